@@ -1,0 +1,89 @@
+"""The one representation of a 3DGS model that everything passes around."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814  # the constant SH basis function
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N 3D Gaussians in the raw parameterisation that 3DGS optimises and that its PLY stores.
+
+    All tensors are float32 and on one device. Raises ValueError when the shapes disagree.
+    """
+
+    means: Tensor  # [N, 3] world position
+    quats: Tensor  # [N, 4] rotation as wxyz, not normalised
+    log_scales: Tensor  # [N, 3] natural logarithm of the standard deviations
+    opacity_logits: Tensor  # [N] opacity before the sigmoid
+    sh: Tensor  # [N, K, 3] spherical harmonics, K = (degree + 1)^2; colour = max(basis . sh + 0.5, 0)
+
+    def __post_init__(self) -> None:
+        n, k = len(self.means), self.sh.shape[1] if self.sh.dim() == 3 else -1
+        expected = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "log_scales": (n, 3),
+            "opacity_logits": (n,),
+            "sh": (n, k, 3),
+        }
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name}: expected shape {shape}, got {tuple(getattr(self, name).shape)}")
+        if k not in (1, 4, 9, 16):
+            raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {k}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> Tensor:
+        """[N, 3] standard deviations, positive."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """[N] opacities in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return int(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def device(self) -> torch.device:
+        return self.means.device
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """The Gaussians with `function` applied to each of the five tensors."""
+        return Gaussians(*(function(getattr(self, f.name)) for f in fields(self)))
+
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        """The Gaussians that a boolean mask, an index tensor or a slice selects."""
+        return self.map(lambda tensor: tensor[index])
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        return self.map(lambda tensor: tensor.to(device))
+
+    def detach(self) -> Gaussians:
+        return self.map(torch.Tensor.detach)
+
+    def with_sh_degree(self, degree: int) -> Gaussians:
+        """The same Gaussians with SH of `degree`: higher coefficients dropped, or zeros added."""
+        k = (degree + 1) ** 2
+        sh = self.sh[:, :k]
+        if sh.shape[1] < k:
+            sh = torch.cat([sh, sh.new_zeros(len(sh), k - sh.shape[1], 3)], dim=1)
+        return Gaussians(self.means, self.quats, self.log_scales, self.opacity_logits, sh)
+
+    @staticmethod
+    def cat(parts: Sequence[Gaussians]) -> Gaussians:
+        """All Gaussians of `parts` in order; they must have one SH degree."""
+        return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
