@@ -1,0 +1,133 @@
+"""Bringing one capture's world into another's frame from the cameras alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from keyss.core.scene import Camera, camera_positions
+from keyss.core.similarity import Similarity
+
+# Weight of the fallback point in `focus_point`, against a mean of projections whose eigenvalues are at
+# most 1: it takes over where the viewing axes differ by less than about two degrees.
+_FALLBACK_WEIGHT = 1e-3
+# A mean of unit vectors shorter than this is no direction: they point everywhere.
+_LEAST_UP = 0.1
+_LEAST_HEADING = 0.2
+
+
+def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> Similarity:
+    """The similarity that brings the secret's world into the cover's frame.
+
+    It moves the point that the secret's cameras look at onto the cover's, makes the mean distances of the
+    cameras from it equal, and the up directions coincide. The turn about up that remains makes the mean
+    headings coincide where both captures have one (a half ring does, a full ring does not); otherwise
+    it is as small as possible. Without an up direction nothing is turned.
+
+    Raises ValueError when either set is empty.
+    """
+    secret, cover = _Capture.of(secret_cameras), _Capture.of(cover_cameras)
+    scale = cover.distance / secret.distance
+    rotation = _rotation(secret, cover)
+    return Similarity(scale, rotation, cover.focus - scale * rotation @ secret.focus)
+
+
+def focus_point(cameras: Sequence[Camera]) -> Tensor:
+    """[3] float64 point nearest to all viewing axes, in the least-squares sense.
+
+    Where the axes are nearly parallel, or meet behind most cameras, it is the point in front of the mean
+    camera at the distance by which the cameras are spread (1 if they all stand in one place).
+    Raises ValueError when there are no cameras.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none")
+    positions, forward = camera_positions(cameras).double(), _axis(cameras, 2)
+    mean = positions.mean(0)
+    spread = float((positions - mean).norm(dim=1).mean())
+    fallback = mean + forward.mean(0) * (spread if spread > 0 else 1.0)
+    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]  # [C, 3, 3]
+    normal = across.mean(0) + _FALLBACK_WEIGHT * torch.eye(3, dtype=torch.float64)
+    target = torch.einsum("cij,cj->i", across, positions) / len(cameras) + _FALLBACK_WEIGHT * fallback
+    focus = torch.linalg.solve(normal, target)
+    depths = ((focus - positions) * forward).sum(1)
+    return focus if 2 * int((depths > 0).sum()) >= len(cameras) else fallback
+
+
+def up_direction(cameras: Sequence[Camera]) -> Tensor | None:
+    """[3] float64 unit up direction of the world that the cameras show, None where they show none.
+
+    People hold cameras level but tilt them: the images' horizontal axes span the world's horizontal
+    plane, while the mean of the cameras' own up vectors leans forward by up to 20 degrees on a half ring.
+    The mean is what is left where the horizontal axes span no plane.
+    """
+    mean = _axis(cameras, 1).mean(0).neg()
+    if float(mean.norm()) < _LEAST_UP:
+        return None
+    right = _axis(cameras, 0)
+    spread, axes = torch.linalg.eigh(right.T @ right / len(cameras))
+    normal: Tensor = axes[:, 0] * torch.sign(axes[:, 0] @ mean)
+    planar = bool(spread[1] > 0.05 and spread[0] < 0.2 * spread[1])
+    if planar and float(normal @ mean) > 0.5 * float(mean.norm()):
+        return normal
+    return _unit(mean)
+
+
+@dataclass(frozen=True)
+class _Capture:
+    """Where a set of cameras looks, all float64."""
+
+    focus: Tensor  # [3]
+    distance: float  # mean from the cameras to the focus, positive
+    up: Tensor | None  # [3] unit vector
+    heading: Tensor | None  # [3] unit vector, mean viewing direction across `up`
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> _Capture:
+        focus = focus_point(cameras)
+        distance = float((camera_positions(cameras).double() - focus).norm(dim=1).mean())
+        up = up_direction(cameras)
+        heading = None
+        if up is not None:
+            forward = _axis(cameras, 2).mean(0)
+            across = forward - up * (up @ forward)
+            if float(across.norm()) > _LEAST_HEADING:
+                heading = _unit(across)
+        return _Capture(focus, distance if distance > 0 else 1.0, up, heading)
+
+
+def _rotation(secret: _Capture, cover: _Capture) -> Tensor:
+    """[3, 3] float64 rotation that takes the secret's up, and heading, to the cover's."""
+    if secret.up is None or cover.up is None:
+        return torch.eye(3, dtype=torch.float64)
+    if secret.heading is None or cover.heading is None:
+        return _least_rotation(secret.up, cover.up)
+    return _frame(cover.up, cover.heading) @ _frame(secret.up, secret.heading).T
+
+
+def _frame(up: Tensor, heading: Tensor) -> Tensor:
+    """[3, 3] rotation whose columns are two orthogonal unit vectors and their cross product."""
+    return torch.stack([up, heading, torch.linalg.cross(up, heading)], dim=1)
+
+
+def _least_rotation(source: Tensor, target: Tensor) -> Tensor:
+    """[3, 3] rotation by the smallest angle that takes unit vector `source` to `target`."""
+    axis = torch.linalg.cross(source, target)
+    if float(axis.norm()) < 1e-9:
+        if float(source @ target) > 0:
+            return torch.eye(3, dtype=torch.float64)
+        # Opposite: every half turn about a perpendicular will do; take the one nearest to a world axis.
+        axis = torch.linalg.cross(source, torch.eye(3, dtype=torch.float64)[int(source.abs().argmin())])
+    axis = _unit(axis)
+    return _frame(target, axis) @ _frame(source, axis).T
+
+
+def _unit(vector: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vector, dim=0)
+
+
+def _axis(cameras: Sequence[Camera], row: int) -> Tensor:
+    """[C, 3] float64 unit vectors of one camera axis in the world: 0 right, 1 down, 2 forward."""
+    return torch.stack([camera.viewmat[row, :3].double() for camera in cameras])

@@ -1,0 +1,212 @@
+"""Similarity transforms of the world, applied to points, cameras and Gaussians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+
+_ROTATION_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation, held in float64 on the CPU.
+
+    Raises ValueError when a value is not finite, `scale` is not positive, or `rotation` is not a rotation
+    (orthonormal with determinant +1, to 1e-6).
+    """
+
+    scale: float = 1.0
+    rotation: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))  # [3, 3]
+    translation: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))  # [3]
+
+    def __post_init__(self) -> None:
+        rotation, translation = (
+            tensor.detach().to("cpu", torch.float64) for tensor in (self.rotation, self.translation)
+        )
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise ValueError(
+                f"similarity: expected a [3, 3] rotation and a [3] translation, "
+                f"got {list(rotation.shape)} and {list(translation.shape)}"
+            )
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"similarity: expected a positive finite scale, got {self.scale}")
+        if not (rotation.isfinite().all() and translation.isfinite().all()):
+            raise ValueError("similarity: the rotation or the translation is not finite")
+        off = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
+        if off > _ROTATION_TOLERANCE or torch.linalg.det(rotation) < 0:
+            raise ValueError("similarity: the rotation is not orthonormal with determinant +1")
+        object.__setattr__(self, "scale", float(self.scale))
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @staticmethod
+    def identity() -> Similarity:
+        return Similarity()
+
+    def inverse(self) -> Similarity:
+        """The transform that undoes this one."""
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def compose(self, first: Similarity) -> Similarity:
+        """The transform that applies `first` and then this one; also written `self @ first`."""
+        return Similarity(
+            self.scale * first.scale, self.rotation @ first.rotation, self.apply_points(first.translation)
+        )
+
+    def __matmul__(self, first: Similarity) -> Similarity:
+        return self.compose(first)
+
+    def apply_points(self, points: Tensor) -> Tensor:
+        """[..., 3] transformed points, of the dtype and on the device of `points`."""
+        rotation, translation = self.rotation.to(points.device), self.translation.to(points.device)
+        return (self.scale * (points.double() @ rotation.T) + translation).to(points.dtype)
+
+    def apply_camera(self, camera: Camera) -> Camera:
+        """The camera moved along with the world: it takes the same image, at `scale` times the depths."""
+        viewmat = camera.viewmat.double()
+        moved = viewmat.clone()
+        rotation = viewmat[:3, :3] @ self.rotation.T.to(viewmat.device)
+        moved[:3, :3] = rotation
+        # From scale * (R_c x + t_c) with x = R^T (x' - t) / scale: the camera's own axes keep unit length.
+        moved[:3, 3] = self.scale * viewmat[:3, 3] - rotation @ self.translation.to(viewmat.device)
+        return replace(camera, viewmat=moved.to(camera.viewmat.dtype))
+
+    def apply_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians moved along with the world, their view-dependent colour included.
+
+        Lengths of the quaternions and opacities stay as they are. Differentiable.
+        """
+        turn = _quaternion(self.rotation).to(gaussians.device)
+        return Gaussians(
+            means=self.apply_points(gaussians.means),
+            quats=_quaternion_product(turn, gaussians.quats.double()).to(gaussians.quats.dtype),
+            log_scales=gaussians.log_scales + math.log(self.scale),
+            opacity_logits=gaussians.opacity_logits,
+            sh=_rotate_sh(gaussians.sh, self.rotation),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-compatible dict of the exact values."""
+        return {
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+    @staticmethod
+    def from_json(data: object) -> Similarity:
+        """The similarity that `to_json` described. Raises ValueError for anything else."""
+        if not isinstance(data, dict) or data.keys() != {"scale", "rotation", "translation"}:
+            raise ValueError("similarity: expected an object with scale, rotation and translation")
+        rows = data["rotation"]
+        if not isinstance(rows, list) or len(rows) != 3:
+            raise ValueError("similarity: expected three rows of rotation")
+        rotation = torch.stack([_numbers(row) for row in rows])
+        return Similarity(float(_numbers([data["scale"]], 1)), rotation, _numbers(data["translation"]))
+
+
+def _numbers(data: object, count: int = 3) -> Tensor:
+    """[count] float64 of a list of JSON numbers."""
+    if not isinstance(data, list) or len(data) != count or not all(type(v) in (int, float) for v in data):
+        raise ValueError(f"similarity: expected {count} number(s), got {str(data)[:80]}")
+    try:
+        return torch.tensor([float(value) for value in data], dtype=torch.float64)
+    except OverflowError as error:
+        raise ValueError("similarity: a number is too large") from error
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """[4] unit quaternion wxyz of a [3, 3] rotation, the one whose largest component is positive."""
+    # Row i is 4 q_i q; the row of the largest component loses no digits.
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    rows = torch.tensor(
+        [
+            [1 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1 - a - e + i],
+        ],
+        dtype=rotation.dtype,
+    )
+    return torch.nn.functional.normalize(rows[rows.diagonal().argmax()], dim=0)
+
+
+def _quaternion_product(p: Tensor, q: Tensor) -> Tensor:
+    """[..., 4] Hamilton product p q, wxyz: the rotation q followed by p."""
+    w, x, y, z = p.unbind(-1)
+    a, b, c, d = q.unbind(-1)
+    return torch.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        dim=-1,
+    )
+
+
+def _rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
+    """[N, K, 3] coefficients of the colour function d -> colour(rotation^T d)."""
+    k = sh.shape[1]
+    matrix = _sh_rotation(rotation, math.isqrt(k) - 1).to(sh.device)
+    return torch.einsum("ij,njc->nic", matrix, sh.double()).to(sh.dtype)
+
+
+def _sh_rotation(rotation: Tensor, degree: int) -> Tensor:
+    """[K, K] float64 block-diagonal matrix that turns SH coefficients with the world.
+
+    Each degree spans a space closed under rotation, so its block is the exact solution of
+    basis(d) block = basis(rotation^T d) over any spread of directions d; more of them than unknowns
+    keep the solution well-conditioned.
+    """
+    directions = _spread_directions(32)
+    basis, turned = _sh_basis(directions, degree), _sh_basis(directions @ rotation, degree)
+    matrix = torch.eye((degree + 1) ** 2, dtype=torch.float64)
+    for band in range(1, degree + 1):
+        block = slice(band**2, (band + 1) ** 2)
+        matrix[block, block] = torch.linalg.lstsq(basis[:, block], turned[:, block]).solution
+    return matrix
+
+
+def _spread_directions(count: int) -> Tensor:
+    """[count, 3] unit vectors spread evenly over the sphere (a Fibonacci spiral)."""
+    index = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * index + 1) / count
+    angle = index * math.pi * (3 - math.sqrt(5))
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
+
+
+def _sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """[D, (degree + 1)^2] the real SH basis with 3DGS's signs, at [D, 3] unit `directions`."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [
+        0.28209479177387814 * torch.ones_like(x),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return torch.stack(basis[: (degree + 1) ** 2], dim=-1)

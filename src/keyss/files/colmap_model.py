@@ -1,0 +1,292 @@
+"""COLMAP's sparse models on disk: cameras, images and points, as `.bin` or `.txt`.
+
+The bytes may be hostile: counts are compared with the bytes that are left before anything is allocated,
+and a file must end where its last record ends. Format: https://colmap.github.io/format.html
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from keyss.core.errors import InputError
+from keyss.files.layout import Points, viewmat_from_quaternion
+from keyss.files.lens import Lens, make_lens
+from keyss.files.reading import read_file, read_text
+
+_T = TypeVar("_T")
+
+# Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+# By the number that stands for a model in cameras.bin.
+_MODEL_NAMES = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
+    *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+)
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """A posed image of a sparse model; its 2-D observations are not kept."""
+
+    name: str
+    camera_id: int
+    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """A reconstruction by COLMAP."""
+
+    lenses: dict[int, Lens]  # by camera id
+    images: tuple[ModelImage, ...]
+    points: Points  # in the order of their ids
+
+
+def find_model(folder: Path) -> Path | None:
+    """Where the sparse model of a scene lies: `sparse/0`, `sparse` or the folder itself; None if nowhere."""
+    for candidate in (folder / "sparse" / "0", folder / "sparse", folder):
+        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return candidate
+    return None
+
+
+def read_model(folder: Path) -> SparseModel:
+    """The model in `folder`, from `.bin` files where `cameras.bin` is there, else from `.txt`.
+
+    Raises InputError when a file is missing, truncated, longer than it says, or holds values that no
+    reconstruction has (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
+    """
+    if (folder / "cameras.bin").is_file():
+        lenses = _cameras_bin(folder / "cameras.bin")
+        images = _images_bin(folder / "images.bin")
+        points = _points_bin(folder / "points3D.bin")
+    else:
+        lenses = _cameras_txt(folder / "cameras.txt")
+        images = _images_txt(folder / "images.txt")
+        points = _points_txt(folder / "points3D.txt")
+    for image in images:
+        if image.camera_id not in lenses:
+            raise InputError(
+                f"{folder}: image {image.name!r} refers to camera {image.camera_id}, which does not exist"
+            )
+    return SparseModel(lenses, images, points)
+
+
+def _lens(where: str, model: str, width: int, height: int, read: Callable[[int], Sequence[float]]) -> Lens:
+    """A lens by COLMAP's model name; `read` yields so many parameters."""
+    if model not in _PARAMETERS:
+        known = ", ".join(_PARAMETERS)
+        raise InputError(
+            f"{where}: camera model {model} is not supported (known: {known}); "
+            "undistort the photos first with `colmap image_undistorter`"
+        )
+    names = _PARAMETERS[model].split()
+    values = dict(zip(names, read(len(names)), strict=True))
+    return make_lens(where, width, height, values, fisheye=model.endswith("FISHEYE"))
+
+
+class _Records:
+    """A cursor over a binary file that never reads past its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = read_file(path)
+        self.offset = 0
+
+    @property
+    def left(self) -> int:
+        return len(self.data) - self.offset
+
+    def take(self, layout: str, what: str) -> tuple[Any, ...]:
+        size = struct.calcsize(layout)
+        self.skip(size, what)
+        return struct.unpack_from(layout, self.data, self.offset - size)
+
+    def skip(self, size: int, what: str) -> None:
+        if size > self.left:
+            raise InputError(
+                f"{self.path}: expected {what} at byte {self.offset}, but only {self.left} bytes are left: "
+                "the file is truncated or damaged"
+            )
+        self.offset += size
+
+    def count(self, record_size: int, what: str) -> int:
+        """A count of records of at least `record_size` bytes each, which the rest of the file must hold."""
+        (count,) = self.take("<Q", f"the number of {what}")
+        if count * record_size > self.left:
+            raise InputError(
+                f"{self.path}: expected {count} {what} of at least {record_size} bytes, "
+                f"but only {self.left} bytes are left: the file is truncated or damaged"
+            )
+        return int(count)
+
+    def name(self) -> str:
+        end = self.data.find(b"\0", self.offset, self.offset + 4096)
+        if end < 0:
+            raise InputError(f"{self.path}: expected an image name of up to 4095 bytes at byte {self.offset}")
+        raw = self.data[self.offset : end]
+        self.offset = end + 1
+        try:
+            return raw.decode()
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self.path}: expected an image name in UTF-8, found {raw!r}") from error
+
+    def end(self) -> None:
+        if self.left:
+            raise InputError(
+                f"{self.path}: expected the end of the file, found {self.left} bytes more: it is damaged"
+            )
+
+
+def _cameras_bin(path: Path) -> dict[int, Lens]:
+    records = _Records(path)
+    lenses: dict[int, Lens] = {}
+    for _ in range(records.count(24, "cameras")):
+        camera_id, number, width, height = records.take("<IiQQ", "a camera")
+        model = _MODEL_NAMES[number] if 0 <= number < len(_MODEL_NAMES) else f"number {number}"
+        where = f"{path}: camera {camera_id}"
+        lens = _lens(where, model, width, height, lambda n: records.take(f"<{n}d", "camera parameters"))
+        _add(lenses, camera_id, lens, where)
+    records.end()
+    return lenses
+
+
+def _images_bin(path: Path) -> tuple[ModelImage, ...]:
+    records = _Records(path)
+    images = []
+    for _ in range(records.count(73, "images")):
+        image_id, *pose, camera_id = records.take("<I7dI", "an image")
+        viewmat = viewmat_from_quaternion(f"{path}: image {image_id}", pose[:4], pose[4:])
+        images.append(ModelImage(records.name(), camera_id, viewmat))
+        records.skip(24 * records.count(24, "observations"), "observations")
+    records.end()
+    return tuple(images)
+
+
+def _points_bin(path: Path) -> Points:
+    records = _Records(path)
+    data, end = records.data, len(records.data)
+    count = records.count(51, "points")
+    offsets = np.empty(count, dtype=np.int64)
+    offset, track_length = records.offset, struct.Struct("<Q").unpack_from
+    for i in range(count):  # bare offsets: scenes have millions of points, each with a track to skip
+        if offset + 51 > end:
+            raise InputError(
+                f"{path}: expected {count} points, but the file ends in point {i + 1}: it is truncated"
+            )
+        offsets[i] = offset
+        offset += 51 + 8 * track_length(data, offset + 43)[0]
+    if offset > end:
+        raise InputError(
+            f"{path}: expected the track of point {count}, but the file ends in it: it is truncated"
+        )
+    records.offset = offset
+    records.end()
+    fields = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
+    points = raw.view(fields)[:, 0]
+    points = points[np.argsort(points["id"], kind="stable")]
+    return Points.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
+
+
+def _cameras_txt(path: Path) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    for number, line in _lines(path):
+        where = f"{path}, line {number}"
+        words = line.split()
+        if len(words) < 4:
+            raise InputError(
+                f"{where}: expected `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`, found {line[:80]!r}"
+            )
+        camera_id, width, height = (_parse(int, where, words[i]) for i in (0, 2, 3))
+        lens = _lens(where, words[1], width, height, partial(_floats, where, words[4:]))
+        _add(lenses, camera_id, lens, where)
+    return lenses
+
+
+def _images_txt(path: Path) -> tuple[ModelImage, ...]:
+    images = []
+    lines = iter(enumerate(read_text(path).split("\n"), 1))
+    for number, line in lines:
+        if not line.strip() or line.startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        words = line.strip().split(maxsplit=9)
+        if len(words) < 10:
+            raise InputError(
+                f"{where}: expected `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, found {line[:80]!r}"
+            )
+        pose = _floats(where, words[1:8], 7)
+        viewmat = viewmat_from_quaternion(where, pose[:4], pose[4:])
+        images.append(ModelImage(words[9], _parse(int, where, words[8]), viewmat))
+        next(lines, None)  # the line of observations, which may be empty
+    return tuple(images)
+
+
+def _points_txt(path: Path) -> Points:
+    xyz, rgb, ids = [], [], []
+    for number, line in _lines(path):
+        where = f"{path}, line {number}"
+        words = line.split(maxsplit=8)
+        if len(words) < 8:
+            raise InputError(
+                f"{where}: expected `POINT3D_ID X Y Z R G B ERROR TRACK...`, found {line[:80]!r}"
+            )
+        ids.append(_parse(int, where, words[0]))
+        xyz.append(_floats(where, words[1:4], 3))
+        color = [_parse(int, where, word) for word in words[4:7]]
+        if not all(0 <= c <= 255 for c in color):
+            raise InputError(f"{where}: expected colours of 0 to 255, found {color}")
+        rgb.append(color)
+    order = sorted(range(len(ids)), key=ids.__getitem__)
+    return Points.checked(
+        path,
+        np.array(xyz, dtype=np.float64).reshape(-1, 3)[order],
+        np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order],
+    )
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    for number, line in enumerate(read_text(path).split("\n"), 1):
+        if line.strip() and not line.startswith("#"):
+            yield number, line
+
+
+def _parse(kind: Callable[[str], _T], where: str, word: str) -> _T:
+    try:
+        return kind(word)
+    except ValueError as error:
+        raise InputError(
+            f"{where}: expected a number ({getattr(kind, '__name__', kind)}), found {word[:40]!r}"
+        ) from error
+
+
+def _floats(where: str, words: Sequence[str], count: int) -> list[float]:
+    if len(words) != count:
+        raise InputError(f"{where}: expected {count} numbers, found {len(words)}")
+    return [_parse(float, where, word) for word in words]
+
+
+def _add(lenses: dict[int, Lens], camera_id: int, lens: Lens, where: str) -> None:
+    if camera_id in lenses:
+        raise InputError(f"{where}: expected every camera once, found id {camera_id} twice")
+    lenses[camera_id] = lens

@@ -1,0 +1,78 @@
+"""Photos from disk to plain RGB bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from keyss.core.errors import InputError
+
+# Only formats that photos of a scene come in: some of Pillow's others start external programs.
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+_MAX_PIXELS = 89_000_000  # just under Pillow's own limit for decompression bombs
+
+
+def probe_image(path: Path) -> tuple[int, int, bool]:
+    """(width, height, whether it may be transparent) of an image, from its header alone.
+
+    EXIF orientation is ignored, as COLMAP does. Raises InputError when the file is missing, is not an
+    image or has more than 89 million pixels.
+    """
+    with _open(path) as image:
+        transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+        return image.width, image.height, transparent
+
+
+def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB of an image file, laid over `background` ([3] in [0, 1]) where it is transparent.
+
+    16-bit grey is scaled to 8 bits; palettes, grey and CMYK are converted. Raises InputError as
+    `probe_image` does, and when the pixels cannot be decoded.
+    """
+    with _open(path) as image:
+        try:
+            return _to_rgb(image, background)
+        except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
+            raise InputError(
+                f"{path}: expected an image, but its pixels cannot be decoded: {error}"
+            ) from error
+
+
+def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """[height, width, 3] by area averaging of a larger image."""
+    # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        image = Image.open(path, formats=_FORMATS)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: expected an image, but there is no such file") from error
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise InputError(f"{path}: expected an image of at most {_MAX_PIXELS:,} pixels: {error}") from error
+    except Exception as error:  # Pillow's parsers raise nearly anything on broken headers
+        kinds = ", ".join(_FORMATS)
+        raise InputError(f"{path}: expected an image ({kinds}), but it cannot be read: {error}") from error
+    if image.width * image.height > _MAX_PIXELS:
+        image.close()
+        raise InputError(
+            f"{path}: expected an image of at most {_MAX_PIXELS:,} pixels, found {image.width}x{image.height}"
+        )
+    return image
+
+
+def _to_rgb(image: Image.Image, background: NDArray[np.float32]) -> NDArray[np.uint8]:
+    if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip instead of scale
+        grey = np.asarray(image, dtype=np.float64).clip(0, 65535)
+        return np.repeat(np.rint(grey / 257).astype(np.uint8)[:, :, None], 3, axis=2)
+    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32)
+        alpha = rgba[:, :, 3:] / 255
+        mixed = rgba[:, :, :3] * alpha + 255 * background * (1 - alpha)
+        return np.rint(mixed).astype(np.uint8)
+    return np.array(image.convert("RGB"), dtype=np.uint8)

@@ -1,0 +1,100 @@
+"""What every scene layout is read into before its photos are decoded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from keyss.core.errors import InputError
+from keyss.files.lens import Lens
+
+MAX_COORDINATE = 1e15  # squares of coordinates up to this still fit in float32
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image file, where it was taken from, and through which lens."""
+
+    path: Path
+    name: str
+    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes, a rigid motion
+    lens: Lens
+
+
+@dataclass(frozen=True)
+class Points:
+    """A point cloud."""
+
+    xyz: NDArray[np.float32]  # [P, 3]
+    rgb: NDArray[np.uint8]  # [P, 3]
+
+    @staticmethod
+    def none() -> Points:
+        return Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+
+    @staticmethod
+    def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> Points:
+        """The points as float32. Raises InputError when a coordinate is not finite or beyond 1e15."""
+        bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
+        if bad.any():
+            first = int(bad.argmax())
+            raise InputError(
+                f"{where}: expected finite points, found {xyz[first].tolist()} as point {first + 1}"
+            )
+        return Points(xyz.astype(np.float32), rgb)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The photos of a scene, split into training and test, and its points."""
+
+    train: tuple[Photo, ...]
+    test: tuple[Photo, ...]
+    points: Points
+
+
+def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    """(train, test): sorted by name, every 8th photo beginning with the first is for testing.
+
+    This is the split of Mip-NeRF 360 and of 3DGS. Raises InputError for fewer than 2 photos.
+    """
+    if len(photos) < 2:
+        raise InputError(
+            f"{where}: expected at least 2 posed images (one to train, one to test), found {len(photos)}"
+        )
+    ordered = sorted(photos, key=lambda photo: photo.name)
+    return tuple(p for i, p in enumerate(ordered) if i % 8), tuple(ordered[::8])
+
+
+def viewmat_from_quaternion(
+    where: str, quaternion: Sequence[float], translation: Sequence[float]
+) -> NDArray[np.float64]:
+    """[4, 4] from a rotation wxyz (normalised here) and a translation. Raises InputError."""
+    norm = math.hypot(*quaternion)
+    if not 1e-8 < norm < math.inf:
+        raise InputError(f"{where}: expected a rotation quaternion, found {list(quaternion)}")
+    w, x, y, z = (q / norm for q in quaternion)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    if not all(abs(t) <= MAX_COORDINATE for t in translation):
+        raise InputError(f"{where}: expected a finite translation, found {list(translation)}")
+    viewmat[:3, 3] = translation
+    return viewmat
+
+
+def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:
+    """Raises InputError when two photos are one file: it could be in training and test at once."""
+    seen: set[str] = set()
+    for photo in photos:
+        if photo.name in seen:
+            raise InputError(f"{where}: expected every image once, found {photo.name!r} twice")
+        seen.add(photo.name)

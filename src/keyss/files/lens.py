@@ -1,0 +1,177 @@
+"""Camera lenses as photos come with them, and how a distorted photo becomes a pinhole one.
+
+Pixel coordinates here have pixel centres at half-integers, as in COLMAP and Nerfstudio: the middle of an
+image is (width / 2, height / 2). OpenCV puts centres at integers, so half a pixel is taken off on the way
+in and added on the way out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from keyss.core.errors import InputError
+
+MAX_SIDE = 32_000  # pixels; OpenCV's remap addresses sources with signed 16-bit integers
+_MAX_ZOOM = 8.0
+_BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order, and that of COLMAP's FULL_OPENCV
+_FISHEYE = ("k1", "k2", "k3", "k4")
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of a photo: focal lengths and principal point in pixels, and its distortion."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 k3 k4 k5 k6 (rational Brown), or fisheye k1 k2 k3 k4
+    fisheye: bool = False  # equidistant projection: distorted even where every coefficient is 0
+
+    @property
+    def is_pinhole(self) -> bool:
+        return not self.fisheye and not any(self.distortion)
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """[3, 3] pixels."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens on another pixel grid; distortion coefficients do not depend on it."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+    def on_image(self, width: int, height: int) -> Lens | None:
+        """The lens for an image of this size: the lens's own, or that size divided by a whole number.
+
+        Photos are often shrunk (`images_4`) after their cameras were computed; whole factors of 2 and
+        more are accepted, rounded up or down per side. None when the sizes have nothing to do with each
+        other.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        factor = round(self.width / width)
+        fits = (
+            abs(width - self.width / factor) < 1 and abs(height - self.height / factor) < 1
+            if factor > 1
+            else False
+        )
+        return self.resized(width, height) if fits else None
+
+
+def make_lens(
+    where: str, width: int, height: int, parameters: Mapping[str, float], *, fisheye: bool = False
+) -> Lens:
+    """The lens with named parameters: `f` or `fx` and `fy`, `cx`, `cy`, `k1` ... `k6`, `p1`, `p2`.
+
+    Raises InputError, which starts with `where`, when a value is out of any sensible range.
+    """
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise InputError(
+            f"{where}: expected an image size of 1 to {MAX_SIDE} pixels a side, found {width}x{height}"
+        )
+    values = dict(parameters)
+    focal = values.pop("f", math.nan)
+    fx, fy = values.pop("fx", focal), values.pop("fy", focal)
+    cx, cy = values.pop("cx"), values.pop("cy")
+    if not (1e-3 <= fx <= 1e7 and 1e-3 <= fy <= 1e7):
+        raise InputError(
+            f"{where}: expected focal lengths of 0.001 to 10,000,000 pixels, found {fx:g} and {fy:g}"
+        )
+    if not (abs(cx) <= 1e6 and abs(cy) <= 1e6):
+        raise InputError(f"{where}: expected a principal point in or near the image, found ({cx:g}, {cy:g})")
+    wild = [f"{name}={value:g}" for name, value in values.items() if not abs(value) <= 100]
+    if wild:
+        raise InputError(f"{where}: expected distortion coefficients within +-100, found {', '.join(wild)}")
+    order = _FISHEYE if fisheye else _BROWN
+    distortion = tuple(values.pop(name, 0.0) for name in order)
+    if any(values.values()):
+        raise InputError(f"{where}: a fisheye lens has no coefficients {', '.join(values)}")
+    return Lens(width, height, fx, fy, cx, cy, distortion if any(distortion) or fisheye else (), fisheye)
+
+
+@dataclass(frozen=True)
+class Undistortion:
+    """How to resample photos of a distorted lens into those of a pinhole lens of the same size."""
+
+    pinhole: Lens
+    map_x: NDArray[np.float32]  # [H, W] OpenCV column in the distorted photo, per pixel of the new one
+    map_y: NDArray[np.float32]  # [H, W] OpenCV row
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W, 3] undistorted, sampled bilinearly."""
+        straight = cv2.remap(
+            image, self.map_x, self.map_y, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(straight, dtype=np.uint8)
+
+
+def undistortion(lens: Lens, where: str) -> Undistortion:
+    """The resampling that takes `lens` to the pinhole with the same principal point and size.
+
+    The focal lengths stay as they are, or grow together by the least factor at which every pixel of
+    the new image is seen in the photo: no invented borders, and no upsampling beyond that. Raises
+    InputError, which starts with `where`, when there is no such factor up to 8.
+    """
+    if _covers(lens, 1.0):
+        zoom = 1.0
+    elif _covers(lens, _MAX_ZOOM):
+        too_wide, zoom = 1.0, _MAX_ZOOM
+        while zoom - too_wide > 1e-4:
+            middle = (too_wide + zoom) / 2
+            too_wide, zoom = (too_wide, middle) if _covers(lens, middle) else (middle, zoom)
+    else:
+        raise InputError(
+            f"{where}: the lens distortion {lens.distortion} cannot be undone; "
+            "undistort the photos first, for example with `colmap image_undistorter`"
+        )
+    pinhole = replace(lens, fx=lens.fx * zoom, fy=lens.fy * zoom, distortion=(), fisheye=False)
+    return Undistortion(pinhole, *_source_coordinates(lens, _opencv_K(pinhole), (lens.width, lens.height)))
+
+
+def _opencv_K(lens: Lens) -> NDArray[np.float64]:
+    K = lens.K
+    K[:2, 2] -= 0.5
+    return K
+
+
+def _source_coordinates(
+    lens: Lens, new_K: NDArray[np.float64], size: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where each pixel of a pinhole image with `new_K` lies in the photo; all in OpenCV's coordinates."""
+    prepare = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    maps = prepare(_opencv_K(lens), np.array(lens.distortion), np.eye(3), new_K, size, cv2.CV_32FC1)
+    return np.asarray(maps[0], dtype=np.float32), np.asarray(maps[1], dtype=np.float32)
+
+
+def _covers(lens: Lens, zoom: float) -> bool:
+    """Whether a pinhole with focal lengths times `zoom` sees only what the photo shows, and once.
+
+    Checked on a grid of 128 x 128 cells that includes the corners. A polynomial distortion turns back on
+    itself far from the axis and shows the photo's content a second time; there its Jacobian is negative.
+    """
+    cells = 128
+    K = _opencv_K(replace(lens, fx=lens.fx * zoom, fy=lens.fy * zoom))
+    K[0] *= cells / max(lens.width - 1, 1)
+    K[1] *= cells / max(lens.height - 1, 1)
+    x, y = (m.astype(np.float64) for m in _source_coordinates(lens, K, (cells + 1, cells + 1)))
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return False
+    edge = 0.5 + 1e-3
+    inside = (x >= -edge) & (x <= lens.width - 1 + edge) & (y >= -edge) & (y <= lens.height - 1 + edge)
+    if not inside.all():
+        return False
+    across_x, across_y = np.diff(x, axis=1)[:-1], np.diff(y, axis=1)[:-1]
+    down_x, down_y = np.diff(x, axis=0)[:, :-1], np.diff(y, axis=0)[:, :-1]
+    return bool((across_x * down_y - across_y * down_x > 0).all())

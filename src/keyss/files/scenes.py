@@ -1,0 +1,144 @@
+"""Any known scene layout on disk into a `Scene` with its photos decoded."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from keyss.core.errors import InputError, UsageError
+from keyss.core.scene import Camera, Scene, View
+from keyss.files.blender import is_blender, read_blender
+from keyss.files.colmap import is_colmap, read_colmap
+from keyss.files.images import probe_image, read_image, shrink
+from keyss.files.layout import Layout, Photo
+from keyss.files.lens import Lens, Undistortion, undistortion
+from keyss.files.nerfstudio import is_nerfstudio, read_nerfstudio
+
+# In the order they are tried: a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it.
+_LAYOUTS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Layout]], ...] = (
+    ("COLMAP (sparse/0/cameras.bin or .txt, images/)", is_colmap, read_colmap),
+    ("Blender / NeRF-synthetic (transforms_train.json)", is_blender, read_blender),
+    ("Nerfstudio (transforms.json)", is_nerfstudio, read_nerfstudio),
+)
+
+
+def load_scene(
+    path: str | os.PathLike[str],
+    *,
+    width: int | None = None,
+    background: Tensor | Sequence[float] | None = None,
+) -> Scene:
+    """Read a scene folder in COLMAP's, NeRF-synthetic's or Nerfstudio's layout, told apart by content.
+
+    `width`: photos wider than this many pixels are shrunk to it by area averaging, their height in
+    proportion and K scaled per axis; photos are never enlarged. Distorted lenses are undistorted before.
+    `background`: three numbers in [0, 1] that lie behind everything and under transparent pixels; by
+    default white when any photo has an alpha channel, else black.
+
+    The test views are the layout's own where it has a split, else every 8th image by name. Camera names
+    are image paths as the layout has them, relative to `images/` for COLMAP and to the scene's folder for
+    the others (`train/r_0.png`). Rotations are exactly orthonormal up to float32.
+
+    Raises InputError for anything that is not such a scene: an unknown layout, broken or truncated
+    files, missing or undecodable images, images whose size contradicts their camera's (a size divided by
+    a whole number is accepted), fewer than one training and one test image. Raises UsageError for a
+    `width` or `background` out of range.
+    """
+    if width is not None and width < 1:
+        raise UsageError(f"expected a width of at least 1 pixel, got {width}")
+    chosen = None if background is None else _checked_background(background)
+    folder = Path(path)
+    layout = _read_layout(folder)
+    for views, purpose in ((layout.train, "to train on"), (layout.test, "to test on")):
+        if not views:
+            raise InputError(f"{folder}: expected at least one image {purpose}, found none")
+
+    transparent = False
+    lenses = []
+    for photo in layout.train + layout.test:
+        image_width, image_height, has_alpha = probe_image(photo.path)
+        transparent |= has_alpha
+        lens = photo.lens.on_image(image_width, image_height)
+        if lens is None:
+            raise InputError(
+                f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height} "
+                f"(or that divided by a whole number), found {image_width}x{image_height}"
+            )
+        lenses.append(lens)
+    if chosen is None:
+        chosen = torch.full((3,), 1.0 if transparent else 0.0)
+
+    # Most scenes have one lens; only the last few maps are kept because each is as large as a photo.
+    undistortions = functools.lru_cache(maxsize=2)(undistortion)
+    behind = chosen.numpy()
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        decode = functools.partial(_view, width=width, background=behind, undistortions=undistortions)
+        decoded = tuple(pool.map(decode, layout.train + layout.test, lenses))
+    return Scene(
+        name=folder.resolve().name,
+        train=decoded[: len(layout.train)],
+        test=decoded[len(layout.train) :],
+        points=torch.from_numpy(layout.points.xyz),
+        colors=torch.from_numpy(layout.points.rgb),
+        background=chosen,
+    )
+
+
+def _read_layout(folder: Path) -> Layout:
+    known = "; ".join(name for name, _, _ in _LAYOUTS)
+    try:
+        if not folder.is_dir():
+            found = "a file" if folder.exists() else "nothing there"
+            raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {known}")
+        for _, matches, read in _LAYOUTS:
+            if matches(folder):
+                return read(folder)
+        entries = sorted(entry.name for entry in folder.iterdir())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
+    found = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
+    raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {known}")
+
+
+def _view(
+    photo: Photo,
+    lens: Lens,
+    width: int | None,
+    background: NDArray[np.float32],
+    undistortions: Callable[[Lens, str], Undistortion],
+) -> View:
+    pixels = read_image(photo.path, background)
+    if pixels.shape[:2] != (lens.height, lens.width):
+        raise InputError(
+            f"{photo.path}: expected {lens.width}x{lens.height} pixels, but it changed while being read"
+        )
+    if not lens.is_pinhole:
+        straighten = undistortions(lens, str(photo.path.parent))
+        pixels, lens = straighten(pixels), straighten.pinhole
+    camera = Camera(
+        viewmat=torch.from_numpy(photo.viewmat.astype(np.float32)),
+        K=torch.from_numpy(lens.K.astype(np.float32)),
+        width=lens.width,
+        height=lens.height,
+        name=photo.name,
+    )
+    if width is not None and width < camera.width:
+        height = max(1, round(camera.height * width / camera.width))
+        camera, pixels = camera.resized(width, height), shrink(pixels, width, height)
+    return View(camera, torch.from_numpy(np.ascontiguousarray(pixels)))
+
+
+def _checked_background(background: Tensor | Sequence[float]) -> Tensor:
+    values = [float(value) for value in background]
+    if len(values) != 3 or not all(math.isfinite(v) and 0 <= v <= 1 for v in values):
+        raise UsageError(f"expected a background of three numbers in [0, 1], got {values}")
+    return torch.tensor(values, dtype=torch.float32)

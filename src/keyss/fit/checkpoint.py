@@ -1,0 +1,76 @@
+"""The complete state of a training run in one safetensors file: tensors and JSON, nothing executable."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from keyss.core.errors import InputError
+from keyss.files.atomic import write_bytes
+from keyss.fit.parameters import Optimizers, Parameters
+
+State = dict[str, Tensor]
+
+
+def save_checkpoint(path: Path, tensors: State, meta: Mapping[str, Any]) -> None:
+    """Atomically write `tensors` and the JSON-able `meta`. Raises OutputError."""
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_bytes(path, safetensors.torch.save(contiguous, {"meta": json.dumps(meta)}))
+
+
+def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
+    """Tensors (on the CPU) and meta of a checkpoint. Raises InputError when it is missing or damaged."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {})["meta"])
+            return {name: file.get_tensor(name) for name in file.keys()}, meta  # noqa: SIM118
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no checkpoint to resume from") from error
+    except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
+        raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
+
+
+def pack_optimizers(parameters: Parameters, optimizers: Optimizers) -> State:
+    """Parameters and their Adam moments as flat names: `means`, `means.exp_avg`, ..."""
+    state: State = {}
+    for name, parameter in parameters.items():
+        state[name] = parameter.detach()
+        for key, value in optimizers[name].state[parameter].items():
+            state[f"{name}.{key}"] = torch.as_tensor(value)
+    return state
+
+
+def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimizers) -> None:
+    """Put back what `pack_optimizers` gave, whatever the number of Gaussians now is."""
+    for name, old in list(parameters.items()):
+        parameter = torch.nn.Parameter(state[name].to(old.device))
+        optimizer = optimizers[name]
+        optimizer.state.pop(old, None)
+        optimizer.param_groups[0]["params"] = [parameter]
+        prefix = f"{name}."
+        moments = {
+            key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)
+        }
+        if moments:
+            optimizer.state[parameter] = {
+                key: value if key == "step" else value.to(old.device) for key, value in moments.items()
+            }
+        parameters[name] = parameter
+
+
+def pack_density(state: Mapping[str, Any]) -> State:
+    """The running statistics of a strategy."""
+    return {f"density.{key}": value for key, value in state.items() if isinstance(value, Tensor)}
+
+
+def unpack_density(state: State, density: dict[str, Any], device: torch.device) -> None:
+    for key in density:
+        if f"density.{key}" in state:
+            density[key] = state[f"density.{key}"].to(device)

@@ -1,0 +1,152 @@
+"""The loop around every training run: progress, checkpoints, Ctrl-C, resume."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from keyss.core.errors import InputError
+from keyss.fit.checkpoint import State, load_checkpoint, save_checkpoint
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during training, after the state was saved. `checkpoint` is None where nothing was to be saved."""
+
+    def __init__(self, checkpoint: Path | None, iteration: int) -> None:
+        super().__init__()
+        self.checkpoint = checkpoint
+        self.iteration = iteration
+
+
+class Run(Protocol):
+    """A training run: everything that `state` returns decides its future completely."""
+
+    iterations: int
+    iteration: int  # steps done
+
+    def step(self) -> None:
+        """One optimisation step; increases `iteration`."""
+
+    def evaluate(self) -> dict[str, float]:
+        """The numbers a person watches, on held-out views."""
+
+    def state(self) -> tuple[State, dict[str, Any]]: ...
+
+    def load(self, tensors: State, meta: dict[str, Any]) -> None: ...
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+
+
+class Reporter(Protocol):
+    """Where progress goes."""
+
+    def start(self, title: str, iterations: int, iteration: int) -> None: ...
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None: ...
+
+    def finish(self) -> None: ...
+
+
+class Silent:
+    """A reporter that says nothing."""
+
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        pass
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        pass
+
+    def finish(self) -> None:
+        pass
+
+
+def train(
+    run: Run,
+    title: str,
+    *,
+    fingerprint: dict[str, Any],
+    seed: int,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    checkpoint_seconds: float = 180.0,
+    evaluate_every: int = 500,
+    reporter: Reporter | None = None,
+) -> float:
+    """Take `run` to its last iteration; returns the seconds spent, those before a resume included.
+
+    With `checkpoint`, the state is saved there every `checkpoint_seconds` and on Ctrl-C (raises
+    Interrupted); with `resume`, it continues from there if the file exists. `fingerprint` (JSON-able) is
+    what must be the same for a resumed run to mean the same; a checkpoint of another one raises InputError.
+    The same seed gives the same run on a CPU, interrupted or not: the global random state, which gsplat's
+    densification draws from, is seeded here, kept in the checkpoint, and given back to the caller.
+    """
+    reporter = reporter or Silent()
+    spent = 0.0
+    with torch.random.fork_rng(), _deferred_interrupt() as interrupted:
+        torch.manual_seed(seed)
+        if checkpoint is not None and resume and checkpoint.exists():
+            tensors, meta = load_checkpoint(checkpoint)
+            if meta.get("fingerprint") != fingerprint:
+                raise InputError(
+                    f"{checkpoint}: belongs to a run with other settings or inputs; "
+                    "give the same ones, or start anew with --overwrite"
+                )
+            torch.set_rng_state(tensors.pop("rng"))
+            run.load(tensors, meta)
+            spent = float(meta["seconds"])
+        started = saved = time.monotonic()
+        numbers: dict[str, float] = {}
+        reporter.start(title, run.iterations, run.iteration)
+
+        def save() -> None:
+            if checkpoint is None:
+                return
+            tensors, meta = run.state()
+            tensors["rng"] = torch.get_rng_state()
+            seconds = spent + time.monotonic() - started
+            save_checkpoint(checkpoint, tensors, {**meta, "fingerprint": fingerprint, "seconds": seconds})
+
+        try:
+            while run.iteration < run.iterations:
+                run.step()
+                if evaluate_every and run.iteration % evaluate_every == 0:
+                    numbers = run.evaluate()
+                reporter.update(run.iteration, len(run), numbers)
+                if interrupted():
+                    save()
+                    raise Interrupted(checkpoint, run.iteration)
+                if time.monotonic() - saved > checkpoint_seconds:
+                    save()
+                    saved = time.monotonic()
+        finally:
+            reporter.finish()
+        return spent + time.monotonic() - started
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C into a flag that is looked at between steps; a second Ctrl-C interrupts at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    seen = False
+
+    def note(signum: int, frame: Any) -> None:
+        nonlocal seen
+        if seen:
+            raise KeyboardInterrupt
+        seen = True
+
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: seen
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,104 @@
+"""A 3DGS model as optimisers and gsplat's strategies want it: a dict of parameters with an Adam each.
+
+The spelling `means quats scales opacities sh0 shN` (scales and opacities still raw) is gsplat's and
+stays inside `fit` and `hide`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.scene import Scene
+from keyss.core.alignment import focus_point
+from keyss.fit.config import FitConfig
+
+INITIAL_OPACITY = 0.1
+
+Parameters = dict[str, torch.nn.Parameter]
+Optimizers = dict[str, torch.optim.Optimizer]
+
+
+def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
+    """Leaf parameters holding a copy of the Gaussians on `device`."""
+    tensors = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.log_scales,
+        "opacities": gaussians.opacity_logits,
+        "sh0": gaussians.sh[:, :1],
+        "shN": gaussians.sh[:, 1:],
+    }
+    return {name: torch.nn.Parameter(t.detach().to(device).clone()) for name, t in tensors.items()}
+
+
+def to_gaussians(parameters: Parameters) -> Gaussians:
+    """The Gaussians that the parameters stand for, attached to their graph."""
+    return Gaussians(
+        parameters["means"],
+        parameters["quats"],
+        parameters["scales"],
+        parameters["opacities"],
+        torch.cat([parameters["sh0"], parameters["shN"]], dim=1),
+    )
+
+
+def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) -> Optimizers:
+    """One Adam per attribute; the position's rate scales with the scene's `extent` (world units)."""
+    rates = {
+        "means": config.means_rate * extent,
+        "quats": config.quats_rate,
+        "scales": config.scales_rate,
+        "opacities": config.opacities_rate,
+        "sh0": config.sh0_rate,
+        "shN": config.shN_rate,
+    }
+    fused = parameters["means"].device.type == "cuda"
+    return {
+        name: torch.optim.Adam([{"params": [parameters[name]], "lr": rate}], eps=1e-15, fused=fused)
+        for name, rate in rates.items()
+    }
+
+
+def initial_gaussians(points: Tensor, colors: Tensor, sh_degree: int, limit: int, generator: torch.Generator) -> Gaussians:
+    """3DGS's start: at each sparse point an isotropic Gaussian as wide as the distance to its neighbours.
+
+    points [P, 3] and colors [P, 3] uint8; at most `limit` of them, drawn at random, are used.
+    """
+    if len(points) > limit:
+        chosen = torch.randperm(len(points), generator=generator)[:limit].sort().values
+        points, colors = points[chosen], colors[chosen]
+    count = len(points)
+    coordinates = points.double().numpy()
+    neighbours = min(4, count)
+    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(count, neighbours)
+    spacing = torch.from_numpy(distances[:, 1:]).square().mean(1).sqrt() if count > 1 else torch.ones(1)
+    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = (colors.float() / 255 - 0.5) / SH_C0
+    return Gaussians(
+        means=points.float().clone(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=spacing.clamp_min(1e-7).log().float()[:, None].repeat(1, 3),
+        opacity_logits=torch.full((count,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+        sh=sh,
+    )
+
+
+def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Points [P, 3] and colours [P, 3] uint8 to start from: the scene's own, or random ones.
+
+    A scene without points (NeRF-synthetic) gets uniform ones of grey in a cube around what the cameras
+    look at, with half the cameras' mean distance as half its edge.
+    """
+    if len(scene.points) >= 100:
+        return scene.points, scene.colors
+    cameras = [view.camera for view in scene.train]
+    focus = focus_point(cameras)
+    distance = torch.stack([camera.position for camera in cameras]).double().sub(focus).norm(dim=1).mean()
+    count = min(limit, 20_000)
+    points = focus + (torch.rand(count, 3, generator=generator) - 0.5) * distance
+    return points.float(), torch.full((count, 3), 128, dtype=torch.uint8)

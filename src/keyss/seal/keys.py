@@ -1,0 +1,111 @@
+"""From what a person types to what the method needs: Argon2id, then HKDF with a label per use.
+
+The key itself is used once, in Argon2id (RFC 9106), which makes guessing expensive; everything else is
+derived from its result by HKDF-SHA256 (RFC 5869) with labels, so that no derived value tells anything of
+another. Keys are text, normalised to NFKC, so that one key typed on two systems is one key.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import string
+import unicodedata
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from argon2.low_level import Type, hash_secret_raw
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
+from scipy.special import ndtri
+from torch import Tensor
+
+from keyss.core.errors import InputError, UsageError
+
+ALPHABET = string.ascii_letters + string.digits
+SALT_BYTES = 16
+EMBEDDING_SIZE = 64
+MAX_KEY_BYTES = 4096
+
+
+def generate_key(length: int = 16) -> str:
+    """A random alphanumeric key from the system's random source: 5.95 bits a character."""
+    if not 1 <= length <= 1024:
+        raise UsageError(f"a key has 1 to 1024 characters, not {length}")
+    return "".join(secrets.choice(ALPHABET) for _ in range(length))
+
+
+@dataclass(frozen=True)
+class KeyDerivation:
+    """Argon2id's public parameters; what a file states is held to a floor and a ceiling."""
+
+    salt: bytes
+    time_cost: int = 3  # passes
+    memory_kib: int = 64 * 1024
+    parallelism: int = 4
+
+    def __post_init__(self) -> None:
+        if len(self.salt) != SALT_BYTES:
+            raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(self.salt)}")
+        for name, low, high in (
+            ("time_cost", 1, 16),
+            ("memory_kib", 8 * 1024, 1024 * 1024),
+            ("parallelism", 1, 16),
+        ):
+            value = getattr(self, name)
+            if not (type(value) is int and low <= value <= high):
+                raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
+
+    @staticmethod
+    def fresh() -> KeyDerivation:
+        """The default costs (RFC 9106, second recommendation) with a new random salt."""
+        return KeyDerivation(salt=secrets.token_bytes(SALT_BYTES))
+
+
+class DerivedKey:
+    """What a key becomes under one `KeyDerivation`."""
+
+    def __init__(self, key: str, derivation: KeyDerivation) -> None:
+        """Takes about 0.1 s. Raises UsageError for an empty or overlong key."""
+        text = unicodedata.normalize("NFKC", key).encode()
+        if not text:
+            raise UsageError("the key is empty")
+        if len(text) > MAX_KEY_BYTES:
+            raise UsageError(f"the key is longer than {MAX_KEY_BYTES} bytes")
+        self._master = hash_secret_raw(
+            text,
+            derivation.salt,
+            time_cost=derivation.time_cost,
+            memory_cost=derivation.memory_kib,
+            parallelism=derivation.parallelism,
+            hash_len=32,
+            type=Type.ID,
+        )
+
+    def _expand(self, label: str, length: int) -> bytes:
+        return HKDFExpand(SHA256(), length, f"keyss/v1/{label}".encode()).derive(self._master)
+
+    def verifier(self) -> bytes:
+        """32 bytes that recognise the key and say nothing of its embedding."""
+        return self._expand("verifier", 32)
+
+    def matches(self, verifier: bytes) -> bool:
+        """Whether `verifier` is this key's, in constant time."""
+        return hmac.compare_digest(self.verifier(), verifier)
+
+    def embedding(self) -> Tensor:
+        """[64] float32 unit vector, uniform on the sphere over keys: what the decoder is conditioned on."""
+        words = np.frombuffer(self._expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
+        uniform = (words.astype(np.float64) + 0.5) / 2.0**64
+        return unit_vector(torch.from_numpy(ndtri(uniform.clip(1e-16, 1 - 1e-16))))
+
+
+def unit_vector(normal: Tensor) -> Tensor:
+    """float32 direction of a vector of independent normal numbers [..., 64]."""
+    return (normal / normal.norm(dim=-1, keepdim=True)).float()
+
+
+def random_embeddings(count: int, generator: torch.Generator) -> Tensor:
+    """[count, 64] what fresh wrong keys become: independent uniform unit vectors."""
+    return unit_vector(torch.randn(count, EMBEDDING_SIZE, generator=generator, dtype=torch.float64))

@@ -1,0 +1,157 @@
+"""Alignment: focus on focus, equal distances, up on up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from keyss.core import Camera
+from keyss.core.alignment import align, focus_point, up_direction
+from keyss.core.scene import camera_positions
+from keyss.core.similarity import Similarity
+
+
+def looking_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> Camera:
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [right, np.cross(forward, right), forward]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return Camera(torch.from_numpy(viewmat).float(), torch.eye(3), 8, 8)
+
+
+def ring(seed: int, turn: float, count: int = 30, height: float = 0.6, target: float = 0.0) -> list[Camera]:
+    """Cameras at radius 3 over `turn` radians, z up, looking roughly at (0, 0, target)."""
+    rng = np.random.default_rng(seed)
+    cameras = []
+    for i in range(count):
+        angle, radius = turn * i / count, 3 * (1 + 0.2 * rng.normal())
+        position = np.array(
+            [radius * math.cos(angle), radius * math.sin(angle), 3 * height + 0.2 * rng.normal()]
+        )
+        wobble = 0.1 * rng.normal(size=3)
+        cameras.append(looking_at(position, wobble + np.array([0, 0, target]), np.array([0.0, 0.0, 1.0])))
+    return cameras
+
+
+def random_similarity(seed: int) -> Similarity:
+    rng = np.random.default_rng(seed)
+    rotation = torch.from_numpy(Rotation.random(rng=rng).as_matrix())
+    return Similarity(float(np.exp(rng.normal())), rotation, torch.from_numpy(rng.normal(size=3)))
+
+
+def mean_distance(cameras: list[Camera]) -> float:
+    return float((camera_positions(cameras).double() - focus_point(cameras)).norm(dim=1).mean())
+
+
+def heading(cameras: list[Camera], up: Tensor) -> Tensor:
+    mean = torch.stack([camera.forward for camera in cameras]).double().mean(0)
+    across = mean - up * (up @ mean)
+    return across / across.norm()
+
+
+seeds = st.integers(0, 10_000)
+quick = settings(max_examples=25, deadline=None)
+
+
+@quick
+@given(seeds)
+def test_half_rings_come_back(seed: int) -> None:
+    """Whatever similarity moved a half ring, aligning undoes it."""
+    cameras, moved_by = ring(seed, math.pi), random_similarity(seed)
+    found = align([moved_by.apply_camera(camera) for camera in cameras], cameras) @ moved_by
+    assert found.scale == pytest.approx(1, abs=1e-4)
+    torch.testing.assert_close(found.rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.translation, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-3)
+
+
+@quick
+@given(seeds, st.sampled_from([math.pi, 1.5, 2 * math.pi]), st.sampled_from([math.pi, 2 * math.pi]))
+def test_focus_distance_and_up_coincide(seed: int, secret_turn: float, cover_turn: float) -> None:
+    world = random_similarity(seed)
+    secret = [world.apply_camera(camera) for camera in ring(seed, secret_turn, height=0.3)]
+    cover = ring(seed + 1, cover_turn, height=0.8)
+    similarity = align(secret, cover)
+    moved = [similarity.apply_camera(camera) for camera in secret]
+    torch.testing.assert_close(focus_point(moved), focus_point(cover), rtol=0, atol=1e-3)
+    assert mean_distance(moved) == pytest.approx(mean_distance(cover), rel=1e-3)
+    up = up_direction(cover)
+    torch.testing.assert_close(up_direction(moved), up, rtol=0, atol=1e-4)
+    if 2 * math.pi not in (secret_turn, cover_turn):
+        torch.testing.assert_close(heading(moved, up), heading(cover, up), rtol=0, atol=1e-4)
+
+
+def test_full_rings_are_not_turned() -> None:
+    similarity = align(ring(1, 2 * math.pi), ring(2, 2 * math.pi))
+    torch.testing.assert_close(similarity.rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("turn", [1.5, math.pi, 2 * math.pi])
+def test_up_does_not_lean(turn: float) -> None:
+    """Although the mean of the cameras' own up vectors does on a part of a ring."""
+    up = up_direction(ring(0, turn, height=1.0))
+    assert up is not None
+    assert up[2] > 0.999
+
+
+def test_focus_is_where_the_cameras_look() -> None:
+    assert focus_point(ring(0, math.pi, count=200, target=0.7)).tolist() == pytest.approx(
+        [0, 0, 0.7], abs=0.05
+    )
+
+
+def test_parallel_axes_focus_in_front() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    places = [np.array([0.0, y, z]) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
+    cameras = [looking_at(place, place + np.array([1.0, 0, 0]), up) for place in places]
+    assert focus_point(cameras).tolist() == pytest.approx([math.sqrt(2), 0, 0], abs=1e-5)
+    found = up_direction(cameras)
+    assert found is not None
+    assert found.tolist() == pytest.approx([0, 0, 1], abs=1e-6)
+
+
+def test_axes_that_meet_behind_the_cameras() -> None:
+    """Cameras that look outwards from a ring: the focus is not the ring's centre seen from behind."""
+    up = np.array([0.0, 0.0, 1.0])
+    places = [np.array([math.cos(a), math.sin(a), 0.0]) for a in np.linspace(-0.6, 0.6, 9)]
+    focus = focus_point([looking_at(place, 2 * place, up) for place in places])
+    assert focus[0] > 1
+
+
+def test_one_camera_each() -> None:
+    secret, cover = ring(0, 1.0, count=1), ring(5, 1.0, count=1)
+    moved = align(secret, cover).apply_camera(secret[0])
+    torch.testing.assert_close(moved.viewmat, cover[0].viewmat, rtol=0, atol=1e-4)
+
+
+def test_without_up_nothing_turns() -> None:
+    cameras = ring(0, math.pi, height=0.0)
+    flips = torch.diag(torch.tensor([-1.0, -1, 1, 1]))
+    rolled = [Camera(flips @ c.viewmat, c.K, c.width, c.height) for c in ring(0, math.pi, height=0.0)]
+    assert up_direction(cameras + rolled) is None
+    similarity = align(cameras + rolled, ring(2, math.pi))
+    assert torch.equal(similarity.rotation, torch.eye(3, dtype=torch.float64))
+
+
+def test_upside_down() -> None:
+    cover = ring(3, 2 * math.pi)
+    half_turn = Similarity(rotation=torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64)))
+    secret = [half_turn.apply_camera(camera) for camera in cover]
+    similarity = align(secret, cover)
+    up, turned = up_direction(cover), up_direction(secret)
+    assert up is not None
+    assert turned is not None
+    torch.testing.assert_close(similarity.rotation @ turned, up, rtol=0, atol=1e-6)
+
+
+def test_no_cameras() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        align([], ring(0, 1.0))

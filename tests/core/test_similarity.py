@@ -1,0 +1,197 @@
+"""Similarity transforms: what moves together still looks the same."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _eval_sh_bases_fast
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from keyss.core import Camera, Gaussians
+from keyss.core.similarity import Similarity
+
+
+def random_similarity(seed: int) -> Similarity:
+    rng = np.random.default_rng(seed)
+    rotation = torch.from_numpy(Rotation.random(rng=rng).as_matrix())
+    return Similarity(float(np.exp(rng.normal())), rotation, torch.from_numpy(rng.normal(size=3)))
+
+
+def random_gaussians(seed: int, degree: int = 3, n: int = 20) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, (degree + 1) ** 2, 3)]
+    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+
+
+def random_camera(seed: int) -> Camera:
+    rng = np.random.default_rng(seed)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.from_numpy(Rotation.random(rng=rng).as_matrix())
+    viewmat[:3, 3] = torch.from_numpy(rng.normal(size=3))
+    return Camera(viewmat, torch.tensor([[80.0, 0, 32], [0, 90, 24], [0, 0, 1]]), 64, 48, "a")
+
+
+def covariances(gaussians: Gaussians) -> Tensor:
+    """[N, 3, 3] float64."""
+    w, x, y, z = gaussians.quats.double().unbind(-1)
+    turns = torch.from_numpy(Rotation.from_quat(torch.stack([x, y, z, w], -1).numpy()).as_matrix())
+    axes = turns * gaussians.scales.double()[:, None, :]
+    return axes @ axes.transpose(1, 2)
+
+
+seeds = st.integers(0, 10_000)
+quick = settings(max_examples=40, deadline=None)
+
+
+@quick
+@given(seeds)
+def test_inverse_and_composition(seed: int) -> None:
+    a, b = random_similarity(seed), random_similarity(seed + 1)
+    points = torch.randn(10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    torch.testing.assert_close((a @ b).apply_points(points), a.apply_points(b.apply_points(points)))
+    torch.testing.assert_close(a.inverse().apply_points(a.apply_points(points)), points)
+    back = a @ a.inverse()
+    assert back.scale == pytest.approx(1)
+    torch.testing.assert_close(back.rotation, torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(back.translation, torch.zeros(3, dtype=torch.float64))
+
+
+@quick
+@given(seeds)
+def test_camera_sees_the_same_image_of_the_moved_world(seed: int) -> None:
+    similarity, camera = random_similarity(seed), random_camera(seed)
+    points = torch.randn(10, 3, generator=torch.Generator().manual_seed(seed))
+
+    def seen(camera: Camera, points: Tensor) -> Tensor:
+        return points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+
+    moved = similarity.apply_camera(camera)
+    expected = similarity.scale * seen(camera, points)
+    torch.testing.assert_close(seen(moved, similarity.apply_points(points)), expected, rtol=1e-4, atol=1e-4)
+    rigid = moved.viewmat[:3, :3]
+    torch.testing.assert_close(rigid @ rigid.T, torch.eye(3), rtol=0, atol=1e-6)
+    torch.testing.assert_close(moved.position, similarity.apply_points(camera.position), rtol=1e-4, atol=1e-4)
+    assert (moved.width, moved.height, moved.name) == (camera.width, camera.height, camera.name)
+    assert moved.viewmat.dtype == torch.float32
+
+
+@quick
+@given(seeds)
+def test_covariances_and_quaternion_lengths(seed: int) -> None:
+    similarity, gaussians = random_similarity(seed), random_gaussians(seed)
+    moved = similarity.apply_gaussians(gaussians)
+    turn = similarity.rotation
+    expected = similarity.scale**2 * turn @ covariances(gaussians) @ turn.T
+    torch.testing.assert_close(covariances(moved), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(moved.quats.norm(dim=1), gaussians.quats.norm(dim=1))
+    assert torch.equal(moved.opacity_logits, gaussians.opacity_logits)
+    assert {getattr(moved, name).dtype for name in ("means", "quats", "log_scales", "sh")} == {torch.float32}
+
+
+@quick
+@given(seeds)
+def test_quaternions_agree_with_scipy(seed: int) -> None:
+    """Also where one component dominates or vanishes, as in half turns."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3) * rng.integers(0, 2, size=3)
+    turn = Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-9) * rng.choice([0, 1e-7, 1, np.pi]))
+    identity = Gaussians(
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.zeros(1, 3),
+        torch.zeros(1),
+        torch.zeros(1, 1, 3),
+    )
+    similarity = Similarity(rotation=torch.from_numpy(turn.as_matrix()))
+    w, x, y, z = similarity.apply_gaussians(identity).quats[0].double().tolist()
+    assert (Rotation.from_quat([x, y, z, w]) * turn.inv()).magnitude() < 1e-6
+
+
+@quick
+@given(seeds, st.integers(0, 3))
+def test_colour_turns_with_the_world(seed: int, degree: int) -> None:
+    similarity, gaussians = random_similarity(seed), random_gaussians(seed, degree)
+    directions = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
+    k = (degree + 1) ** 2
+    before = _eval_sh_bases_fast(k, directions @ similarity.rotation) @ gaussians.sh.double()
+    after = _eval_sh_bases_fast(k, directions) @ similarity.apply_gaussians(gaussians).sh.double()
+    torch.testing.assert_close(after, before, rtol=0, atol=3e-6)
+
+
+def test_colour_rotation_is_exact_in_float64() -> None:
+    similarity, gaussians = random_similarity(3), random_gaussians(3).map(Tensor.double)
+    directions = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
+    before = _eval_sh_bases_fast(16, directions @ similarity.rotation) @ gaussians.sh
+    after = _eval_sh_bases_fast(16, directions) @ similarity.apply_gaussians(gaussians).sh
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
+
+
+def test_gaussians_come_back() -> None:
+    similarity, gaussians = random_similarity(7), random_gaussians(7)
+    back = similarity.inverse().apply_gaussians(similarity.apply_gaussians(gaussians))
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        torch.testing.assert_close(getattr(back, name), getattr(gaussians, name), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(covariances(back), covariances(gaussians), rtol=1e-4, atol=1e-4)
+
+
+def test_is_differentiable() -> None:
+    gaussians = random_gaussians(1).map(Tensor.requires_grad_)
+    moved = random_similarity(1).apply_gaussians(gaussians)
+    sum(getattr(moved, name).square().sum() for name in ("means", "quats", "log_scales", "sh")).backward()
+    assert all(getattr(gaussians, name).grad.isfinite().all() for name in ("means", "quats", "sh"))
+
+
+@quick
+@given(seeds)
+def test_json_is_exact(seed: int) -> None:
+    similarity = random_similarity(seed)
+    back = Similarity.from_json(json.loads(json.dumps(similarity.to_json())))
+    assert back.scale == similarity.scale
+    assert torch.equal(back.rotation, similarity.rotation)
+    assert torch.equal(back.translation, similarity.translation)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scale": 0.0},
+        {"scale": -1.0},
+        {"scale": math.inf},
+        {"scale": True},
+        {"scale": "1"},
+        {"scale": 10**400},
+        {"translation": [0.0, math.nan, 0.0]},
+        {"translation": [0.0, 0.0]},
+        {"translation": 3},
+        {"rotation": [[1, 0, 0], [0, 1, 0]]},
+        {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
+        {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1.00001]]},
+        {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, None]]},
+        {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, math.nan]]},
+        {"unknown": 1},
+    ],
+)
+def test_bad_json(change: dict[str, Any]) -> None:
+    good = Similarity.identity().to_json()
+    Similarity.from_json(good)
+    with pytest.raises(ValueError, match="similarity: "):
+        Similarity.from_json(good | change)
+
+
+@pytest.mark.parametrize("data", [None, [], {}, "identity", {"scale": 1.0}])
+def test_json_of_something_else(data: object) -> None:
+    with pytest.raises(ValueError, match="similarity: "):
+        Similarity.from_json(data)
+
+
+def test_bad_shapes() -> None:
+    with pytest.raises(ValueError, match="expected a"):
+        Similarity(rotation=torch.eye(4))

@@ -1,0 +1,163 @@
+"""Scenes in the layout of NeRF-synthetic."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from files.scene_files import frames, look_at_origin, photo, save, write_blender, write_json
+from keyss.core import InputError, UsageError
+from keyss.files import load_scene
+
+
+def test_lego_looks_at_the_origin(real_data: Path) -> None:
+    scene = load_scene(real_data / "lego", width=100)
+    assert (scene.name, len(scene.train), len(scene.test)) == ("lego", 100, 25)
+    assert scene.background.tolist() == [1, 1, 1]
+    assert scene.points.shape == scene.colors.shape == (0, 3)
+    for view in scene.views:
+        camera = view.camera
+        towards_origin = -camera.position / camera.position.norm()
+        assert float(camera.forward @ towards_origin) > 0.999
+        assert camera.up[2] > -1e-4  # the cameras stand on the upper hemisphere, upright
+        focal = 50 / math.tan(0.6911112070083618 / 2)
+        np.testing.assert_allclose(camera.K, [[focal, 0, 50], [0, focal, 50], [0, 0, 1]], rtol=1e-6)
+        assert view.image[0, 0].tolist() == [255, 255, 255]
+        assert view.image.float().mean() < 250  # there is something on the white
+    assert scene.train[0].camera.name == "train/r_0.png"
+
+
+def test_poses_are_rigid_and_in_opencv_axes(tmp_path: Path) -> None:
+    camera = load_scene(write_blender(tmp_path)).train[0].camera
+    assert camera.position.tolist() == pytest.approx([4, 0, 0], abs=1e-6)
+    assert camera.forward.tolist() == pytest.approx([-1, 0, 0], abs=1e-6)
+    assert camera.up.tolist() == pytest.approx([0, 0, 1], abs=1e-6)
+    assert camera.K[0, 0] == camera.K[1, 1] == pytest.approx(6 / math.tan(0.35))
+
+
+@pytest.mark.parametrize("background", [None, (0.0, 0.5, 1.0), torch.tensor([0.2, 0.0, 0.4])])
+def test_transparency_shows_the_background(tmp_path: Path, background: object) -> None:
+    scene = load_scene(write_blender(tmp_path), background=background)  # type: ignore[arg-type]
+    behind = np.array([1, 1, 1] if background is None else list(background), np.float64)
+    rgba = photo(0, 4).astype(np.float64)
+    alpha = rgba[:, :, 3:] / 255
+    expected = rgba[:, :, :3] * alpha + 255 * behind * (1 - alpha)
+    assert np.abs(scene.train[0].image.numpy() - expected).max() <= 0.51
+    np.testing.assert_allclose(scene.background, behind, rtol=1e-6)
+
+
+@pytest.mark.parametrize("background", [(0, 0), (0, 0, 2), (0, 0, math.nan), torch.tensor([-1.0, 0, 0])])
+def test_backgrounds_out_of_range_are_refused(tmp_path: Path, background: object) -> None:
+    with pytest.raises(UsageError, match=r"three numbers in \[0, 1\]"):
+        load_scene(tmp_path, background=background)  # type: ignore[arg-type]
+
+
+def test_opaque_photos_have_a_black_background(tmp_path: Path) -> None:
+    scene = load_scene(write_blender(tmp_path, channels=3))
+    assert scene.background.tolist() == [0, 0, 0]
+    assert np.array_equal(scene.train[1].image.numpy(), photo(1))
+
+
+@pytest.mark.parametrize(
+    ("splits", "train", "test"),
+    [
+        (("train", "test", "val"), ["train/r_0.png", "train/r_1.png"], ["test/r_0.png", "test/r_1.png"]),
+        (("train", "val"), ["train/r_0.png", "train/r_1.png"], ["val/r_0.png", "val/r_1.png"]),
+        (("train",), ["train/r_1.png"], ["train/r_0.png"]),
+    ],
+)
+def test_which_photos_are_for_testing(
+    tmp_path: Path, splits: tuple[str, ...], train: list[str], test: list[str]
+) -> None:
+    scene = load_scene(write_blender(tmp_path, splits))
+    assert [v.camera.name for v in scene.train] == train
+    assert [v.camera.name for v in scene.test] == test
+
+
+def test_training_photos_are_not_tested_on(tmp_path: Path) -> None:
+    write_blender(tmp_path)
+    (tmp_path / "transforms_test.json").write_text((tmp_path / "transforms_train.json").read_text())
+    with pytest.raises(InputError, match=r"every image once, found 'train/r_0\.png' twice"):
+        load_scene(tmp_path)
+
+
+def test_uniform_scale_and_rounding_leave_a_rigid_motion(tmp_path: Path) -> None:
+    write_blender(tmp_path)
+    matrix = np.array(look_at_origin(0.5))
+    matrix[:3, :3] *= 2.5
+    matrix[:3, :3] += 1e-3
+    write_transforms(tmp_path, matrix.tolist())
+    camera = load_scene(tmp_path).train[0].camera
+    rotation = camera.viewmat[:3, :3].double()
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(camera.position, matrix[:3, 3], atol=1e-5)
+
+
+def write_transforms(folder: Path, matrix: object) -> None:
+    meta = {"camera_angle_x": 0.7, "frames": frames(["train/r_0", "train/r_1"])}
+    meta["frames"][0]["transform_matrix"] = matrix  # type: ignore[index]
+    write_json(folder / "transforms_train.json", meta)
+
+
+def changed(row: int, column: int, value: object) -> list[list[object]]:
+    matrix: list[list[object]] = [list(r) for r in look_at_origin(0.0)]
+    matrix[row][column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (None, "expected a 4x4 `transform_matrix`, found nothing"),
+        ([[1, 0, 0, 0]], "expected a 4x4"),
+        ([[1, 0, 0]] * 4, "expected a 4x4"),
+        ([1, 2, 3, 4], "expected a 4x4"),
+        (changed(0, 0, "one"), "expected a finite number"),
+        (changed(0, 0, None), "expected a finite number"),
+        (changed(0, 0, True), "expected a finite number"),
+        (changed(0, 3, math.nan), "expected a finite number"),
+        (changed(0, 3, 10**400), "expected a finite number"),
+        (changed(0, 3, 1e300), "finite `transform_matrix`"),
+        (changed(3, 3, 2.0), "ends in 0 0 0 1"),
+        (changed(0, 2, 1.1), "with a rotation"),
+        (changed(0, 2, -1.0), "with a rotation"),  # a mirror
+        ([[0, 0, 0, 1]] * 3, "with a rotation"),
+    ],
+)
+def test_impossible_poses_are_named(tmp_path: Path, matrix: object, message: str) -> None:
+    write_transforms(write_blender(tmp_path), matrix)
+    with pytest.raises(InputError, match=f"transforms_train.json: frame 0: .*{message}"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("angle", [0, -1, 3.2, "wide", None, math.inf, [0.7]])
+def test_impossible_angles_are_named(tmp_path: Path, angle: object) -> None:
+    path = write_blender(tmp_path) / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"camera_angle_x": angle}))
+    with pytest.raises(InputError, match="camera_angle_x"):
+        load_scene(tmp_path)
+
+
+def test_missing_photos_and_wrong_sizes_are_named(tmp_path: Path) -> None:
+    write_blender(tmp_path)
+    meta = json.loads((tmp_path / "transforms_train.json").read_text())
+    write_json(tmp_path / "transforms_train.json", meta | {"w": 13, "h": 8})
+    with pytest.raises(InputError, match=r"r_0\.png: .* its camera, 13x8 .* found 12x8"):
+        load_scene(tmp_path)
+    write_json(tmp_path / "transforms_train.json", meta | {"w": 24, "h": 16})
+    assert load_scene(tmp_path).train[0].camera.K[0, 0] == pytest.approx(6 / math.tan(0.35))
+    (tmp_path / "train" / "r_1.png").unlink()
+    with pytest.raises(InputError, match="r_1: expected an image"):
+        load_scene(tmp_path)
+
+
+def test_jpeg_extension_is_found_too(tmp_path: Path) -> None:
+    write_blender(tmp_path)
+    (tmp_path / "train" / "r_0.png").unlink()
+    save(tmp_path / "train" / "r_0.jpg", photo(0))
+    assert load_scene(tmp_path).train[0].camera.name == "train/r_0.jpg"

@@ -1,0 +1,273 @@
+"""COLMAP scenes: pycolmap is the oracle for what is valid, and nothing broken gets through."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from files.scene_files import (
+    camera_bytes,
+    counted,
+    image_bytes,
+    mutations,
+    photo,
+    point_bytes,
+    save,
+    write_colmap,
+)
+from keyss.core import InputError
+from keyss.files import load_scene
+from keyss.files.colmap import read_colmap
+
+BINARIES = ("cameras.bin", "images.bin", "points3D.bin")
+
+
+def as_text(binary: Path, text: Path) -> None:
+    """COLMAP's own conversion of a model to .txt."""
+    text.mkdir(parents=True)
+    pycolmap.Reconstruction(binary).write_text(text)
+
+
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", "."])
+def test_the_model_is_found_in_each_of_its_places(tmp_path: Path, model: str) -> None:
+    scene = load_scene(write_colmap(tmp_path / "kitchen", model=model))
+    assert scene.name == "kitchen"
+    assert [v.camera.name for v in scene.test] == ["00.png"]
+    assert [v.camera.name for v in scene.train] == ["01.png", "02.png"]
+    assert scene.points.tolist() == [[-1, 0, 1], [1, 2, 3]]  # by id
+    assert scene.colors.tolist() == [[255, 0, 9], [1, 2, 3]]
+    assert scene.points.dtype == torch.float32
+    assert scene.colors.dtype == torch.uint8
+    assert scene.background.tolist() == [0, 0, 0]
+    camera = scene.train[0].camera
+    assert camera.K.tolist() == [[10, 0, 6], [0, 11, 4], [0, 0, 1]]
+    assert (camera.width, camera.height) == (12, 8)
+    assert np.array_equal(scene.train[0].image.numpy(), photo(1))
+
+
+def test_agrees_with_pycolmap_on_a_real_scene(real_data: Path, tmp_path: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
+    layout = read_colmap(real_data / "fox")
+    by_name = {image.name: image for image in reconstruction.images.values()}
+    assert {p.name for p in layout.train + layout.test} == by_name.keys()
+    for taken in layout.train + layout.test:
+        image = by_name[taken.name]
+        np.testing.assert_allclose(taken.viewmat[:3], image.cam_from_world().matrix(), atol=1e-12)
+        np.testing.assert_allclose(taken.lens.K, image.camera.calibration_matrix())
+    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
+    np.testing.assert_array_equal(layout.points.xyz, np.array([p.xyz for p in points], np.float32))
+    np.testing.assert_array_equal(layout.points.rgb, [p.color for p in points])
+
+    as_text(real_data / "fox" / "sparse" / "0", tmp_path / "fox" / "sparse" / "0")
+    text = read_colmap(tmp_path / "fox")
+    np.testing.assert_array_equal(text.points.xyz, layout.points.xyz)
+    np.testing.assert_array_equal(text.points.rgb, layout.points.rgb)
+    for ours, theirs in zip(text.train + text.test, layout.train + layout.test, strict=True):
+        assert (ours.name, ours.lens) == (theirs.name, theirs.lens)
+        np.testing.assert_allclose(ours.viewmat, theirs.viewmat, atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [None, 200])
+def test_points_land_on_their_observations(real_data: Path, width: int | None) -> None:
+    reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
+    by_name = {image.name: image for image in reconstruction.images.values()}
+    scene = load_scene(real_data / "fox", width=width)
+    assert (len(scene.train), len(scene.test)) == (43, 7)
+    for view in scene.views:
+        seen = [p for p in by_name[view.camera.name].points2D if p.has_point3D()]
+        world = np.array([reconstruction.points3D[p.point3D_id].xyz for p in seen])
+        observed = np.array([p.xy for p in seen]) * (view.camera.width / 540, view.camera.height / 960)
+        viewmat, K = view.camera.viewmat.double().numpy(), view.camera.K.double().numpy()
+        projected = (world @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+        error = projected[:, :2] / projected[:, 2:] - observed
+        assert np.linalg.norm(error, axis=1).mean() < view.camera.width / 540
+        assert view.image.shape == (view.camera.height, view.camera.width, 3)
+
+
+def test_a_large_model_is_read_quickly(real_data: Path) -> None:
+    start = time.perf_counter()
+    layout = read_colmap(real_data / "bonsai")
+    assert time.perf_counter() - start < 2
+    assert (len(layout.train), len(layout.test), len(layout.points.xyz)) == (255, 37, 72_074)
+
+
+def test_text_models_with_comments_empty_lines_and_spaces_in_names(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "scene")
+    model = folder / "sparse" / "0"
+    for name in BINARIES:
+        (model / name).unlink()
+    save(folder / "images" / "left camera" / "1 a.png", photo(9))
+    (model / "cameras.txt").write_text("# cameras\r\n1 SIMPLE_PINHOLE 12 8 10 6 4\r\n\r\n")
+    images = "#\n\n1 2 0 0 0 0 0 4 1 left camera/1 a.png\n\n2 1 0 0 0 0 0 4 1 01.png\n1.0 2.0 -1\n"
+    (model / "images.txt").write_text(images)
+    (model / "points3D.txt").write_text("5 1 2 3 4 5 6 0.1 1 0 2 0\n")
+    scene = load_scene(folder)
+    assert [v.camera.name for v in scene.views] == ["left camera/1 a.png", "01.png"]
+    assert torch.equal(
+        scene.train[0].camera.viewmat[:3, :3], torch.eye(3)
+    )  # the quaternion was not normalised
+    assert scene.points.tolist() == [[1, 2, 3]]
+
+
+def test_no_points_and_no_observations(tmp_path: Path) -> None:
+    images = counted(*(image_bytes(i, f"0{i}.png", observations=0) for i in range(2)))
+    scene = load_scene(write_colmap(tmp_path, images=images, points3D=counted()))
+    assert scene.points.shape == scene.colors.shape == (0, 3)
+
+
+@pytest.mark.parametrize("name", BINARIES)
+def test_every_truncation_is_an_input_error(tmp_path: Path, name: str) -> None:
+    path = write_colmap(tmp_path) / "sparse" / "0" / name
+    data = path.read_bytes()
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=name):
+            read_colmap(tmp_path)
+    path.write_bytes(data + b"\0")
+    with pytest.raises(InputError, match="end of the file"):
+        read_colmap(tmp_path)
+
+
+def test_truncated_points_of_a_real_scene(real_data: Path, tmp_path: Path) -> None:
+    data = (real_data / "fox" / "sparse" / "0" / "points3D.bin").read_bytes()
+    folder = write_colmap(tmp_path)
+    for length in np.random.default_rng(0).integers(0, len(data), 20):
+        (folder / "sparse" / "0" / "points3D.bin").write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"points3D\.bin.*(truncated|number)"):
+            read_colmap(folder)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("kind", ["cameras", "images", "points3D"])
+def test_damage_gives_an_input_error_or_a_scene(tmp_path: Path, kind: str, suffix: str) -> None:
+    folder = write_colmap(tmp_path / "scene")
+    model = folder / "sparse" / "0"
+    if suffix == ".txt":
+        as_text(model, tmp_path / "text")
+        for name in BINARIES:
+            (model / name).unlink()
+        for path in (tmp_path / "text").iterdir():
+            path.rename(model / path.name)
+    path = model / (kind + suffix)
+    outcomes = set()
+    for broken in mutations(path.read_bytes(), 150):
+        path.write_bytes(broken)
+        try:
+            scene = load_scene(folder)
+        except InputError:
+            outcomes.add("refused")
+        else:
+            outcomes.add("read")
+            cameras = [view.camera for view in scene.views]
+            assert all(c.viewmat.isfinite().all() and c.K.isfinite().all() for c in cameras)
+            assert scene.points.isfinite().all()
+    assert outcomes == {"refused", "read"}
+
+
+@pytest.mark.parametrize("name", BINARIES)
+@pytest.mark.parametrize("count", [2**64 - 1, 2**63, 2**40, 1000])
+def test_absurd_counts_are_refused_before_allocating(tmp_path: Path, name: str, count: int) -> None:
+    path = write_colmap(tmp_path) / "sparse" / "0" / name
+    path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
+    with pytest.raises(InputError, match=f"expected {count} "):
+        read_colmap(tmp_path)
+
+
+def two_images(*last: bytes) -> bytes:
+    return counted(image_bytes(1, "00.png"), *last)
+
+
+@pytest.mark.parametrize(
+    ("replaced", "message"),
+    [
+        (
+            {"images": two_images(image_bytes(2, "01.png", quaternion=(0, 0, 0, 0)))},
+            "image 2: expected a rotation",
+        ),
+        (
+            {"images": two_images(image_bytes(2, "01.png", quaternion=(math.nan, 0, 0, 1)))},
+            "expected a rotation",
+        ),
+        ({"images": two_images(image_bytes(2, "01.png", quaternion=(1e308,) * 4))}, "expected a rotation"),
+        (
+            {"images": two_images(image_bytes(2, "01.png", translation=(0, math.inf, 0)))},
+            "finite translation",
+        ),
+        ({"images": two_images(image_bytes(2, "01.png", translation=(0, 1e300, 0)))}, "finite translation"),
+        ({"images": two_images(image_bytes(2, "01.png", camera_id=5))}, "camera 5, which does not exist"),
+        ({"images": two_images(image_bytes(2, "00.png"))}, "'00.png' twice"),
+        ({"images": two_images(image_bytes(2, "x" * 5000))}, "image name of up to 4095 bytes"),
+        (
+            {"images": two_images(image_bytes(2, "missing.png"))},
+            r"missing\.png: expected an image, but there is no",
+        ),
+        ({"images": two_images(image_bytes(2, "../images/01.png"))}, "inside images/"),
+        ({"images": two_images(image_bytes(2, "a\\..\\01.png"))}, "inside images/"),
+        ({"images": two_images(image_bytes(2, "/etc/passwd"))}, "inside images/"),
+        ({"images": two_images(image_bytes(2, "C:\\01.png"))}, "inside images/"),
+        ({"images": two_images(image_bytes(2, "a\nb"))}, "inside images/"),
+        ({"images": two_images(image_bytes(2, ""))}, "inside images/"),
+        ({"images": two_images()}, "at least 2 posed images"),
+        ({"images": counted()}, "at least 2 posed images"),
+        ({"cameras": counted(camera_bytes(), camera_bytes())}, "id 1 twice"),
+        (
+            {"cameras": counted(camera_bytes(model=7, params=(1, 1, 6, 4, 0.1)))},
+            "camera model FOV is not supported",
+        ),
+        ({"cameras": counted(camera_bytes(model=-1))}, "camera model number -1 is not supported"),
+        ({"cameras": counted(camera_bytes(params=(-1, 1, 6, 4)))}, "focal lengths"),
+        ({"cameras": counted(camera_bytes(params=(math.nan, 1, 6, 4)))}, "focal lengths"),
+        ({"cameras": counted(camera_bytes(params=(9, 9, math.inf, 4)))}, "principal point"),
+        ({"cameras": counted(camera_bytes(model=2, params=(9, 6, 4, math.nan)))}, "coefficients.*k1=nan"),
+        ({"cameras": counted(camera_bytes(model=2, params=(9, 6, 4, -50)))}, "cannot be undone"),
+        ({"cameras": counted(camera_bytes(width=0))}, "found 0x8"),
+        ({"cameras": counted(camera_bytes(height=2**60))}, "image size"),
+        ({"points3D": counted(point_bytes(1, (0, math.nan, 0)))}, "expected finite points"),
+        ({"points3D": counted(point_bytes(1, (0, 1e200, 0)))}, "expected finite points"),
+    ],
+)
+def test_impossible_values_are_named(tmp_path: Path, replaced: dict[str, bytes], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_scene(write_colmap(tmp_path, **replaced))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("cameras.txt", "1 PINHOLE 12\n", "line 1: expected `CAMERA_ID MODEL"),
+        ("cameras.txt", "1 PINHOLE 12 8 10 11 6\n", "expected 4 numbers, found 3"),
+        ("cameras.txt", "1 PINHOLE 12 x 10 11 6 4\n", "expected a number .*'x'"),
+        ("cameras.txt", "1 EUCM 12 8 10 11 6 4\n", "EUCM is not supported"),
+        ("images.txt", "1 1 0 0 0 0 0 4 1\n", "line 1: expected `IMAGE_ID"),
+        ("images.txt", "1 1 0 0 0 0 0 nan 1 00.png\n", "finite translation"),
+        ("points3D.txt", "1 0 0 0\n", "line 1: expected `POINT3D_ID"),
+        ("points3D.txt", "1 0 0 0 0 256 0 0.5\n", "colours of 0 to 255"),
+        ("points3D.txt", "1 0 inf 0 0 0 0 0.5\n", "finite points"),
+        ("points3D.txt", "1 0 0 0 0 0 0\n", "expected `POINT3D_ID"),
+        ("points3D.txt", "1 0 0 0 0 0 blue 0\n", "expected a number .*'blue'"),
+    ],
+)
+def test_broken_text_names_the_line(tmp_path: Path, name: str, text: str, message: str) -> None:
+    model = write_colmap(tmp_path / "scene") / "sparse" / "0"
+    as_text(model, tmp_path / "text")
+    (tmp_path / "text" / name).write_text(text)
+    for path in BINARIES:
+        (model / path).unlink()
+    for path in (tmp_path / "text").iterdir():
+        path.rename(model / path.name)
+    with pytest.raises(InputError, match=message):
+        read_colmap(tmp_path / "scene")
+
+
+@pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
+def test_missing_model_files_are_named(tmp_path: Path, name: str) -> None:
+    (write_colmap(tmp_path) / "sparse" / "0" / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: expected a file"):
+        load_scene(tmp_path)

@@ -1,0 +1,292 @@
+"""Scenes in Nerfstudio's layout."""
+
+from __future__ import annotations
+
+import copy
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from files.scene_files import frames, mutations, photo, save, write_json, write_nerfstudio
+from keyss.core import InputError
+from keyss.files import load_scene
+from keyss.files.lens import undistortion
+from keyss.files.nerfstudio import read_nerfstudio
+from keyss.files.point_cloud import read_point_cloud
+
+
+def test_intrinsics_of_the_file_and_of_a_frame(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path / "desk")
+    meta = json.loads((tmp_path / "desk" / "transforms.json").read_text())
+    meta["frames"][1] |= {"fl_x": 20, "cx": 5.0, "w": 12.0}
+    write_json(tmp_path / "desk" / "transforms.json", meta)
+    scene = load_scene(tmp_path / "desk")
+    assert scene.name == "desk"
+    assert [v.camera.name for v in scene.test] == ["images/frame_00000.png"]
+    assert scene.train[0].camera.K.tolist() == [[20, 0, 5], [0, 11, 4], [0, 0, 1]]
+    assert scene.train[1].camera.K.tolist() == [[10, 0, 6.5], [0, 11, 4], [0, 0, 1]]
+    assert np.array_equal(scene.train[1].image.numpy(), photo(2))
+    assert scene.test[0].camera.position.tolist() == pytest.approx([4, 0, 0], abs=1e-6)
+    assert scene.test[0].camera.forward.tolist() == pytest.approx([-1, 0, 0], abs=1e-6)
+
+
+def test_focal_lengths_from_angles_and_sizes_from_photos(tmp_path: Path) -> None:
+    angle = 2 * np.arctan(0.5)
+    cut = {"w": None, "h": None, "fl_x": None, "fl_y": None, "cx": None, "cy": None}
+    camera = load_scene(write_nerfstudio(tmp_path, camera_angle_x=angle, **cut)).train[0].camera
+    np.testing.assert_allclose(camera.K, [[12, 0, 6], [0, 12, 4], [0, 0, 1]], rtol=1e-6)
+    camera = (
+        load_scene(write_nerfstudio(tmp_path, camera_angle_x=angle, camera_angle_y=angle, **cut))
+        .train[0]
+        .camera
+    )
+    np.testing.assert_allclose(camera.K, [[12, 0, 6], [0, 8, 4], [0, 0, 1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("keys", "model", "params"),
+    [
+        ({"k1": 0.1, "k2": -0.05, "p1": 0.004, "p2": -0.006}, "OPENCV", [0.1, -0.05, 0.004, -0.006]),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": -0.1}, "OPENCV", [-0.1, 0, 0, 0]),
+        ({"k1": 0.1, "k2": -0.05, "k3": 0.02}, "FULL_OPENCV", [0.1, -0.05, 0, 0, 0.02, 0, 0, 0]),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.03, "k2": -0.02, "k3": 0.004, "k4": -0.001},
+            "OPENCV_FISHEYE",
+            [0.03, -0.02, 0.004, -0.001],
+        ),
+        ({"is_fisheye": True, "k1": 0.03}, "OPENCV_FISHEYE", [0.03, 0, 0, 0]),
+    ],
+)
+def test_distortion_means_what_colmap_means(
+    tmp_path: Path, keys: dict[str, object], model: str, params: list[float]
+) -> None:
+    lens = read_nerfstudio(write_nerfstudio(tmp_path, **keys)).train[0].lens
+    oracle = pycolmap.Camera(model=model, width=12, height=8, params=[10, 11, 6.5, 4, *params])
+    straight = undistortion(lens, "here")
+    columns, rows = np.meshgrid(np.arange(12) + 0.5, np.arange(8) + 0.5)
+    rays = (
+        np.stack([columns, rows, np.ones_like(rows)], axis=2).reshape(-1, 3)
+        @ np.linalg.inv(straight.pinhole.K).T
+    )
+    ours = np.stack([straight.map_x, straight.map_y], axis=2) + 0.5
+    np.testing.assert_allclose(ours.reshape(-1, 2), oracle.img_from_cam(rays), atol=1e-4)
+
+
+def names(folder: Path) -> tuple[list[str], list[str]]:
+    layout = read_nerfstudio(folder)
+    return [p.name[-5] for p in layout.train], [p.name[-5] for p in layout.test]  # type: ignore[return-value]
+
+
+def test_splits(tmp_path: Path) -> None:
+    path = [f"images/frame_{i:05}.png" for i in range(10)]
+    assert names(write_nerfstudio(tmp_path, 10)) == ([*"1234567", "9"], ["0", "8"])
+    both = {"train_filenames": path[:3], "test_filenames": ["./" + path[5]]}
+    assert names(write_nerfstudio(tmp_path, 10, **both)) == (["0", "1", "2"], ["5"])
+    validation = {"train_filenames": path[:3], "test_filenames": [], "val_filenames": path[6:8]}
+    assert names(write_nerfstudio(tmp_path, 10, **validation)) == (["0", "1", "2"], ["6", "7"])
+    assert names(write_nerfstudio(tmp_path, 4, train_filenames=path[:3])) == (["0", "1", "2"], ["3"])
+    assert names(write_nerfstudio(tmp_path, 4, test_filenames=path[:3])) == (["3"], ["0", "1", "2"])
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"train_filenames": "images/frame_00000.png"}, "expected a list as `train_filenames`, found str"),
+        ({"train_filenames": [3]}, "expected a relative `file_path`, found 3"),
+        ({"train_filenames": ["images/none.png"]}, "none.png: expected an image"),
+        (
+            {"train_filenames": ["images/frame_00000.png"], "test_filenames": ["images/frame_00000.png"]},
+            "found 'images/frame_00000.png' in both",
+        ),
+        (
+            {"test_filenames": [f"images/frame_0000{i}.png" for i in range(3)]},
+            "at least one image to train on",
+        ),
+        ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not supported"),
+        ({"camera_model": 5}, "5 is not supported"),
+        ({"camera_model": ["OPENCV"]}, "a list of 1 is not supported"),
+        ({"k4": 0.1}, "expected k4 = 0"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "a fisheye lens has no coefficients p1"),
+        ({"fl_x": None, "fl_y": None}, "expected `fl_x` or `camera_angle_x`, found neither"),
+        ({"fl_x": -10}, "focal lengths"),
+        ({"w": 12.5}, "whole number as `w`"),
+        ({"w": "12"}, "finite number as `w`"),
+        ({"h": 0}, "image size"),
+        ({"h": 9}, "found 12x8"),
+        ({"frames": []}, "at least one frame, found a list of 0"),
+        ({"frames": {"a": 1}}, "at least one frame, found a dict of 1"),
+        ({"frames": None}, "at least one frame, found nothing"),
+        ({"frames": [1]}, "frame 0: expected an object, found 1"),
+        ({"ply_file_path": 3}, "expected a relative `file_path`, found 3"),
+        ({"ply_file_path": "none.ply"}, "none.ply: expected a file, found nothing there"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, extra: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_scene(write_nerfstudio(tmp_path, **extra))
+
+
+@pytest.mark.parametrize(
+    "file_path",
+    [
+        "/etc/hostname",
+        "../../x.png",
+        "images/../../../x.png",
+        "C:/x.png",
+        "..\\..\\x.png",
+        "a\0b",
+        "..",
+        "",
+        7,
+        None,
+    ],
+)
+def test_paths_that_leave_are_refused(tmp_path: Path, file_path: object) -> None:
+    with pytest.raises(
+        InputError, match=r"expected (a relative `file_path`|paths in the scene's folder or its parent)"
+    ):
+        load_scene(
+            write_nerfstudio(tmp_path, frames=[*frames(["images/frame_00000.png"]), {"file_path": file_path}])
+        )
+
+
+def test_photos_beside_the_folder_are_allowed(tmp_path: Path) -> None:
+    paths = ["../photos/0.png", "../photos/1.png"]
+    scene_folder = write_nerfstudio(tmp_path / "scene", frames=frames(paths))
+    for i in range(2):
+        save(tmp_path / "photos" / f"{i}.png", photo(i))
+    assert [v.camera.name for v in load_scene(scene_folder).views] == paths[::-1]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "3", "null", "[" * 100_000, '{"frames": ' + "9" * 5000 + "}", "\xff"]
+)
+def test_files_that_are_no_json_object(tmp_path: Path, text: str) -> None:
+    (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"transforms\.json: expected"):
+        load_scene(tmp_path)
+
+
+def replacements(value: Any, put: Any) -> Iterator[None]:
+    """Replace every value inside a JSON value by junk, one at a time; `put` sets the root."""
+    for junk in (None, True, -1, 1e308, float("nan"), "x", [], {}, [[]], {"a": 1}):
+        put(junk)
+        yield
+    put(value)
+    if isinstance(value, dict | list):
+        for key in list(value) if isinstance(value, dict) else range(len(value)):
+            yield from replacements(value[key], lambda new, at=key: value.__setitem__(at, new))
+
+
+def test_junk_anywhere_gives_an_input_error_or_a_scene(tmp_path: Path) -> None:
+    write_nerfstudio(
+        tmp_path, 2, k1=0.01, applied_transform=[[1, 0, 0, 0]], train_filenames=["images/frame_00000.png"]
+    )
+    root = {"": copy.deepcopy(json.loads((tmp_path / "transforms.json").read_text()))}
+    outcomes = set()
+    for _ in replacements(root[""], lambda new: root.__setitem__("", new)):
+        write_json(tmp_path / "transforms.json", root[""])
+        try:
+            load_scene(tmp_path)
+            outcomes.add("read")
+        except InputError:
+            outcomes.add("refused")
+    assert outcomes == {"refused", "read"}
+
+
+XYZ = np.array([[0, 1, 2], [3, 4, 5.5], [-1, 0, 7]], np.float32)
+RGB = np.array([[1, 2, 3], [255, 0, 128], [9, 9, 9]], np.uint8)
+HEADER = (
+    "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 3\n"
+    "property float x\nproperty float y\nproperty float z\n"
+    "property double extra\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+    "element face 0\nproperty list uchar int vertex_index\nend_header\n"
+)
+
+
+def cloud(kind: str) -> bytes:
+    header = HEADER.format(kind).encode()
+    if kind == "ascii":
+        rows = [
+            " ".join(map(str, [*xyz, 0.25, *rgb]))
+            for xyz, rgb in zip(XYZ.tolist(), RGB.tolist(), strict=True)
+        ]
+        return header + "\n".join(rows).encode() + b"\n"
+    order = "<" if "little" in kind else ">"
+    rows = [struct.pack(order + "fffdBBB", *xyz, 0.25, *rgb) for xyz, rgb in zip(XYZ, RGB, strict=True)]
+    return header + b"".join(rows)
+
+
+KINDS = ["ascii", "binary_little_endian", "binary_big_endian"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_points_come_from_the_ply(tmp_path: Path, kind: str) -> None:
+    write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply")
+    (tmp_path / "sparse_pc.ply").write_bytes(cloud(kind))
+    scene = load_scene(tmp_path)
+    np.testing.assert_array_equal(scene.points, XYZ)
+    np.testing.assert_array_equal(scene.colors, RGB)
+
+
+def test_points_agree_with_colmaps_export(real_data: Path, tmp_path: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
+    reconstruction.export_PLY(tmp_path / "fox.ply")
+    points = read_point_cloud(tmp_path / "fox.ply")
+    expected = np.array([[*p.xyz.astype(np.float32), *p.color] for p in reconstruction.points3D.values()])
+    found = np.concatenate([points.xyz, points.rgb], axis=1)
+    np.testing.assert_array_equal(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)])
+
+
+def test_points_without_colours_are_grey(tmp_path: Path) -> None:
+    axes = "property float x\nproperty float y\nproperty float z\n"
+    header = f"ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n"
+    (tmp_path / "a.ply").write_text(header + "1 2 3")
+    points = read_point_cloud(tmp_path / "a.ply")
+    assert (points.xyz.tolist(), points.rgb.tolist()) == ([[1, 2, 3]], [[128, 128, 128]])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_plys_are_refused_or_read(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.ply"
+    data = cloud(kind)
+    whole = len(data) if "binary" in kind else len(data.rstrip()) - len(b" 9")
+    for length in range(whole):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"a\.ply: expected"):
+            read_point_cloud(path)
+    outcomes = set()
+    for broken in mutations(data, 300):
+        path.write_bytes(broken)
+        try:
+            assert np.isfinite(read_point_cloud(path).xyz).all()
+            outcomes.add("read")
+        except InputError:
+            outcomes.add("refused")
+    assert outcomes == {"refused", "read"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("vertex 3", "vertex 99999999999999999999999", "expected 9+ vertices"),
+        ("vertex 3", "vertex -3", "the vertices as first element"),
+        ("element vertex 3", "element face 1\nelement vertex 3", "the vertices as first element"),
+        ("ascii", "utf-8", "a format and the vertices"),
+        ("property float z", "property float w", "expected vertices with x, y and z"),
+        ("property float z", "property float x", "a format and the vertices"),
+        ("property float z", "property list uchar float z", "scalar vertex properties"),
+        ("property uchar red", "property float red", "red, green and blue of type uchar"),
+        ("end_header", "end", "with a header"),
+    ],
+)
+def test_what_is_wrong_with_a_ply_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    (tmp_path / "a.ply").write_bytes(cloud("ascii").replace(old.encode(), new.encode()))
+    with pytest.raises(InputError, match=message):
+        read_point_cloud(tmp_path / "a.ply")

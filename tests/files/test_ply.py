@@ -1,0 +1,417 @@
+"""The Inria PLY: exact round trips, other people's tools, hostile bytes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from keyss.core import Gaussians, InputError, OutputError
+from keyss.files.ply import OPACITY_LOGIT_BOUND, describe_ply, read_ply, write_ply
+
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def random_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        normal(n, 3), normal(n, 4), normal(n, 3) - 4, 2 * normal(n), 0.3 * normal(n, (degree + 1) ** 2, 3)
+    )
+
+
+def assert_same_bits(a: Gaussians, b: Gaussians) -> None:
+    for name in FIELDS:
+        ours, theirs = getattr(a, name), getattr(b, name)
+        assert torch.equal(ours.view(torch.int32), theirs.view(torch.int32)), name
+
+
+def names_of(degree: int, *, normals: bool = True) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    return [
+        *("x", "y", "z"),
+        *(("nx", "ny", "nz") if normals else ()),
+        *("f_dc_0", "f_dc_1", "f_dc_2"),
+        *rest,
+        "opacity",
+        *("scale_0", "scale_1", "scale_2"),
+        *("rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+
+
+def columns_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Each property's values by name, written independently of the writer."""
+    n, k = gaussians.sh.shape[:2]
+    columns = {name: gaussians.means[:, i] for i, name in enumerate("xyz")}
+    columns |= {f"n{axis}": torch.zeros(n) for axis in "xyz"}
+    columns |= {f"f_dc_{c}": gaussians.sh[:, 0, c] for c in range(3)}
+    for c in range(3):
+        columns |= {f"f_rest_{c * (k - 1) + j}": gaussians.sh[:, 1 + j, c] for j in range(k - 1)}
+    columns |= {"opacity": gaussians.opacity_logits}
+    columns |= {f"scale_{i}": gaussians.log_scales[:, i] for i in range(3)}
+    columns |= {f"rot_{i}": gaussians.quats[:, i] for i in range(4)}
+    return {name: values.numpy() for name, values in columns.items()}
+
+
+def ply_bytes(
+    columns: dict[str, np.ndarray], *, form: str = "binary_little_endian", kinds: dict[str, str] | None = None
+) -> bytes:
+    """A PLY with the properties in the order of `columns`; `kinds` names types other than float."""
+    codes = {"float": "f4", "double": "f8", "uchar": "u1", "short": "i2", "int32": "i4"}
+    kinds = {name: (kinds or {}).get(name, "float") for name in columns}
+    n = len(next(iter(columns.values())))
+    header = f"ply\nformat {form} 1.0\nelement vertex {n}\n"
+    header += "".join(f"property {kind} {name}\n" for name, kind in kinds.items()) + "end_header\n"
+    if form == "ascii":
+        lines = (" ".join(repr(float(v)) for v in row) for row in zip(*columns.values(), strict=True))
+        return header.encode() + "\n".join(lines).encode()
+    order = ">" if form == "binary_big_endian" else "<"
+    data = np.zeros(n, dtype=[(name, order + codes[kind]) for name, kind in kinds.items()])
+    for name, values in columns.items():
+        data[name] = values
+    return header.encode() + data.tobytes()
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A small valid model of degree 1, as written by us."""
+    path = tmp_path / "model.ply"
+    write_ply(path, random_gaussians(5, 1))
+    return path
+
+
+# --- writing ---------------------------------------------------------------------------------------------
+
+
+def test_layout_is_inrias(tmp_path: Path) -> None:
+    gaussians = random_gaussians(7, 3)
+    write_ply(tmp_path / "a.ply", gaussians)
+    expected = {name: columns_of(gaussians)[name] for name in names_of(3)}
+    assert len(expected) == 62
+    assert (tmp_path / "a.ply").read_bytes() == ply_bytes(expected)
+
+
+def test_bytes_depend_on_values_only(tmp_path: Path) -> None:
+    gaussians = random_gaussians(9, 2)
+    write_ply(tmp_path / "a.ply", gaussians)
+    strided = gaussians.map(lambda t: torch.stack([t, t], dim=-1)[..., 0].requires_grad_())
+    write_ply(tmp_path / "b.ply", strided)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_refuses_to_write_what_it_would_not_read(tmp_path: Path) -> None:
+    gaussians = random_gaussians(3, 0)
+    with pytest.raises(OutputError, match="no Gaussians"):
+        write_ply(tmp_path / "a.ply", gaussians[:0])
+    gaussians.means[1, 2] = torch.nan
+    with pytest.raises(OutputError, match="z in 1"):
+        write_ply(tmp_path / "a.ply", gaussians)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- reading ---------------------------------------------------------------------------------------------
+
+finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), n=st.integers(1, 3), degree=st.integers(0, 3))
+def test_round_trip_is_bit_exact(tmp_path: Path, data: st.DataObject, n: int, degree: int) -> None:
+    size = n * len(names_of(degree, normals=False))
+    values = torch.tensor(data.draw(st.lists(finite, min_size=size, max_size=size)), dtype=torch.float32)
+    parts = values.split([3 * n, 4 * n, 3 * n, n, size - 11 * n])
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, -1, 3)]
+    gaussians = Gaussians(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+    write_ply(tmp_path / "a.ply", gaussians)
+    back = read_ply(tmp_path / "a.ply")
+    assert back.sh_degree == degree
+    assert_same_bits(back, gaussians)
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
+    """Any order, no normals, and properties of every size in between."""
+    gaussians = random_gaussians(6, degree)
+    columns = columns_of(gaussians)
+    names = names_of(degree, normals=False)
+    np.random.default_rng(degree).shuffle(names)
+    names[4:4] = ["red", "label", "confidence", "f_extra"]
+    columns |= {name: np.arange(6.0) for name in ("red", "label", "confidence", "f_extra")}
+    kinds = {"red": "uchar", "label": "short", "confidence": "double", "x": "double", "f_dc_1": "double"}
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply_bytes({name: columns[name] for name in names}, form=form, kinds=kinds))
+    assert_same_bits(read_ply(path), gaussians)
+
+
+def test_reads_what_is_longer_than_one_chunk(tmp_path: Path) -> None:
+    gaussians = random_gaussians(12_345, 3)
+    write_ply(tmp_path / "a.ply", gaussians)
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+def test_ignores_comments_other_elements_and_trailing_bytes(model: Path) -> None:
+    head, body = model.read_bytes().split(b"end_header\n", 1)
+    head = head.replace(b"ply\n", "ply\r\ncomment é end_header\nobj_info a b c\n\n".encode(), 1)
+    head = head.replace(b"element vertex", b"element camera 2\nproperty double f\nelement vertex")
+    head += b"element face 3\nproperty list uchar int vertex_indices\ncomment\n"
+    other = model.with_name("other.ply")
+    other.write_bytes(head + b"end_header\n" + bytes(16) + body + b"anything")
+    assert_same_bits(read_ply(other), read_ply(model))
+
+
+def test_infinite_opacity_is_clamped(tmp_path: Path) -> None:
+    gaussians = random_gaussians(3, 0)
+    columns = columns_of(gaussians)
+    columns["opacity"] = np.array([np.inf, -np.inf, 40.0])
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    logits = read_ply(tmp_path / "a.ply").opacity_logits
+    assert logits.tolist() == [OPACITY_LOGIT_BOUND, -OPACITY_LOGIT_BOUND, 40.0]
+    assert 0 < logits[:2].sigmoid().min() < logits[:2].sigmoid().max() < 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("opacity", np.nan, "float"),
+        ("x", np.inf, "float"),
+        ("f_rest_8", -np.inf, "float"),
+        ("y", 1e60, "double"),
+    ],
+)
+def test_other_values_must_be_finite(tmp_path: Path, name: str, value: float, kind: str) -> None:
+    columns = columns_of(random_gaussians(4, 1))
+    columns[name] = np.array([0.0, value, value, 0.0])
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, kinds={name: kind}))
+    with pytest.raises(InputError, match=rf"among 4 Gaussians: {name} in 2$"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_describes(model: Path) -> None:
+    info, gaussians = describe_ply(model), read_ply(model)
+    assert (info.count, info.sh_degree, info.bytes) == (5, 1, model.stat().st_size)
+    assert info.lower == tuple(gaussians.means.amin(0).tolist())
+    assert info.upper == tuple(gaussians.means.amax(0).tolist())
+    assert info.faint_share == pytest.approx(float((gaussians.opacities < 0.05).float().mean()))
+
+
+# --- what is refused -------------------------------------------------------------------------------------
+
+
+def header_of(*lines: str) -> bytes:
+    return "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header", ""]).encode()
+
+
+XYZ = ("element vertex 1", "property float x", "property float y", "property float z")
+BROKEN = {
+    "empty": (b"", "ends inside the header"),
+    "an image": (b"\x89PNG\r\n\x1a\n" + bytes(100), "begin with a line 'ply'"),
+    "no end": (b"ply\nformat ascii 1.0\n", "ends inside the header"),
+    "no format": (b"ply\nelement vertex 1\nend_header\n", "one 'format' line"),
+    "two formats": (header_of("format ascii 1.0"), "makes no sense"),
+    "future": (b"ply\nformat ascii 2.0\nend_header\n", "makes no sense"),
+    "no vertex": (header_of("element face 1"), "got 1 and 0"),
+    "two vertex elements": (header_of(*XYZ, *XYZ), "got 1 and 2"),
+    "property of nothing": (header_of("property float x"), "makes no sense"),
+    "property twice": (header_of(*XYZ, "property float x"), "makes no sense"),
+    "unknown type": (header_of("element vertex 1", "property half x"), "makes no sense"),
+    "list in vertex": (header_of(*XYZ, "property list uchar int f"), "list property"),
+    "list before": (header_of("element a 1", "property list uchar int f", *XYZ), "list property"),
+    "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: rot_0"),
+    "compressed": (header_of("element vertex 1", "property uint packed_position"), "compressed"),
+    "no model": (header_of("element vertex 1", "property float u"), "not a 3DGS model.*missing: x, y, z"),
+    "odd f_rest": (header_of(*XYZ, "property float f_rest_0"), "0, 9, 24 or 45"),
+    "gap in f_rest": (header_of(*XYZ, *(f"property float f_rest_{i + 1}" for i in range(9))), "0, 9, 24"),
+    "negative": (header_of("element vertex -1"), "makes no sense"),
+    "fraction": (header_of("element vertex 1.5"), "makes no sense"),
+    "underscore": (header_of("element vertex 1_0"), "makes no sense"),
+    "word": (header_of("element vertex many"), "makes no sense"),
+    "endless line": (b"ply\ncomment " + b"a" * 100_000, "longer than"),
+    "endless lines": (b"ply\n" + b"comment\n" * 2000, "longer than"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_refuses(tmp_path: Path, case: str) -> None:
+    data, message = BROKEN[case]
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(InputError, match=message):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+@pytest.mark.parametrize("count", ["6", "1000000000000", "999999999999999999"])
+def test_count_is_checked_against_the_size(tmp_path: Path, form: str, count: str) -> None:
+    data = ply_bytes(columns_of(random_gaussians(5, 1)), form=form)
+    if form == "ascii":  # so short that even the smallest excess cannot fit
+        head, _ = data.split(b"end_header\n")
+        data = head + b"end_header\n" + b"1 " * 140
+    (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 5\n", f"vertex {count}\n".encode()))
+    with pytest.raises(InputError, match="the header announces"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_absurd_element_before_the_vertices(model: Path) -> None:
+    data = model.read_bytes()
+    other = b"element a 999999999999999999\nproperty int i\nelement vertex"
+    model.write_bytes(data.replace(b"element vertex", other))
+    with pytest.raises(InputError, match="not a whole"):
+        read_ply(model)
+
+
+def test_no_gaussians(model: Path) -> None:
+    model.write_bytes(model.read_bytes().replace(b"vertex 5", b"vertex 0"))
+    with pytest.raises(InputError, match="holds no Gaussians"):
+        read_ply(model)
+
+
+@pytest.mark.parametrize("tail", [b"", b"word"])
+def test_broken_ascii(tmp_path: Path, tail: bytes) -> None:
+    head, body = ply_bytes(columns_of(random_gaussians(5, 0)), form="ascii").split(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.rsplit(b" ", 1)[0] + b" " + tail)
+    with pytest.raises(InputError, match="cut short or hold something not a number"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_not_a_file(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing.ply"):
+        with pytest.raises(InputError, match="no such file"):
+            read_ply(path)
+
+
+def test_truncation_anywhere(model: Path) -> None:
+    data = model.read_bytes()
+    body = data.index(b"end_header\n") + len(b"end_header\n")
+    stride = (len(data) - body) // 5
+    offsets = {*range(body + 2), *(body + row * stride + shift for row in range(5) for shift in (-1, 0, 1))}
+    for offset in sorted({*offsets, len(data) - 1} - {len(data)}):
+        model.write_bytes(data[:offset])
+        with pytest.raises(InputError):
+            read_ply(model)
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_flipped_bytes_in_the_header(tmp_path: Path, form: str) -> None:
+    data = ply_bytes(columns_of(random_gaussians(5, 1)), form=form)
+    body = data.index(b"end_header\n") + len(b"end_header\n")
+    rng = np.random.default_rng(0)
+    path = tmp_path / "a.ply"
+    valid = 0
+    for _ in range(1500):
+        damaged = bytearray(data)
+        for at in rng.integers(0, body, size=rng.integers(1, 4)):
+            damaged[at] = rng.choice([damaged[at] ^ (1 << rng.integers(0, 8)), rng.integers(0, 256)])
+        path.write_bytes(damaged)
+        try:
+            gaussians = read_ply(path)
+        except InputError:
+            continue
+        valid += 1
+        assert all(getattr(gaussians, name).isfinite().all() for name in FIELDS)
+    assert valid < 1000
+
+
+# --- other people's models and tools ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "degree"),
+    [
+        ("guitar", 90_854, 0),
+        ("biker", 152_746, 0),
+        ("playbot_lod2", 125_000, 2),
+        ("playbot_lod4", 8_406, 2),
+    ],
+)
+def test_real_models(real_data: Path, tmp_path: Path, name: str, count: int, degree: int) -> None:
+    source = real_data / "splats" / f"{name}.ply"
+    gaussians = read_ply(source)
+    assert (len(gaussians), gaussians.sh_degree) == (count, degree)
+    theirs = gsply.plyread(source)
+    assert np.array_equal(gaussians.means.numpy(), theirs.means)
+    assert np.array_equal(gaussians.sh[:, 0].numpy(), theirs.sh0)
+    write_ply(tmp_path / "a.ply", gaussians)
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gsply_reads_ours(tmp_path: Path, degree: int) -> None:
+    gaussians = random_gaussians(50, degree)
+    write_ply(tmp_path / "a.ply", gaussians)
+    theirs = gsply.plyread(tmp_path / "a.ply")
+    assert np.array_equal(theirs.means, gaussians.means.numpy())
+    assert np.array_equal(theirs.scales, gaussians.log_scales.numpy())
+    assert np.array_equal(theirs.quats, gaussians.quats.numpy())
+    assert np.array_equal(theirs.opacities, gaussians.opacity_logits.numpy())
+    assert np.array_equal(theirs.sh0, gaussians.sh[:, 0].numpy())
+    assert np.array_equal(theirs.shN.reshape(50, -1, 3), gaussians.sh[:, 1:].numpy())
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_we_read_gsply(tmp_path: Path, degree: int) -> None:
+    gaussians = random_gaussians(50, degree)
+    rest = gaussians.sh[:, 1:].numpy() if degree else None
+    gsply.plywrite(
+        tmp_path / "a.ply",
+        gaussians.means.numpy(),
+        gaussians.log_scales.numpy(),
+        gaussians.quats.numpy(),
+        gaussians.opacity_logits.numpy(),
+        gaussians.sh[:, 0].numpy(),
+        rest,
+    )
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+@pytest.fixture(scope="session")
+def splat_transform() -> str:
+    """Path of the splat-transform program."""
+    local = Path(__file__).parents[2] / "node_modules" / ".bin" / "splat-transform"
+    named = os.environ.get("KEYSS_SPLAT_TRANSFORM")
+    tool = named or (str(local) if local.exists() else shutil.which("splat-transform"))
+    if not tool:
+        pytest.skip("splat-transform not found: npm install --no-save @playcanvas/splat-transform@2.7.1")
+    return tool
+
+
+def transform(tool: str, source: Path, target: Path) -> Path:
+    subprocess.run([tool, str(source), str(target)], check=True, capture_output=True, timeout=60)
+    return target
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_splat_transform_copies_ours(splat_transform: str, tmp_path: Path, degree: int) -> None:
+    gaussians = random_gaussians(40, degree)
+    write_ply(tmp_path / "in.ply", gaussians)
+    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
+    assert_same_bits(read_ply(copy), gaussians)
+
+
+def test_splat_transform_converts_ours(splat_transform: str, tmp_path: Path) -> None:
+    gaussians = random_gaussians(40, 3)
+    write_ply(tmp_path / "in.ply", gaussians)
+    table = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.csv").read_text().splitlines()
+    header, first = table[0].split(","), [float(cell) for cell in table[1].split(",")]
+    expected = columns_of(gaussians)
+    assert set(header) >= set(names_of(3, normals=False))
+    for name, value in zip(header, first, strict=True):
+        assert value == pytest.approx(float(expected[name][0]), abs=1e-5), name
+
+    packed = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.compressed.ply")
+    with pytest.raises(InputError, match="compressed"):
+        read_ply(packed)
+    unpacked = read_ply(transform(splat_transform, packed, tmp_path / "back.ply"))
+    lost = torch.cdist(unpacked.means, gaussians.means).amin(1)  # the format re-orders
+    assert unpacked.sh_degree == 3
+    assert float(lost.max()) < 0.01

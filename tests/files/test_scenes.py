@@ -1,0 +1,197 @@
+"""What holds for scenes of every layout: detection, photos, sizes, determinism."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from files.scene_files import (
+    HEIGHT,
+    WIDTH,
+    camera_bytes,
+    counted,
+    image_bytes,
+    photo,
+    save,
+    write_blender,
+    write_colmap,
+    write_nerfstudio,
+)
+from keyss.core import InputError, UsageError
+from keyss.files import load_scene
+
+WRITERS = {"colmap": write_colmap, "blender": write_blender, "nerfstudio": write_nerfstudio}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_views_are_ready_to_train_on(tmp_path: Path, layout: str) -> None:
+    scene = load_scene(str(WRITERS[layout](tmp_path)))
+    for view in scene.views:
+        assert view.image.dtype == torch.uint8
+        assert view.image.is_contiguous()
+        assert view.image.shape == (view.camera.height, view.camera.width, 3) == (HEIGHT, WIDTH, 3)
+        assert view.camera.viewmat.dtype == view.camera.K.dtype == torch.float32
+        assert view.camera.viewmat.shape == (4, 4)
+    assert len({view.camera.name for view in scene.views}) == len(scene.views)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_two_loads_are_identical(tmp_path: Path, layout: str) -> None:
+    WRITERS[layout](tmp_path, count=20)
+    first, second = load_scene(tmp_path, width=7), load_scene(tmp_path, width=7)
+    for a, b in zip(first.views, second.views, strict=True):
+        assert a.camera.name == b.camera.name
+        assert torch.equal(a.image, b.image)
+        assert torch.equal(a.camera.viewmat, b.camera.viewmat)
+
+
+def test_every_eighth_photo_by_name_is_for_testing(tmp_path: Path) -> None:
+    images = counted(*(image_bytes(i, f"{i:02}.png") for i in reversed(range(20))))
+    scene = load_scene(write_colmap(tmp_path, 20, images=images))
+    assert [v.camera.name for v in scene.test] == ["00.png", "08.png", "16.png"]
+    assert [v.camera.name for v in scene.train] == [f"{i:02}.png" for i in range(20) if i % 8]
+
+
+def test_colmap_goes_before_the_json_made_from_it(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path)
+    write_colmap(tmp_path)
+    assert load_scene(tmp_path).test[0].camera.name == "00.png"
+
+
+def test_unknown_layouts_are_told_what_is_known(tmp_path: Path) -> None:
+    known = "Known layouts: COLMAP .*; Blender .*; Nerfstudio"
+    with pytest.raises(InputError, match=f"found an empty folder.*{known}"):
+        load_scene(tmp_path)
+    (tmp_path / "video.mp4").touch()
+    with pytest.raises(InputError, match=f"found video.mp4. {known}"):
+        load_scene(tmp_path)
+    with pytest.raises(InputError, match=f"found a file. {known}"):
+        load_scene(tmp_path / "video.mp4")
+    with pytest.raises(InputError, match=f"found nothing there. {known}"):
+        load_scene(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("width", "size"), [(6, (6, 4)), (5, (5, 3)), (1, (1, 1)), (12, (12, 8)), (100, (12, 8))]
+)
+def test_width_shrinks_and_never_enlarges(tmp_path: Path, width: int, size: tuple[int, int]) -> None:
+    write_colmap(tmp_path)
+    full, view = load_scene(tmp_path).train[0], load_scene(tmp_path, width=width).train[0]
+    assert (view.camera.width, view.camera.height) == size
+    assert view.image.shape == (size[1], size[0], 3)
+    np.testing.assert_allclose(view.camera.K[0], full.camera.K[0] * size[0] / 12)
+    np.testing.assert_allclose(view.camera.K[1], full.camera.K[1] * size[1] / 8)
+
+
+@pytest.mark.parametrize("width", [6, 5, 7, 1])
+def test_shrinking_averages_areas(tmp_path: Path, width: int) -> None:
+    view = load_scene(write_colmap(tmp_path), width=width).train[0]
+    height = view.camera.height
+    columns, rows = area_weights(WIDTH, width), area_weights(HEIGHT, height)
+    expected = np.einsum("ih,jw,hwc->ijc", rows, columns, photo(1).astype(np.float64))
+    assert np.abs(view.image.numpy() - expected).max() < 0.51
+
+
+def area_weights(old: int, new: int) -> np.ndarray:
+    """[new, old] share of each old cell in each new one."""
+    edges = np.arange(new + 1) * old / new
+    left, right = edges[:-1, None], edges[1:, None]
+    cells = np.arange(old)[None]
+    return (np.minimum(right, cells + 1) - np.maximum(left, cells)).clip(0) * new / old
+
+
+@pytest.mark.parametrize("width", [0, -3])
+def test_width_must_be_positive(tmp_path: Path, width: int) -> None:
+    with pytest.raises(UsageError, match="at least 1 pixel"):
+        load_scene(tmp_path, width=width)
+
+
+def test_photos_shrunk_by_a_whole_number_after_their_cameras_were_made(tmp_path: Path) -> None:
+    cameras = counted(camera_bytes(width=49, height=31, params=(40, 40, 24.5, 15.5)))  # 12 x 8 is a quarter
+    camera = load_scene(write_colmap(tmp_path, cameras=cameras)).train[0].camera
+    np.testing.assert_allclose(camera.K, [[40 * 12 / 49, 0, 6], [0, 40 * 8 / 31, 4], [0, 0, 1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(8, 12), (6, 4), (18, 12), (36, 30)])
+def test_other_sizes_are_refused_with_both(tmp_path: Path, size: tuple[int, int]) -> None:
+    folder = write_colmap(tmp_path, cameras=counted(camera_bytes(width=size[0], height=size[1])))
+    with pytest.raises(InputError, match=f"0[0-2].png: .* {size[0]}x{size[1]} .* found 12x8"):
+        load_scene(folder)
+
+
+def with_photo(folder: Path, image: Image.Image, **options: object) -> np.ndarray:
+    """The pixels of a scene's training photo after `image` took its place."""
+    write_colmap(folder)
+    image.save(folder / "images" / "01.png", **options)  # type: ignore[arg-type]
+    return load_scene(folder, background=(0, 0, 1)).train[0].image.numpy()
+
+
+def test_grey_palette_and_deep_photos_become_rgb(tmp_path: Path) -> None:
+    grey = photo(3, 1)[:, :, 0]
+    rgb = np.repeat(grey[:, :, None], 3, axis=2)
+    assert np.array_equal(with_photo(tmp_path, Image.fromarray(grey)), rgb)
+    deep = grey.astype(np.uint16) * 257
+    assert np.array_equal(with_photo(tmp_path, Image.fromarray(deep)), rgb)
+    palette = Image.fromarray(photo(4)).quantize(16)
+    assert np.array_equal(with_photo(tmp_path, palette), np.asarray(palette.convert("RGB")))
+    see_through = with_photo(tmp_path, palette, transparency=bytes([0] * 16))
+    assert (see_through == [0, 0, 255]).all()
+    one_bit = Image.fromarray(grey > 99)
+    assert np.array_equal(with_photo(tmp_path, one_bit), np.where(rgb > 99, 255, 0))
+
+
+def test_cmyk_jpegs_are_read(tmp_path: Path) -> None:
+    images = counted(image_bytes(1, "00.png"), image_bytes(2, "b.jpg"))
+    write_colmap(tmp_path, images=images)
+    Image.new("CMYK", (WIDTH, HEIGHT), (0, 255, 255, 0)).save(tmp_path / "images" / "b.jpg")
+    assert np.abs(load_scene(tmp_path).train[0].image.float().numpy() - [255, 0, 0]).max() < 8
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turn by 90 degrees
+    assert np.array_equal(with_photo(tmp_path, Image.fromarray(photo(1)), exif=exif), photo(1))
+
+
+def test_broken_photos_are_named(tmp_path: Path) -> None:
+    path = write_colmap(tmp_path) / "images" / "01.png"
+    data = path.read_bytes()
+    for length in range(0, len(data) - 20, 7):  # the last 20 bytes are checksums and the end mark
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"01\.png: expected an image"):
+            load_scene(tmp_path)
+    path.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n")
+    with pytest.raises(InputError, match=r"01\.png: expected an image \(JPEG, PNG"):
+        load_scene(tmp_path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match=r"01\.png: expected an image"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("side", [9_500, 30_000])
+def test_decompression_bombs_are_refused_unopened(tmp_path: Path, side: int) -> None:
+    header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
+    png = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in chunks
+    )
+    folder = write_colmap(tmp_path, cameras=counted(camera_bytes(width=side, height=side)))
+    (folder / "images" / "01.png").write_bytes(png)
+    with pytest.raises(InputError, match=r"01\.png: expected an image of at most 89,000,000 pixels"):
+        load_scene(folder)
+
+
+def test_names_that_differ_only_by_folder(tmp_path: Path) -> None:
+    images = counted(*(image_bytes(i, f"cam{i}/00.png") for i in range(3)))
+    write_colmap(tmp_path, images=images)
+    for i in range(3):
+        save(tmp_path / "images" / f"cam{i}" / "00.png", photo(i))
+    assert [v.camera.name for v in load_scene(tmp_path).train] == ["cam1/00.png", "cam2/00.png"]
