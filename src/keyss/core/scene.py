@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -69,6 +70,17 @@ class Scene:
         """Radius of the training cameras: 1.1 x the largest distance from their mean (3DGS's `cameras_extent`)."""
         positions = camera_positions([view.camera for view in self.train])
         return 1.1 * float((positions - positions.mean(0)).norm(dim=1).max())
+
+    def digest(self) -> str:
+        """SHA-256 over all cameras, photos, points and the background: equal for equal content only."""
+        state = hashlib.sha256(f"{len(self.train)} {len(self.test)}".encode())
+        tensors = [self.points, self.colors, self.background]
+        for view in self.views:
+            tensors += [view.camera.viewmat, view.camera.K, view.image]
+        for tensor in tensors:
+            state.update(f"{tensor.dtype} {list(tensor.shape)}".encode())
+            state.update(tensor.contiguous().numpy().tobytes())
+        return state.hexdigest()
 
 
 def camera_positions(cameras: Sequence[Camera]) -> Tensor:

@@ -1,1 +1,5 @@
-"""TODO"""
+"""How well a hiding works."""
+
+from keyss.measure.hiding import measure_hiding
+
+__all__ = ["measure_hiding"]

@@ -1,1 +1,1 @@
-"""TODO"""
+"""The rasterizer for the CPU: numba kernels behind one torch.autograd.Function."""

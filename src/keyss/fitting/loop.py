@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import torch
 
 from keyss.core.errors import InputError
-from keyss.fit.checkpoint import State, load_checkpoint, save_checkpoint
+from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
 
 
 class Interrupted(KeyboardInterrupt):
@@ -30,6 +30,9 @@ class Run(Protocol):
 
     iterations: int
     iteration: int  # steps done
+
+    def prepare(self) -> None:
+        """What a fresh run does before its first step, and a resumed one has behind it."""
 
     def step(self) -> None:
         """One optimisation step; increases `iteration`."""
@@ -83,7 +86,7 @@ def train(
     """Take `run` to its last iteration; returns the seconds spent, those before a resume included.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds` and on Ctrl-C (raises
-    Interrupted); with `resume`, it continues from there if the file exists. `fingerprint` (JSON-able) is
+    Interrupted) and at the end; with `resume`, it continues from there if the file exists. `fingerprint` (JSON-able) is
     what must be the same for a resumed run to mean the same; a checkpoint of another one raises InputError.
     The same seed gives the same run on a CPU, interrupted or not: the global random state, which gsplat's
     densification draws from, is seeded here, kept in the checkpoint, and given back to the caller.
@@ -102,6 +105,8 @@ def train(
             torch.set_rng_state(tensors.pop("rng"))
             run.load(tensors, meta)
             spent = float(meta["seconds"])
+        else:
+            run.prepare()
         started = saved = time.monotonic()
         numbers: dict[str, float] = {}
         reporter.start(title, run.iterations, run.iteration)
@@ -126,6 +131,7 @@ def train(
                 if time.monotonic() - saved > checkpoint_seconds:
                     save()
                     saved = time.monotonic()
+            save()
         finally:
             reporter.finish()
         return spent + time.monotonic() - started

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from keyss.core.gaussians import Gaussians
-from keyss.hide.mask import Mask
+from keyss.hiding.mask import Mask
 from keyss.seal.keys import EMBEDDING_SIZE
 
 CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient

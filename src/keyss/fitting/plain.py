@@ -9,22 +9,22 @@ from typing import Any
 import torch
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
-from keyss.fit.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
-from keyss.fit.config import FitConfig
-from keyss.fit.density import CappedStrategy
-from keyss.fit.image_metrics import mean_psnr
-from keyss.fit.loop import Reporter, train
-from keyss.fit.losses import Target, photometric_loss
-from keyss.fit.parameters import (
+from keyss.core.scene import Scene
+from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
+from keyss.fitting.config import FitConfig
+from keyss.fitting.density import CappedStrategy
+from keyss.fitting.image_metrics import mean_psnr, thin
+from keyss.fitting.loop import Reporter, train
+from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.parameters import (
     initial_gaussians,
     initial_points,
     make_optimizers,
     to_gaussians,
     to_parameters,
 )
-from keyss.fit.sampling import Shuffle
-from keyss.render import rasterization
+from keyss.fitting.sampling import Shuffle
+from keyss.rendering import render_with_meta
 
 
 @dataclass(frozen=True)
@@ -60,26 +60,20 @@ class PlainRun:
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
+    def prepare(self) -> None:
+        """Nothing is to be done before the first step."""
+
     def step(self) -> None:
         config = self.config
         view = self.views[self.shuffle.draw()]
         self.iteration += 1
-        gaussians = to_gaussians(self.parameters)
-        camera = view.camera
-        images, _, meta = rasterization(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.sh,
-            camera.viewmat[None].to(self.device),
-            camera.K[None].to(self.device),
-            camera.width,
-            camera.height,
+        image, meta = render_with_meta(
+            to_gaussians(self.parameters),
+            view.camera,
+            self.background,
             sh_degree=config.sh_degree_at(self.iteration),
-            backgrounds=self.background[None],
         )
-        loss = photometric_loss(images[0], Target.of(view.image.to(self.device)), config.ssim_weight)
+        loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
         self.strategy.step_pre_backward(self.parameters, self.optimizers, self.density, self.iteration, meta)
         loss.backward()
         decay = 0.01 ** (self.iteration / config.iterations)
@@ -108,12 +102,6 @@ class PlainRun:
         self.iteration = int(meta["iteration"])
 
 
-def thin(views: tuple[View, ...], count: int) -> tuple[View, ...]:
-    """At most `count` of the views, evenly spread."""
-    step = max(1, -(-len(views) // count))
-    return views[::step]
-
-
 def fit_scene(
     scene: Scene,
     config: FitConfig | None = None,
@@ -133,7 +121,7 @@ def fit_scene(
     seconds = train(
         run,
         title,
-        fingerprint={"scene": scene_fingerprint(scene), "config": asdict(config), "device": str(device)},
+        fingerprint={"scene": scene.digest(), "config": asdict(config), "device": str(device)},
         seed=config.seed,
         checkpoint=checkpoint,
         resume=resume,
@@ -142,15 +130,3 @@ def fit_scene(
         reporter=reporter,
     )
     return FitResult(run.gaussians().to("cpu"), replace(config), seconds)
-
-
-def scene_fingerprint(scene: Scene) -> dict[str, Any]:
-    """What tells one loaded scene from another: JSON-able and cheap."""
-    return {
-        "name": scene.name,
-        "train": len(scene.train),
-        "test": len(scene.test),
-        "size": [scene.train[0].camera.width, scene.train[0].camera.height],
-        "points": len(scene.points),
-        "background": [round(float(x), 6) for x in scene.background],
-    }

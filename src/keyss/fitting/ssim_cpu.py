@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.render.cpu.jit import njit, prange
+from keyss.render.cpu import parallel
+from keyss.render.cpu.jit import finite_kernel
+from keyss.render.cpu.simd8 import fetch_add
 
 RADIUS = 5  # SSIM's 11x11 window
 SIGMA = 1.5
@@ -26,8 +28,8 @@ ROWS_PER_JOB = 32
 Array = npt.NDArray[np.float32]
 
 
-@njit(parallel=True, fastmath=True)
-def blur(source: Any, result: Any) -> None:
+@finite_kernel
+def _blur(counter: Any, source: Any, result: Any) -> None:
     """Separable 11x11 window over the last two axes of [B, H, W], zeros outside.
 
     Both passes run down one row at a time while it is in the first-level cache, with all eleven taps
@@ -35,7 +37,10 @@ def blur(source: Any, result: Any) -> None:
     """
     count, height, width = source.shape
     jobs_per_plane = (height + ROWS_PER_JOB - 1) // ROWS_PER_JOB
-    for job in prange(count * jobs_per_plane):
+    while True:
+        job = fetch_add(counter, 0, 1)
+        if job >= count * jobs_per_plane:
+            break
         plane = job // jobs_per_plane
         start = (job % jobs_per_plane) * ROWS_PER_JOB
         zeros = np.zeros(width, np.float32)
@@ -73,11 +78,14 @@ def blur(source: Any, result: Any) -> None:
                 )
 
 
-@njit(parallel=True, fastmath=True)
-def _products(planes: Any, target: Any, stacked: Any) -> None:
+@finite_kernel
+def _products(counter: Any, planes: Any, target: Any, stacked: Any) -> None:
     """stacked [9, H, W] = x, x^2, x y."""
     _, height, width = planes.shape
-    for job in prange(3 * height):
+    while True:
+        job = fetch_add(counter, 0, 1)
+        if job >= 3 * height:
+            break
         c, y = job // height, job % height
         for x in range(width):
             value = planes[c, y, x]
@@ -86,11 +94,14 @@ def _products(planes: Any, target: Any, stacked: Any) -> None:
             stacked[6 + c, y, x] = value * target[c, y, x]
 
 
-@njit(parallel=True, fastmath=True)
-def _similarity(stats: Any, target_mean: Any, target_variance: Any, row_sums: Any) -> None:
+@finite_kernel
+def _similarity(counter: Any, stats: Any, target_mean: Any, target_variance: Any, row_sums: Any) -> None:
     """Row sums of the SSIM map; `stats` [9, H, W] is overwritten by its derivatives to mean, square, product."""
     _, height, width = target_mean.shape
-    for job in prange(3 * height):
+    while True:
+        job = fetch_add(counter, 0, 1)
+        if job >= 3 * height:
+            break
         c, y = job // height, job % height
         total = np.float32(0)
         for x in range(width):
@@ -111,11 +122,14 @@ def _similarity(stats: Any, target_mean: Any, target_variance: Any, row_sums: An
         row_sums[job] = total
 
 
-@njit(parallel=True, fastmath=True)
-def _chain(planes: Any, target: Any, derivatives: Any, scale: Any, gradient: Any) -> None:
+@finite_kernel
+def _chain(counter: Any, planes: Any, target: Any, derivatives: Any, scale: Any, gradient: Any) -> None:
     """gradient [3, H, W] = scale (d mean + 2 x d square + y d product), after the derivatives were blurred."""
     _, height, width = planes.shape
-    for job in prange(3 * height):
+    while True:
+        job = fetch_add(counter, 0, 1)
+        if job >= 3 * height:
+            break
         c, y = job // height, job % height
         for x in range(width):
             gradient[c, y, x] = scale * (
@@ -125,15 +139,20 @@ def _chain(planes: Any, target: Any, derivatives: Any, scale: Any, gradient: Any
             )
 
 
+def blur(source: Array, result: Array) -> None:
+    """Write SSIM's window (11x11, sigma 1.5, zeros outside) over the last two axes of [B, H, W] to `result`."""
+    parallel.run(_blur, source, result)
+
+
 def ssim_and_gradient(planes: Array, target: Array, mean: Array, variance: Array) -> tuple[float, Array]:
     """Mean SSIM of two images [3, H, W] and its gradient to the first; `mean`, `variance` are the target's."""
     stacked = np.empty((9, *planes.shape[1:]), np.float32)
     stats = np.empty_like(stacked)
-    _products(planes, target, stacked)
+    parallel.run(_products, planes, target, stacked)
     blur(stacked, stats)
     row_sums = np.empty(3 * planes.shape[1], np.float32)
-    _similarity(stats, mean, variance, row_sums)
+    parallel.run(_similarity, stats, mean, variance, row_sums)
     blur(stats, stacked)
     gradient = np.empty_like(planes)
-    _chain(planes, target, stacked, np.float32(1 / planes.size), gradient)
+    parallel.run(_chain, planes, target, stacked, np.float32(1 / planes.size), gradient)
     return float(row_sums.sum(dtype=np.float64) / planes.size), gradient

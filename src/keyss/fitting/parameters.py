@@ -15,7 +15,7 @@ from torch import Tensor
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Scene
 from keyss.core.alignment import focus_point
-from keyss.fit.config import FitConfig
+from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
 

@@ -10,8 +10,8 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove
 from torch import Tensor
 
-from keyss.fit.config import FitConfig
-from keyss.fit.parameters import Optimizers, Parameters
+from keyss.fitting.config import FitConfig
+from keyss.fitting.parameters import Optimizers, Parameters
 
 
 class CappedStrategy(DefaultStrategy):  # type: ignore[misc]

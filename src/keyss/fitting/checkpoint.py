@@ -14,7 +14,7 @@ from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
-from keyss.fit.parameters import Optimizers, Parameters
+from keyss.fitting.parameters import Optimizers, Parameters
 
 State = dict[str, Tensor]
 

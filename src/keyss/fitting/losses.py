@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from keyss.fit import ssim_cpu
+from keyss.fitting import ssim_cpu
 
 C1, C2 = 0.01**2, 0.03**2
 

@@ -1,0 +1,374 @@
+"""The commands: what each takes, which function it calls, and what it prints.
+
+Everything heavy is imported inside the commands, so that `keyss --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+if TYPE_CHECKING:
+    from keyss.fitting.config import FitConfig
+
+
+def optional(metavar: str, help: str, otherwise: str) -> Any:
+    """An argument that may be left out; `otherwise` says what happens then."""
+    return arg(metavar=metavar, help=help, help_behavior_hint=f"(default: {otherwise})")
+
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+Device = Annotated[DeviceName, arg(help="Where to compute; auto takes a CUDA GPU where there is one.")]
+Seed = Annotated[int | None, optional("N", "Seed of everything random.", "the preset's")]
+# Every command takes --seed and --device, so that scripts can pass them to all alike.
+UnusedSeed = Annotated[int, arg(metavar="N", help="Changes nothing here: nothing is random.")]
+UnusedDevice = Annotated[DeviceName, arg(help="Changes nothing here: nothing is computed.")]
+KeyFiles = Annotated[
+    UseAppendAction[tuple[Path, ...]],
+    optional("FILE", "File with the key, once for each secret.", "KEYSS_KEY, or a hidden prompt"),
+]
+Width = Annotated[
+    int | None, optional("PIXELS", "Photos wider than this are downscaled to it.", "as they are")
+]
+Background = Annotated[
+    tuple[float, float, float] | None,
+    optional("R G B", "Colour behind everything, 0 to 1 each; transparent photos get it.", "black"),
+]
+Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
+MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
+Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
+Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
+OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
+
+
+def keygen(
+    *,
+    length: Annotated[int, arg(metavar="N", help="Number of characters, 5.95 bits each.")] = 16,
+    seed: Annotated[
+        int | None, optional("N", "Refused: a key is drawn from the system's random source.", "none")
+    ] = None,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Print a new random key.
+
+    example: keyss keygen > key.txt
+    """
+    from keyss.core.errors import UsageError
+    from keyss.seal import generate_key
+
+    if seed is not None:
+        raise UsageError("keygen takes no --seed: a key that can be drawn again is no secret")
+    print(generate_key(length))
+
+
+def fit(
+    scene: Annotated[Positional[Path], arg(metavar="SCENE", help="Folder of posed photos.")],
+    *,
+    out: OutFolder,
+    preset: Annotated[
+        Literal["quick", "default", "paper"], arg(help="Size and length of the run.")
+    ] = "default",
+    iterations: Iterations = None,
+    max_gaussians: MaxGaussians = None,
+    width: Width = None,
+    background: Background = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: Seed = None,
+) -> None:
+    """Fit a plain 3DGS model to the photos of a scene.
+
+    example: keyss fit SCENE -o runs/cover
+    """
+    from keyss import verbs
+    from keyss.cli.tables import print_files, print_fit
+    from keyss.fitting.config import PRESETS
+    from keyss.progress import reporter
+
+    verbs.fit(
+        scene,
+        config=_schedule(PRESETS[preset], iterations, max_gaussians, seed),
+        width=width,
+        background=background,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
+    print_fit(_metrics(out))
+    print_files(out, {"model.ply": "the model", "metrics.json": "its numbers", "config.json": "what ran"})
+
+
+def hide(
+    *,
+    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see.")],
+    secret: Annotated[
+        UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE", help="Scene to hide in it; at least one.")
+    ],
+    key_file: KeyFiles = (),
+    out: OutFolder,
+    preset: Annotated[Literal["quick", "default"], arg(help="Size and length of the run.")] = "default",
+    iterations: Iterations = None,
+    max_gaussians: MaxGaussians = None,
+    width: Width = None,
+    background: Background = None,
+    mask: Annotated[
+        str | None,
+        optional("op,ro,sc,xyz,sh", "Attributes that the decoder changes, some of these.", "op,ro,sc,xyz"),
+    ] = None,
+    start: Annotated[
+        Literal["warm", "points"] | None,
+        optional("{warm,points}", "Start from plain models, or from sparse points (the paper).", "warm"),
+    ] = None,
+    cover_model: Annotated[
+        Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
+    ] = None,
+    secret_model: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
+    ] = (),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: Seed = None,
+) -> None:
+    """Hide secret scenes in a cover scene, each under its own key.
+
+    example: keyss hide --cover SCENE_A --secret SCENE_B --key-file key.txt -o runs/hidden
+    """
+    from dataclasses import replace
+
+    from keyss import verbs
+    from keyss.cli.keys import keys
+    from keyss.cli.tables import print_files, print_metrics
+    from keyss.core.errors import UsageError
+    from keyss.hiding.config import PRESETS
+    from keyss.hiding.mask import parse_mask
+    from keyss.progress import reporter
+
+    if not secret:
+        raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
+    if secret_model and len(secret_model) != len(secret):
+        raise UsageError(
+            f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
+        )
+    config = PRESETS[preset]
+    config = replace(config, fit=_schedule(config.fit, iterations, max_gaussians, seed))
+    if mask is not None:
+        config = replace(config, mask=parse_mask(mask))
+    if start is not None:
+        config = replace(config, start=start)
+    models = secret_model or (None,) * len(secret)
+    verbs.hide(
+        cover,
+        [
+            verbs.Secret(scene, key, model)
+            for scene, key, model in zip(
+                secret, keys(key_file, len(secret), confirm=True), models, strict=True
+            )
+        ],
+        config=config,
+        width=width,
+        background=background,
+        cover_model=cover_model,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
+    print_metrics(_metrics(out))
+    print_files(
+        out,
+        {
+            "stego.ply": "the cover with the secret in it: this is what to publish",
+            "decoder.safetensors": "opens it together with the key: keep it from strangers",
+            "private": "plain models of all scenes: keep them to yourself",
+            "metrics.json": "the numbers",
+            "config.json": "what ran",
+        },
+    )
+
+
+def reveal(
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply.")],
+    *,
+    key_file: Annotated[
+        Path | None, optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt")
+    ] = None,
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
+    decoder: Annotated[
+        Path | None, optional("FILE", "The decoder.", "decoder.safetensors beside the .ply")
+    ] = None,
+    frame: Annotated[
+        Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
+    ] = "secret",
+    decoy: Annotated[
+        bool, arg(help="With a wrong key, write what the method gives for it: the cover.")
+    ] = False,
+    force: Annotated[bool, arg(help="Go on although the decoder was made for another .ply.")] = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: UnusedSeed = 0,
+) -> None:
+    """Bring a secret back with its key.
+
+    example: keyss reveal runs/hidden/stego.ply --key-file key.txt -o secret.ply
+    """
+    from keyss import verbs
+    from keyss.cli.keys import keys
+
+    (key,) = keys((key_file,) if key_file else (), 1)
+    revealed = verbs.reveal(
+        stego,
+        key,
+        decoder=decoder,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
+    print(f"{out}: {len(revealed):,} Gaussians")
+
+
+def render(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply.")],
+    *,
+    cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
+    split: Annotated[Literal["test", "train", "all"], arg(help="Which of its cameras.")] = "test",
+    width: Width = None,
+    background: Background = None,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: UnusedSeed = 0,
+) -> None:
+    """Render a model from the cameras of a scene.
+
+    example: keyss render secret.ply --cameras SCENE_B -o images/
+    """
+    from keyss import verbs
+
+    images = verbs.render(
+        model,
+        cameras,
+        split=split,
+        width=width,
+        background=background,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
+    print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
+
+
+def evaluate(
+    run: Annotated[Positional[Path], arg(metavar="RUN", help="Result folder of `keyss hide`.")],
+    *,
+    key_file: KeyFiles = (),
+    wrong_keys: Annotated[int, arg(metavar="N", help="Number of random wrong keys to try.")] = 32,
+    device: Device = "auto",
+    seed: UnusedSeed = 0,
+) -> None:
+    """Measure a hiding run against the test photos, with the keys and with wrong ones.
+
+    example: keyss evaluate runs/hidden --key-file key.txt
+    """
+    from keyss import verbs
+    from keyss.cli.keys import keys
+    from keyss.cli.tables import print_files, print_metrics
+    from keyss.progress import reporter
+
+    metrics = verbs.evaluate(
+        run, keys(key_file, len(key_file) or 1), wrong_keys=wrong_keys, device=device, reporter=reporter()
+    )
+    print_metrics(metrics)
+    print_files(run, {"metrics.json": "the numbers"})
+
+
+def info(
+    path: Annotated[
+        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a decoder or a result folder.")
+    ],
+    *,
+    json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
+    device: UnusedDevice = "auto",
+    seed: UnusedSeed = 0,
+) -> None:
+    """Tell what is in a model, a scene folder or a decoder.
+
+    example: keyss info runs/hidden/stego.ply
+    """
+    from keyss import verbs
+    from keyss.cli.tables import print_facts
+
+    facts = verbs.info(path)
+    if json_:
+        print(json.dumps(facts, indent=2))
+    else:
+        print_facts(facts)
+
+
+def demo(
+    *,
+    out: OutFolder = Path("out/demo"),
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: Annotated[int, arg(metavar="N", help="Seed of everything random, the demo's key included.")] = 0,
+) -> None:
+    """Hide one made-up scene in another and open it again: everything in about three minutes.
+
+    example: keyss demo -o out/demo
+    """
+    from keyss.cli.tables import print_files, print_metrics
+    from keyss.demo import run_demo
+    from keyss.progress import reporter
+
+    metrics = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=reporter())
+    print_metrics(metrics)
+    print_files(
+        out,
+        {
+            "comparison.png": "all of it in one picture: look here first",
+            "stego.ply": "what would be published: opens in any 3DGS viewer",
+            "secret.ply": "what the key brought back from it",
+            "decoder.safetensors": "needed for that, beside the key",
+            "key.txt": "the key of this demo, known to everybody",
+            "scenes": "the photos",
+            "metrics.json": "the numbers",
+        },
+    )
+
+
+ALL = (keygen, fit, hide, reveal, render, evaluate, info, demo)
+
+
+def _schedule(
+    config: FitConfig, iterations: int | None, max_gaussians: int | None, seed: int | None
+) -> FitConfig:
+    """The preset with what was asked for on the command line."""
+    from dataclasses import replace
+
+    from keyss.core.errors import UsageError
+
+    for option, value, low in (
+        ("--iterations", iterations, 1),
+        ("--max-gaussians", max_gaussians, 1),
+        ("--seed", seed, 0),
+    ):
+        if value is not None and not low <= value < 2**32:
+            raise UsageError(f"{option}: expected {low} to {2**32 - 1}, got {value}")
+    asked: dict[str, Any] = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": seed}
+    return replace(config, **{name: value for name, value in asked.items() if value is not None})
+
+
+def _metrics(folder: Path) -> dict[str, Any]:
+    metrics: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
+    return metrics

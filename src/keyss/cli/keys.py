@@ -1,0 +1,65 @@
+"""Where keys come from: files, the environment, a hidden prompt; never arguments, which others see."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from keyss.core.errors import InputError, UsageError
+
+VARIABLE = "KEYSS_KEY"
+MAX_FILE_BYTES = 4096
+
+
+def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[str]:
+    """`count` keys: those of `files` if there are any, else of the environment, else asked for.
+
+    `confirm` asks twice, for keys that lock rather than open. Raises UsageError when the numbers do not
+    fit or there is nowhere to ask, InputError for a file that holds no key.
+    """
+    if files:
+        if len(files) != count:
+            raise UsageError(f"expected one --key-file for each of {count} secret(s), got {len(files)}")
+        return [key_of_file(path) for path in files]
+    if VARIABLE in os.environ:
+        if count != 1:
+            raise UsageError(
+                f"{VARIABLE} holds one key, but there are {count} secrets: give --key-file for each"
+            )
+        if not os.environ[VARIABLE]:
+            raise UsageError(f"{VARIABLE} is set but empty")
+        return [os.environ[VARIABLE]]
+    if not sys.stdin.isatty():
+        raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal and be asked")
+    return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
+
+
+def key_of_file(path: Path) -> str:
+    """The text of a key file without one newline at its end. Raises InputError."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: the key file cannot be read: {error.strerror}") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise InputError(f"{path}: expected a key file of at most {MAX_FILE_BYTES} bytes, found more")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a key in UTF-8, found other bytes") from error
+    key = text.removesuffix("\n").removesuffix("\r")
+    if not key:
+        raise InputError(f"{path}: the key file is empty; `keyss keygen > FILE` writes a key")
+    return key
+
+
+def _ask(prompt: str, confirm: bool) -> str:
+    key = getpass.getpass(f"{prompt}: ")
+    if not key:
+        raise UsageError("the key is empty")
+    if confirm and getpass.getpass(f"{prompt} again: ") != key:
+        raise UsageError("the two keys differ")
+    return key

@@ -1,0 +1,53 @@
+"""How near a picture is to a photo, as the training loop and the results report it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import View
+from keyss.fitting.losses import Target, ssim
+from keyss.rendering import render
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Means over views."""
+
+    psnr: float  # dB
+    ssim: float  # the 3DGS variant, at most 1
+
+
+def psnr(image: Tensor, reference: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of two [H, W, 3] images; values are clamped to [0, 1] first."""
+    error = (image.clamp(0, 1) - reference.clamp(0, 1)).square().mean()
+    return float(-10 * torch.log10(error.clamp_min(1e-12)))
+
+
+@torch.no_grad()
+def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> Quality:
+    """Mean PSNR and SSIM of the views' renders, rounded to no fewer than 32 bits, against their photos."""
+    psnrs, ssims = [], []
+    for view in views:
+        photo = view.image.to(gaussians.device).float() / 255
+        image = render(gaussians, view.camera, background).clamp(0, 1)
+        psnrs.append(psnr(image, photo))
+        ssims.append(float(ssim(image, Target.of(photo))))
+    return Quality(sum(psnrs) / len(psnrs), sum(ssims) / len(ssims))
+
+
+@torch.no_grad()
+def mean_psnr(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> float:
+    """Mean PSNR in dB of the views' renders against their photos."""
+    device = gaussians.device
+    values = [psnr(render(gaussians, v.camera, background), v.image.to(device).float() / 255) for v in views]
+    return sum(values) / len(values)
+
+
+def thin(views: Sequence[View], count: int) -> tuple[View, ...]:
+    """At most `count` of the views, evenly spread."""
+    return tuple(views[:: max(1, -(-len(views) // count))])

@@ -1,0 +1,126 @@
+"""Hiding from posed photos: plain models of all scenes, one frame for all, joint training."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from keyss.core.alignment import align
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.core.similarity import Similarity
+from keyss.fitting.loop import Reporter, train
+from keyss.fitting.plain import fit_scene
+from keyss.hiding.config import HideConfig
+from keyss.hiding.decoder_file import HiddenSecret, SavedDecoder, choose_anchors
+from keyss.hiding.joint import JointRun
+from keyss.hiding.targets import PlacedScene
+from keyss.seal.keys import SALT_BYTES, DerivedKey, KeyDerivation
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """What hiding gives: what is published, what opens it, and what stays private."""
+
+    stego: Gaussians  # to be published
+    decoder: SavedDecoder
+    plains: tuple[Gaussians, ...]  # plain models of the cover and the secrets, each in its own frame
+    seconds: float
+
+
+def hide_scenes(
+    scenes: Sequence[Scene],
+    keys: Sequence[str],
+    config: HideConfig,
+    *,
+    plains: Sequence[Gaussians | None] | None = None,
+    device: torch.device | str = "cpu",
+    checkpoints: Path | None = None,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> Hidden:
+    """Hide `scenes[1:]` in `scenes[0]`, each to be opened by its key.
+
+    `plains`: existing plain models, None for those to be fitted. With `checkpoints` (a folder) the state
+    of every stage is kept there, and `resume` goes on from it. Raises UsageError for keys that are equal
+    or not one per secret, Interrupted on Ctrl-C, InputError for checkpoints of another run.
+    """
+    if len(keys) != len(scenes) - 1 or not keys:
+        raise UsageError(f"expected one key for each of {len(scenes) - 1} secret(s), got {len(keys)}")
+    started = time.monotonic()
+    device = torch.device(device)
+    derivation = KeyDerivation(salt=_salt(scenes[0], config.fit.seed))
+    derived = [DerivedKey(key, derivation) for key in keys]
+    if len({key.verifier() for key in derived}) != len(derived):
+        raise UsageError("two secrets have the same key: each needs its own")
+
+    models, seconds = [], 0.0
+    for index, (scene, given) in enumerate(zip(scenes, plains or [None] * len(scenes), strict=True)):
+        if given is not None:
+            models.append(given.with_sh_degree(config.fit.sh_degree))
+            continue
+        role = "cover" if index == 0 else "secret" if len(scenes) == 2 else f"secret {index}"
+        result = fit_scene(
+            scene,
+            config.fit,
+            device=device,
+            title=f"plain model of the {role} ({scene.name})",
+            checkpoint=checkpoints / f"plain-{index}.safetensors" if checkpoints else None,
+            resume=resume,
+            reporter=reporter,
+        )
+        models.append(result.gaussians)
+
+    cover_cameras = [view.camera for view in scenes[0].train]
+    frames = [Similarity.identity()]
+    frames += [align([view.camera for view in scene.train], cover_cameras) for scene in scenes[1:]]
+    placed = [PlacedScene.of(*parts) for parts in zip(scenes, models, frames, strict=True)]
+    run = JointRun(placed, [key.embedding() for key in derived], config, device)
+    train(
+        run,
+        "hide",
+        fingerprint={
+            "scenes": [scene.digest() for scene in scenes],
+            "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
+            "keys": [hashlib.sha256(key.verifier()).hexdigest() for key in derived],
+            "config": _jsonable(config),
+            "device": device.type,
+        },
+        seed=config.fit.seed,
+        checkpoint=checkpoints / "joint.safetensors" if checkpoints else None,
+        resume=resume,
+        checkpoint_seconds=config.fit.checkpoint_seconds,
+        evaluate_every=config.fit.evaluate_every,
+        reporter=reporter,
+    )
+    stego = run.gaussians().to("cpu")
+    generator = torch.Generator().manual_seed(config.fit.seed)
+    saved = SavedDecoder(
+        decoder=run.decoder.to("cpu").requires_grad_(False),
+        derivation=derivation,
+        secrets=tuple(
+            HiddenSecret(key.verifier(), frame) for key, frame in zip(derived, frames[1:], strict=True)
+        ),
+        anchors=choose_anchors(stego, generator),
+    )
+    return Hidden(stego, saved, tuple(models), seconds + time.monotonic() - started)
+
+
+def _salt(cover: Scene, seed: int) -> bytes:
+    """A salt that is the same when a run is repeated and differs between covers and between seeds.
+
+    A salt must be unique rather than secret; taking it from public things makes runs repeatable.
+    """
+    return hashlib.sha256(f"keyss/v1/salt {seed} {cover.digest()}".encode()).digest()[:SALT_BYTES]
+
+
+def _jsonable(config: HideConfig) -> dict[str, object]:
+    values = asdict(config)
+    values["mask"] = list(config.mask)
+    return values

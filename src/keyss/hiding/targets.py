@@ -1,0 +1,79 @@
+"""Combined camera poses (KeySS, section 3.4): what each scene looks like from every training pose.
+
+Where a scene has a photo for a pose, that is its target; elsewhere a plain 3DGS model of the scene
+renders it. Everything is in the cover's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera, Scene, View
+from keyss.core.similarity import Similarity
+from keyss.fitting.losses import Target
+from keyss.rendering import render
+
+CACHE_BYTES = 2 << 30
+
+
+@dataclass(frozen=True)
+class PlacedScene:
+    """A scene and its plain model, both brought into the cover's frame by `frame` (identity for the cover)."""
+
+    scene: Scene
+    plain: Gaussians
+    frame: Similarity
+
+    @staticmethod
+    def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
+        """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
+        moved = replace(
+            scene,
+            train=tuple(_moved(view, frame) for view in scene.train),
+            test=tuple(_moved(view, frame) for view in scene.test),
+            points=frame.apply_points(scene.points),
+        )
+        return PlacedScene(moved, frame.apply_gaussians(plain), frame)
+
+
+def _moved(view: View, frame: Similarity) -> View:
+    return View(frame.apply_camera(view.camera), view.image)
+
+
+class CombinedPoses:
+    """All training poses of all scenes, and every scene's target at each of them."""
+
+    def __init__(self, scenes: Sequence[PlacedScene], device: torch.device) -> None:
+        self.scenes = scenes
+        self.device = device
+        self.plains = [placed.plain.to(device) for placed in scenes]
+        self._rendered: dict[tuple[int, int, int], Tensor] = {}
+        self._bytes = 0
+
+    def camera(self, owner: int, index: int) -> Camera:
+        """Training pose `index` of scene `owner`."""
+        return self.scenes[owner].scene.train[index].camera
+
+    def target(self, scene: int, owner: int, index: int) -> Target:
+        """What `scene` looks like from training pose `index` of `owner`."""
+        image = self.scenes[owner].scene.train[index].image if scene == owner else self._render(scene, owner, index)
+        return Target.of(image.to(self.device))
+
+    def _render(self, scene: int, owner: int, index: int) -> Tensor:
+        """Rendered once, kept as 8-bit pixels like the photos while they fit into CACHE_BYTES."""
+        cached = self._rendered.get((scene, owner, index))
+        if cached is not None:
+            return cached
+        with torch.no_grad():
+            background = self.scenes[scene].scene.background
+            image = render(self.plains[scene], self.camera(owner, index), background)
+        pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+        if self._bytes + pixels.numel() <= CACHE_BYTES:
+            self._rendered[scene, owner, index] = pixels
+            self._bytes += pixels.numel()
+        return pixels

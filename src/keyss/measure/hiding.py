@@ -1,0 +1,95 @@
+"""How well a hiding works, on the test photos of its scenes: the numbers of `metrics.json`."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.fitting.image_metrics import Quality, mean_psnr, quality
+from keyss.hiding.decoder_file import SavedDecoder
+from keyss.hiding.revealing import reveal_gaussians
+from keyss.seal.keys import DerivedKey
+
+
+def measure_hiding(
+    stego: Gaussians,
+    saved: SavedDecoder,
+    scenes: Sequence[Scene],  # the cover, then the secrets, each in its own frame
+    keys: Sequence[str],  # one for each secret, in any order
+    bounds: Sequence[Gaussians],  # plain models of the scenes, each in its own frame
+    *,
+    wrong_keys: int = 32,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Qualities of cover and secrets, their bounds, and what wrong keys show.
+
+    `bound`: the plain models. `wrong_key`: PSNR of what fresh random 16-character keys give, against the
+    cover's photos and, seen from the secrets' own cameras, against theirs; `floor` is the stego cover
+    itself against the secrets' photos, which is what a wrong key should look like.
+    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
+    """
+    cover, secrets = scenes[0], scenes[1:]
+    key_of: dict[int, str] = {}
+    for key in keys:
+        found = saved.find(DerivedKey(key, saved.derivation))
+        key_of[saved.secrets.index(found)] = key
+    if sorted(key_of) != list(range(len(secrets))):
+        raise UsageError(f"expected the keys of all {len(secrets)} secret(s), got {len(key_of)} of them")
+
+    revealed = [reveal_gaussians(stego, saved, key_of[index]).to(stego.device) for index in range(len(secrets))]
+    frames = [saved.secrets[index].frame for index in range(len(secrets))]
+    against_cover: list[float] = []
+    against_secrets: list[list[float]] = [[] for _ in secrets]
+    for key in _random_keys(wrong_keys, seed):
+        decoy = reveal_gaussians(stego, saved, key, decoy=True)
+        against_cover.append(mean_psnr(decoy, cover.test, _background(cover, stego)))
+        for index, secret in enumerate(secrets):
+            against_secrets[index].append(_psnr_in(secret, frames[index].inverse().apply_gaussians(decoy)))
+    return {
+        "cover": _quality(cover, stego),
+        "secrets": [_quality(secret, model) for secret, model in zip(secrets, revealed, strict=True)],
+        "bound": {
+            "cover": _quality(cover, bounds[0]),
+            "secrets": [_quality(secret, model) for secret, model in zip(secrets, bounds[1:], strict=True)],
+        },
+        "wrong_key": {
+            "keys": wrong_keys,
+            "vs_cover": {"mean": sum(against_cover) / wrong_keys, "min": min(against_cover)},
+            "vs_secrets": [{"mean": sum(v) / wrong_keys, "max": max(v)} for v in against_secrets],
+            "floor": [
+                _psnr_in(secret, frame.inverse().apply_gaussians(stego))
+                for secret, frame in zip(secrets, frames, strict=True)
+            ],
+        },
+        "gaussians": len(stego),
+    }
+
+
+def _quality(scene: Scene, model: Gaussians) -> dict[str, float]:
+    result: Quality = quality(model, scene.test, _background(scene, model))
+    return asdict(result)
+
+
+def _psnr_in(scene: Scene, model: Gaussians) -> float:
+    return mean_psnr(model, scene.test, _background(scene, model))
+
+
+def _background(scene: Scene, model: Gaussians) -> torch.Tensor:
+    return scene.background.to(model.device)
+
+
+def _random_keys(count: int, seed: int) -> list[str]:
+    """Keys of 16 alphanumeric characters from a seeded generator, so that measurements can be repeated."""
+    if count < 1:
+        raise UsageError(f"expected at least one wrong key, got {count}")
+    alphabet = string.ascii_letters + string.digits
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.randint(len(alphabet), (count, 16), generator=generator)
+    return ["".join(alphabet[i] for i in row) for row in draws.tolist()]

@@ -1,0 +1,95 @@
+"""Checks of what `rasterization` is called with, the same for every backend."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from keyss.core import UsageError
+from keyss.render.cpu.layout import EPS2D_MIN
+
+MAX_SIDE = 2**16  # pixels
+
+
+def check_arguments(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    eps2d: float,
+    sh_degree: int | None,
+    backgrounds: Tensor | None,
+    render_mode: str,
+    rasterize_mode: str,
+) -> None:
+    """Raise ValueError for a wrong shape or value, UsageError for what is not supported."""
+    if render_mode != "RGB":
+        raise UsageError(f"render_mode: only 'RGB' is supported, got {render_mode!r}")
+    if rasterize_mode != "classic":
+        raise UsageError(f"rasterize_mode: only 'classic' is supported, got {rasterize_mode!r}")
+    if means.dim() != 2 or viewmats.dim() != 3:
+        raise ValueError(
+            f"expected means [N, 3] and viewmats [C, 4, 4] without batch dimensions, "
+            f"got {list(means.shape)} and {list(viewmats.shape)}"
+        )
+    count, cameras = len(means), len(viewmats)
+    _check_shape("means", means, count, 3)
+    _check_shape("quats", quats, count, 4)
+    _check_shape("scales", scales, count, 3)
+    _check_shape("opacities", opacities, count)
+    _check_shape("viewmats", viewmats, cameras, 4, 4)
+    _check_shape("Ks", Ks, cameras, 3, 3)
+    if backgrounds is not None:
+        _check_shape("backgrounds", backgrounds, cameras, 3)
+    if sh_degree is None:
+        if colors.dim() == 2 and colors.shape[0] == count and colors.shape[1] != 3:
+            raise UsageError(f"colors: only 3 channels are supported, got {list(colors.shape)}")
+        _check_shape("colors", colors, count, 3)
+    else:
+        if sh_degree not in (0, 1, 2, 3):
+            raise ValueError(f"sh_degree: expected 0, 1, 2, 3 or None, got {sh_degree!r}")
+        if colors.dim() != 3:
+            raise ValueError(f"colors: expected shape [{count}, K, 3], got {list(colors.shape)}")
+        _check_shape("colors", colors, count, colors.shape[1], 3)
+        if colors.shape[1] < (sh_degree + 1) ** 2:
+            raise ValueError(
+                f"colors: sh_degree {sh_degree} needs at least {(sh_degree + 1) ** 2} coefficients, "
+                f"got {list(colors.shape)}"
+            )
+    for name, tensor in (
+        ("means", means),
+        ("quats", quats),
+        ("scales", scales),
+        ("opacities", opacities),
+        ("colors", colors),
+        ("viewmats", viewmats),
+        ("Ks", Ks),
+        ("backgrounds", backgrounds),
+    ):
+        if tensor is None:
+            continue
+        if not tensor.is_floating_point():
+            raise ValueError(f"{name}: expected floating point numbers, got {tensor.dtype}")
+        if tensor.device != means.device:
+            raise ValueError(f"{name}: is on {tensor.device}, but means is on {means.device}")
+    for name, side in (("width", width), ("height", height)):
+        if not 1 <= side <= MAX_SIDE:
+            raise ValueError(f"{name}: expected 1 to {MAX_SIDE} pixels, got {side}")
+    if not 0 < near_plane < far_plane:
+        raise ValueError(f"expected 0 < near_plane < far_plane, got {near_plane} and {far_plane}")
+    if not EPS2D_MIN <= eps2d < 1e6:
+        raise ValueError(
+            f"eps2d: expected {EPS2D_MIN} or more, got {eps2d}: narrower footprints would be "
+            f"drawn wrongly by the CPU rasterizer"
+        )
+
+
+def _check_shape(name: str, tensor: Tensor, *shape: int) -> None:
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")

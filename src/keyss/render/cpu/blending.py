@@ -1,0 +1,329 @@
+"""Alpha blending of the Gaussians of each tile, front to back, and its gradient (3DGS, eq. 3).
+
+Down a column of pixels a Gaussian's footprint E is a Gaussian in y, so it follows from two recurrences:
+E(y + 1) = E(y) ratio(y) and ratio(y + 1) = ratio(y) decay. A row costs two multiplications for it, and
+exp is needed only where a run of rows starts. A run is short enough that exp(-sigma) at its first row is
+a normal float whenever any later row of it counts: with eps2d >= 0.3 the curvature in y is at most
+1/0.3, so sigma grows by no more than 78 over ANCHOR_ROWS - 1 rows away from a pixel with alpha >= 1/255.
+
+A tile is 8 pixels wide: one vector is one row. A pixel's transmittance is stored negated once it has
+stopped.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
+
+from __future__ import annotations
+
+import numpy as np
+
+from keyss.render.cpu.jit import finite_kernel
+from keyss.render.cpu.layout import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLUE,
+    DECAY,
+    EXTENT_Y,
+    GREEN,
+    HALF,
+    MOMENTS,
+    ONE,
+    OPACITY,
+    PACKED,
+    RED,
+    TILE_HEIGHT,
+    TILE_PIXELS,
+    TILE_WIDTH,
+    TRANSMITTANCE_MIN,
+    TWO,
+    XX,
+    XY,
+    YY,
+    ZERO,
+    X,
+    Y,
+    f32,
+)
+from keyss.render.cpu.simd8 import (
+    any_gt,
+    at,
+    ceil,
+    divide,
+    exp,
+    fetch_add,
+    floor,
+    load8,
+    maximum,
+    minimum,
+    multiply_add,
+    negative_abs,
+    prefetch_read,
+    prefetch_write,
+    ramp,
+    select_ge,
+    select_gt,
+    select_le,
+    splat,
+    store8,
+    sum_lanes,
+    sum_lanes_of_8,
+)
+
+ANCHOR_ROWS = 6  # rows between two evaluations of exp, see above
+PREFETCH = 6  # how many list entries ahead to ask for memory
+STOP_CHECK = 16  # Gaussians between two tests whether the whole tile has stopped
+
+
+@finite_kernel
+def _blend_tile(packed, ranks, start, end, left, top, height, planes):
+    """Blend entries start..end of the list into planes = [transmittance | red | green | blue].
+
+    Returns the entry before which the whole tile had stopped.
+    """
+    for k in range(0, TILE_PIXELS, 8):
+        store8(planes, k, splat(ONE))
+    for k in range(TILE_PIXELS, 4 * TILE_PIXELS, 8):
+        store8(planes, k, splat(ZERO))
+    centre_x = f32(left) + HALF
+    centre_y = f32(top) + HALF
+    entry = start
+    while entry < end:
+        check = min(entry + STOP_CHECK, end)
+        for e in range(entry, check):
+            prefetch_read(packed, np.int64(at(ranks, min(e + PREFETCH, end - 1))) * PACKED)
+            g = np.int64(at(ranks, e)) * PACKED
+            y = at(packed, g + Y) - centre_y
+            extent_y = at(packed, g + EXTENT_Y)
+            first_row = max(ceil(y - extent_y), 0)
+            last_row = min(floor(y + extent_y), height - 1)
+            yy = at(packed, g + YY)
+            opacity = at(packed, g + OPACITY)
+            decay = at(packed, g + DECAY)
+            red = at(packed, g + RED)
+            green = at(packed, g + GREEN)
+            blue = at(packed, g + BLUE)
+            dx = ramp(-(at(packed, g + X) - centre_x))
+            exponent_0 = dx * dx * at(packed, g + XX)
+            exponent_1 = dx * at(packed, g + XY)
+            for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
+                dy = f32(anchor) - y
+                footprint = exp(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
+                ratio = exp(exponent_1 + yy * (dy + dy + ONE))
+                for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
+                    alpha = select_ge(footprint, ALPHA_MIN, minimum(footprint, ALPHA_MAX), ZERO)
+                    footprint = footprint * ratio
+                    ratio = ratio * decay
+                    before = load8(planes, k)
+                    weight = alpha * maximum(before, ZERO)
+                    after = before - weight
+                    store8(planes, k, select_gt(after, TRANSMITTANCE_MIN, after, negative_abs(before)))
+                    weight = select_gt(after, TRANSMITTANCE_MIN, weight, ZERO)
+                    p = k + TILE_PIXELS
+                    store8(planes, p, multiply_add(weight, red, load8(planes, p)))
+                    p = k + 2 * TILE_PIXELS
+                    store8(planes, p, multiply_add(weight, green, load8(planes, p)))
+                    p = k + 3 * TILE_PIXELS
+                    store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
+        entry = check
+        most = load8(planes, 0)
+        for k in range(8, TILE_PIXELS, 8):
+            most = maximum(most, load8(planes, k))
+        if not any_gt(most, TRANSMITTANCE_MIN):
+            break
+    return entry
+
+
+@finite_kernel
+def blend(
+    counter, packed, tile_ranks, tile_starts, tile_columns, width, height, background, image, transmittance, ends
+):
+    """Draw all tiles into `image` and `transmittance`; ends[t] is the first list entry of tile t not looked at."""
+    planes = np.empty(4 * TILE_PIXELS + 16, np.float32)
+    while True:
+        tile = fetch_add(counter, 0, 1)
+        if tile >= ends.shape[0]:
+            break
+        left = (tile % tile_columns) * TILE_WIDTH
+        top = (tile // tile_columns) * TILE_HEIGHT
+        rows = min(TILE_HEIGHT, height - top)
+        ends[tile] = _blend_tile(
+            packed, tile_ranks, tile_starts[tile], tile_starts[tile + 1], left, top, rows, planes
+        )
+        for y in range(rows):
+            for x in range(min(TILE_WIDTH, width - left)):
+                k = y * 8 + x
+                rest = abs(planes[k])
+                image[top + y, left + x, 0] = planes[k + TILE_PIXELS] + rest * background[0]
+                image[top + y, left + x, 1] = planes[k + 2 * TILE_PIXELS] + rest * background[1]
+                image[top + y, left + x, 2] = planes[k + 3 * TILE_PIXELS] + rest * background[2]
+                transmittance[top + y, left + x] = rest
+
+
+@finite_kernel
+def _blend_tile_backward(
+    packed, ranks, slots, start, end, left, top, height, planes, moments, extras, extra_width, absgrad
+):
+    """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
+
+    planes = [transmittance | gradient still to come | red, green and blue gradient]. The gradient still
+    to come is what everything behind the current Gaussian contributes to dL/d(transmittance) times it:
+    the pixel's total minus what has been passed. Within a row dx is fixed per lane, so the loop over rows
+    sums powers of dy only.
+    """
+    centre_x = f32(left) + HALF
+    centre_y = f32(top) + HALF
+    zero = splat(ZERO)
+    for e in range(start, end):
+        ahead = min(e + PREFETCH, end - 1)
+        prefetch_read(packed, np.int64(at(ranks, ahead)) * PACKED)
+        prefetch_write(moments, np.int64(at(slots, ahead)) * MOMENTS)
+        g = np.int64(at(ranks, e)) * PACKED
+        y = at(packed, g + Y) - centre_y
+        extent_y = at(packed, g + EXTENT_Y)
+        first_row = max(ceil(y - extent_y), 0)
+        last_row = min(floor(y + extent_y), height - 1)
+        xx = at(packed, g + XX)
+        xy = at(packed, g + XY)
+        yy = at(packed, g + YY)
+        opacity = at(packed, g + OPACITY)
+        decay = at(packed, g + DECAY)
+        red = at(packed, g + RED)
+        green = at(packed, g + GREEN)
+        blue = at(packed, g + BLUE)
+        dx = ramp(-(at(packed, g + X) - centre_x))
+        exponent_0 = dx * dx * xx
+        exponent_1 = dx * xy
+        sum_1 = zero
+        sum_y = zero
+        sum_yy = zero
+        sum_red = zero
+        sum_green = zero
+        sum_blue = zero
+        sum_abs_x = zero
+        sum_abs_y = zero
+        for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
+            dy = f32(anchor) - y
+            footprint = exp(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
+            ratio = exp(exponent_1 + yy * (dy + dy + ONE))
+            row_dy = splat(dy)
+            for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
+                alpha = select_ge(footprint, ALPHA_MIN, minimum(footprint, ALPHA_MAX), ZERO)
+                stored = load8(planes, k)
+                before = maximum(stored, ZERO)
+                weight = alpha * before
+                after = stored - weight
+                store8(planes, k, select_gt(after, TRANSMITTANCE_MIN, after, negative_abs(stored)))
+                alpha = select_gt(after, TRANSMITTANCE_MIN, alpha, ZERO)
+                weight = select_gt(after, TRANSMITTANCE_MIN, weight, ZERO)
+                gradient_red = load8(planes, k + 2 * TILE_PIXELS)
+                gradient_green = load8(planes, k + 3 * TILE_PIXELS)
+                gradient_blue = load8(planes, k + 4 * TILE_PIXELS)
+                own = multiply_add(
+                    gradient_red, red, multiply_add(gradient_green, green, gradient_blue * blue)
+                )
+                behind = load8(planes, k + TILE_PIXELS) - weight * own
+                store8(planes, k + TILE_PIXELS, behind)
+                alpha_gradient = before * own - divide(behind, ONE - alpha)
+                s = select_le(footprint, ALPHA_MAX, alpha, ZERO) * alpha_gradient
+                footprint = footprint * ratio
+                ratio = ratio * decay
+                s_dy = s * row_dy
+                sum_1 = sum_1 + s
+                sum_y = sum_y + s_dy
+                sum_yy = multiply_add(s_dy, row_dy, sum_yy)
+                sum_red = multiply_add(weight, gradient_red, sum_red)
+                sum_green = multiply_add(weight, gradient_green, sum_green)
+                sum_blue = multiply_add(weight, gradient_blue, sum_blue)
+                if absgrad:
+                    along_x = s * multiply_add(row_dy, xy, dx * (xx * TWO))
+                    along_y = s * multiply_add(row_dy, yy * TWO, exponent_1)
+                    sum_abs_x = sum_abs_x - negative_abs(along_x)
+                    sum_abs_y = sum_abs_y - negative_abs(along_y)
+                row_dy = row_dy + ONE
+        sum_x = dx * sum_1
+        slot = np.int64(at(slots, e))
+        store8(
+            moments,
+            slot * MOMENTS,
+            sum_lanes_of_8(sum_1, sum_x, sum_y, sum_x * dx, dx * sum_y, sum_yy, sum_red, sum_green),
+        )
+        extras[slot * extra_width] = sum_lanes(sum_blue)
+        if absgrad:
+            extras[slot * extra_width + 1] = sum_lanes(sum_abs_x)
+            extras[slot * extra_width + 2] = sum_lanes(sum_abs_y)
+
+
+@finite_kernel
+def blend_backward(
+    counter,
+    packed,
+    tile_ranks,
+    tile_slots,
+    tile_starts,
+    ends,
+    tile_columns,
+    width,
+    height,
+    image,
+    transmittance,
+    image_gradient,
+    alpha_gradient,
+    moments,
+    extras,
+    extra_width,
+    absgrad,
+):
+    """Fill every slot of `moments` and `extras` from the gradients of the image and of alpha."""
+    planes = np.zeros(5 * TILE_PIXELS + 16, np.float32)
+    while True:
+        tile = fetch_add(counter, 0, 1)
+        if tile >= ends.shape[0]:
+            break
+        left = (tile % tile_columns) * TILE_WIDTH
+        top = (tile // tile_columns) * TILE_HEIGHT
+        rows = min(TILE_HEIGHT, height - top)
+        columns = min(TILE_WIDTH, width - left)
+        for e in range(ends[tile], tile_starts[tile + 1]):
+            slot = np.int64(at(tile_slots, e))
+            store8(moments, slot * MOMENTS, splat(ZERO))
+            for k in range(slot * extra_width, (slot + 1) * extra_width):
+                extras[k] = ZERO
+        if tile_starts[tile] == ends[tile]:
+            continue
+        for y in range(rows):
+            for x in range(TILE_WIDTH):
+                k = y * 8 + x
+                if x < columns:
+                    red = image_gradient[top + y, left + x, 0]
+                    green = image_gradient[top + y, left + x, 1]
+                    blue = image_gradient[top + y, left + x, 2]
+                    planes[k] = ONE
+                    planes[k + TILE_PIXELS] = (
+                        red * image[top + y, left + x, 0]
+                        + green * image[top + y, left + x, 1]
+                        + blue * image[top + y, left + x, 2]
+                        - alpha_gradient[top + y, left + x] * transmittance[top + y, left + x]
+                    )
+                    planes[k + 2 * TILE_PIXELS] = red
+                    planes[k + 3 * TILE_PIXELS] = green
+                    planes[k + 4 * TILE_PIXELS] = blue
+                else:
+                    planes[k] = -ONE
+                    planes[k + TILE_PIXELS] = ZERO
+                    planes[k + 2 * TILE_PIXELS] = ZERO
+                    planes[k + 3 * TILE_PIXELS] = ZERO
+                    planes[k + 4 * TILE_PIXELS] = ZERO
+        _blend_tile_backward(
+            packed,
+            tile_ranks,
+            tile_slots,
+            tile_starts[tile],
+            ends[tile],
+            left,
+            top,
+            rows,
+            planes,
+            moments,
+            extras,
+            extra_width,
+            absgrad,
+        )

@@ -1,0 +1,94 @@
+"""How the kernels are compiled, and where the compiled code is kept.
+
+numba's cache notices a change of the file that holds a kernel, but not of the files it imports. All
+kernels here share one cache folder whose name is a hash of every source file in this package, so any
+change makes a new folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+# Everything `fastmath` allows except assuming that no NaN and no infinity occurs: a Gaussian with a NaN
+# must fail the comparisons that select it, not index wildly.
+_NAN_SAFE = {"contract", "arcp", "nsz", "reassoc", "afn"}
+
+
+def kernel(function: Function) -> Function:
+    """Compile `function` at its first call; NaN and infinity compare as IEEE says."""
+    return _compiled(function, fastmath=_NAN_SAFE)
+
+
+def finite_kernel(function: Function) -> Function:
+    """Compile `function` at its first call; the compiler may assume that all numbers are finite."""
+    return _compiled(function, fastmath=True)
+
+
+def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
+    options = {"fastmath": fastmath, "error_model": "numpy", "nogil": True}
+    folder = cache_folder()
+    if folder is None:
+        return cast(Function, numba.njit(**options)(function))
+    # A kernel takes the cache folder of the moment in which it is decorated.
+    folder_before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder)
+    try:
+        return cast(Function, numba.njit(cache=True, **options)(function))
+    except RuntimeError:  # the folder went away, and numba's own places are not writable either
+        return cast(Function, numba.njit(**options)(function))
+    finally:
+        numba.config.CACHE_DIR = folder_before
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Where the compiled kernels of exactly these sources are kept; None where nothing is writable.
+
+    The first writable of: `NUMBA_CACHE_DIR`, `__pycache__` beside this file, the user's cache folder.
+    """
+    digest = hashlib.sha256()
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
+    for parent in _cache_parents():
+        folder = parent / f"keyss-kernels-{digest.hexdigest()[:16]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    return None
+
+
+def _cache_parents() -> list[Path]:
+    parents = [Path(__file__).parent / "__pycache__"]
+    if numba.config.CACHE_DIR:
+        parents.insert(0, Path(numba.config.CACHE_DIR))
+    user_cache = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME")
+    if user_cache:
+        parents.append(Path(user_cache))
+    else:
+        try:
+            parents.append(Path.home() / ".cache")
+        except RuntimeError:  # no home folder is known
+            pass
+    return parents
+
+
+@cache
+def announce_compilation() -> None:
+    """Say on stderr that the first render takes a while, if nothing is compiled yet. Says it once."""
+    folder = cache_folder()
+    if folder is None or next(folder.rglob("*.nbi"), None) is None:
+        print("keyss: compiling the CPU rasterizer, about 20 s, once", file=sys.stderr, flush=True)

@@ -1,0 +1,63 @@
+"""Numbers that all kernels share: the rendering conventions, and what lies where in their arrays."""
+
+import numpy as np
+
+f32 = np.float32
+
+# Conventions of 3DGS as gsplat has them (classic mode).
+ALPHA_MIN = f32(1.0 / 255.0)  # contributions below this are skipped
+ALPHA_MAX = f32(0.999)  # alpha is clamped to this; no gradient passes a clamped alpha
+TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave no more than this ends its pixel and is not drawn
+RADIUS_SIGMAS = f32(3.33)  # reported radii are at most this many standard deviations
+FOV_MARGIN = f32(0.15)  # the Jacobian is clamped outside the image enlarged by this share on each side
+EPS2D_MIN = 0.3  # the exponential recurrence down the rows of a tile is exact for eps2d from here on
+
+# A tile is as wide as a vector; tall tiles make the recurrence down its rows pay.
+TILE_WIDTH = 8
+TILE_HEIGHT = 32
+TILE_WIDTH_LOG2 = 3
+TILE_HEIGHT_LOG2 = 5
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+
+# The packed record of a visible Gaussian: one cache line.
+PACKED = 16
+X = 0  # centre in pixels
+Y = 1
+XX = 2  # -sigma = XX dx^2 + XY dx dy + YY dy^2, the exponent of the Gaussian's footprint
+XY = 3
+YY = 4
+LEVEL = 5  # 2 ln(255 opacity): alpha >= 1/255 where 2 sigma <= this
+OPACITY = 6
+RED = 7
+GREEN = 8
+BLUE = 9
+EXTENT_X = 10  # half the width of the box that holds all pixels with alpha >= 1/255
+EXTENT_Y = 11
+DECAY = 12  # exp(2 YY), the ratio of successive ratios down a column
+
+# The record of sums over one (Gaussian, tile) pair that the backward pass leaves: with s = dL/d(-sigma),
+# sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient, one vector; then blue,
+# and for absgrad the sums of |dL/dx| and |dL/dy|.
+MOMENTS = 8
+
+# The camera array: rotation (row-major, 0 to 8), translation, then these and the position in the world.
+CAMERA = 19
+TX = 9
+TY = 10
+TZ = 11
+FX = 12
+FY = 13
+CX = 14
+CY = 15
+POSITION = 16
+
+# Gaussians per piece of work in the kernels that go over Gaussians. Part of the results: sums of camera
+# gradients are taken within a piece first.
+CHUNK = 2048
+
+ZERO = f32(0)
+HALF = f32(0.5)
+ONE = f32(1)
+TWO = f32(2)
+HUGE = f32(1e30)  # what is larger is treated like infinity: skipped
+NORM_MIN = f32(1e-24)  # smallest squared length that is normalised

@@ -1,0 +1,52 @@
+"""Runs a kernel on several threads.
+
+Kernels release the GIL and take their work in small pieces from a shared counter, so ordinary Python
+threads drive them. Compared with numba's own `prange` this costs no second compilation, is safe to call
+from several threads and after a fork, and a core that is busy elsewhere only delays the piece it holds.
+The pieces never depend on the number of threads, hence nor do the results.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+
+_CORES = os.cpu_count() or 1
+_pools: dict[int, ThreadPoolExecutor] = {}  # one per number of helper threads
+
+
+def run(kernel: Callable[..., None], *arguments: Any) -> None:
+    """Call `kernel(counter, *arguments)` on as many threads as torch uses; returns when all pieces are done.
+
+    `counter` is an int64 array of one zero: the kernel draws the number of its next piece from it with
+    `simd8.fetch_add` until there are no more pieces.
+    """
+    counter = np.zeros(1, np.int64)
+    helpers = min(torch.get_num_threads(), _CORES) - 1
+    if helpers < 1:
+        kernel(counter, *arguments)
+        return
+    tasks = [_pool(helpers).submit(kernel, counter, *arguments) for _ in range(helpers)]
+    try:
+        kernel(counter, *arguments)
+    finally:
+        # By now every piece is taken: a helper that has not started has nothing left to do.
+        for task in tasks:
+            if not task.cancel():
+                task.result()
+
+
+def _pool(helpers: int) -> ThreadPoolExecutor:
+    pool = _pools.get(helpers)
+    if pool is None:
+        pool = _pools[helpers] = ThreadPoolExecutor(helpers, thread_name_prefix="keyss-render")
+    return pool
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pools.clear)  # threads do not survive a fork

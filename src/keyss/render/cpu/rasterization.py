@@ -1,0 +1,356 @@
+"""The kernels put together: forward and backward of all cameras as one torch.autograd.Function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
+
+from keyss.core import BackendError
+from keyss.render.cpu import binning, blending, projection, projection_backward
+from keyss.render.cpu.jit import announce_compilation
+from keyss.render.cpu.layout import CAMERA, CHUNK, DECAY, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
+from keyss.render.cpu.parallel import run
+from keyss.render.cpu.scratch import aligned, scratch
+
+Array = np.ndarray[Any, Any]
+
+MAX_PAIRS = 2**31 - 1  # places in the lists of tiles are int32
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a call is made with besides tensors; see `keyss.render.rasterization`."""
+
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_count: int  # SH coefficients to use; 0 where colours are RGB
+    absgrad: bool
+
+    @property
+    def extra_width(self) -> int:
+        """Floats per (Gaussian, tile) pair beside the `layout.MOMENTS`."""
+        return 3 if self.absgrad else 1
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What the backward pass needs to know of one camera's forward pass."""
+
+    camera: Array  # [CAMERA]
+    packed: Array  # [V, PACKED] visible Gaussians by depth
+    rank: Array  # [N] place of each Gaussian in `packed`, -1 where it is not seen
+    first_slots: Array  # [N + 1] first slot of each Gaussian's pairs
+    tile_starts: Array  # [tiles + 1] first list entry of each tile
+    tile_ranks: Array  # [pairs] the Gaussian of each list entry, as a rank
+    tile_slots: Array  # [pairs] the slot of each list entry
+    ends: Array  # [tiles] first list entry that the tile did not come to
+
+
+def rasterize(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [N, K, 3] SH coefficients; [N, 1, 3] RGB where settings.sh_count is 0
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    backgrounds: Tensor,  # [C, 3]
+    settings: Settings,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Draw float32 contiguous CPU tensors. Returns images [C, H, W, 3], alphas [C, H, W, 1] and meta."""
+    cameras, count = len(viewmats), len(means)
+    means2d = torch.empty(cameras, count, 2)
+    # The gradient with respect to the projected centres is handed out through an input of its own: the
+    # Function reads nothing from it, but returns dL/d(means2d) for it.
+    geometry = (means, quats, scales, opacities, viewmats)
+    means2d.requires_grad_(torch.is_grad_enabled() and any(tensor.requires_grad for tensor in geometry))
+    meta: dict[str, Any] = {
+        "means2d": means2d,
+        "depths": torch.empty(cameras, count),
+        "radii": torch.empty(cameras, count, 2, dtype=torch.int32),
+    }
+    images, alphas = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        means, quats, scales, opacities, colors, viewmats, backgrounds, means2d, Ks, settings, meta
+    )
+    return images, alphas, meta
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmats: Tensor,
+        backgrounds: Tensor,
+        means2d: Tensor,
+        Ks: Tensor,
+        settings: Settings,
+        meta: dict[str, Any],
+    ) -> tuple[Tensor, Tensor]:
+        announce_compilation()
+        shape = (len(viewmats), settings.height, settings.width)
+        images = torch.empty(*shape, 3)
+        transmittances = torch.empty(shape)
+        gaussians = tuple(tensor.detach().numpy() for tensor in (means, quats, scales, opacities, colors))
+        drawings = []
+        for c in range(len(viewmats)):
+            drawing = _draw(
+                gaussians,
+                _camera_array(viewmats[c], Ks[c]),
+                backgrounds[c].detach().numpy(),
+                settings,
+                means2d.detach()[c].numpy(),
+                meta["depths"][c].numpy(),
+                meta["radii"][c].numpy(),
+                images[c].numpy(),
+                transmittances[c].numpy(),
+            )
+            if any(ctx.needs_input_grad):
+                drawings.append(drawing)
+        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, images, transmittances)
+        ctx.means2d = means2d
+        ctx.drawings = drawings
+        ctx.settings = settings
+        ctx.set_materialize_grads(False)
+        return images, (1.0 - transmittances)[..., None]
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(
+        ctx: Any, images_gradient: Tensor | None, alphas_gradient: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        means, quats, scales, opacities, colors, viewmats, images, transmittances = ctx.saved_tensors
+        settings: Settings = ctx.settings
+        if images_gradient is None:
+            images_gradient = torch.zeros_like(images)
+        if alphas_gradient is None:
+            alphas_gradient = torch.zeros_like(transmittances)
+        images_gradient = images_gradient.contiguous()
+        alphas_gradient = alphas_gradient.reshape(transmittances.shape).contiguous()
+        need_colors, need_camera, need_background = ctx.needs_input_grad[4:7]
+
+        gaussians = (means, quats, scales, opacities, colors)
+        gradients = [torch.empty_like(tensor) for tensor in gaussians[:4]]
+        gradients.append(torch.empty_like(colors) if need_colors else torch.empty(0, 1, 3))
+        means2d_gradient = torch.empty_like(ctx.means2d)
+        absgrad = torch.empty_like(ctx.means2d if settings.absgrad else means2d_gradient[:, :0])
+        pieces = -(-len(means) // CHUNK)
+        camera_gradient = np.zeros((pieces if need_camera else 0, 15))
+        viewmats_gradient = torch.zeros_like(viewmats) if need_camera else None
+        for c, drawing in enumerate(ctx.drawings):
+            moments, extras = _blend_backward(
+                drawing,
+                images[c].numpy(),
+                transmittances[c].numpy(),
+                images_gradient[c].numpy(),
+                alphas_gradient[c].numpy(),
+                settings,
+            )
+            run(
+                projection_backward.project_backward,
+                *(tensor.detach().numpy() for tensor in gaussians),
+                settings.sh_count,
+                drawing.camera,
+                settings.width,
+                settings.height,
+                drawing.rank,
+                drawing.packed,
+                drawing.first_slots,
+                moments,
+                extras,
+                settings.extra_width,
+                c == 0,
+                need_colors,
+                need_camera,
+                settings.absgrad,
+                *(gradient.numpy() for gradient in gradients),
+                means2d_gradient[c].detach().numpy(),
+                absgrad[c].detach().numpy(),
+                camera_gradient,
+            )
+            if viewmats_gradient is not None:
+                viewmats_gradient[c] = _viewmat_gradient(camera_gradient, viewmats[c])
+        if settings.absgrad:
+            ctx.means2d.absgrad = absgrad
+        backgrounds_gradient = None
+        if need_background:
+            # numpy's sum, unlike torch's, does not depend on the number of threads.
+            weighted = (images_gradient.double() * transmittances.double()[..., None]).numpy()
+            backgrounds_gradient = torch.from_numpy(weighted.sum((1, 2))).float()
+        returned = (*gradients, viewmats_gradient, backgrounds_gradient, means2d_gradient, None, None, None)
+        return tuple(
+            gradient if needed else None
+            for gradient, needed in zip(returned, ctx.needs_input_grad, strict=True)
+        )
+
+
+def _draw(
+    gaussians: tuple[Array, ...],
+    camera: Array,
+    background: Array,
+    settings: Settings,
+    means2d: Array,
+    depths: Array,
+    radii: Array,
+    image: Array,
+    transmittance: Array,
+) -> Drawing:
+    """One camera's forward pass; fills the last five arrays."""
+    means, quats, scales, opacities, colors = gaussians
+    count = len(means)
+    width, height = settings.width, settings.height
+    columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
+
+    footprints = scratch("footprints", (count, DECAY + 1), np.float32)
+    run(
+        projection.project,
+        means,
+        quats,
+        scales,
+        opacities,
+        camera,
+        width,
+        height,
+        np.float32(settings.near_plane),
+        np.float32(settings.far_plane),
+        np.float32(settings.eps2d),
+        np.float32(settings.radius_clip),
+        footprints,
+        means2d,
+        depths,
+        radii,
+    )
+    rank = np.empty(count, np.int32)
+    order, spare_order = (scratch(name, (count,), np.int32) for name in ("order", "spare_order"))
+    keys, spare_keys = (scratch(name, (count,), np.uint32) for name in ("keys", "spare_keys"))
+    visible = binning.sort_by_depth(depths, rank, order, spare_order, keys, spare_keys)
+    packed = aligned((visible, PACKED), np.float32)
+    tile_bounds = scratch("tile_bounds", (visible,), np.int64)
+    run(
+        projection.pack,
+        footprints,
+        means,
+        colors,
+        settings.sh_count,
+        camera,
+        columns,
+        rows,
+        rank,
+        radii,
+        packed,
+        tile_bounds,
+    )
+
+    shares = 4 * torch.get_num_threads() if torch.get_num_threads() > 1 else 1
+    starts = np.empty(shares + 1, np.int64)
+    binning.share_bounds(tile_bounds, starts)
+    if starts[-1] >= MAX_PAIRS:
+        raise BackendError(
+            f"{visible} Gaussians cover {starts[-1]} tiles together, more than the CPU rasterizer can list "
+            f"({MAX_PAIRS}): render fewer or smaller Gaussians, or at a lower resolution"
+        )
+    tiles = scratch("tiles", (int(starts[-1]),), np.int32)
+    tiles_per_gaussian = scratch("tiles_per_gaussian", (visible,), np.int32)
+    cursors = scratch("cursors", (shares, columns * rows), np.int64)
+    run(binning.list_pairs, packed, columns, rows, starts, tiles, tiles_per_gaussian, cursors)
+    tile_starts = np.empty(columns * rows + 1, np.int64)
+    first_slots = np.empty(count + 1, np.int64)
+    pairs = binning.offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_slots)
+    tile_ranks = np.empty(pairs, np.int32)
+    tile_slots = np.empty(pairs, np.int32)
+    run(
+        binning.sort_pairs,
+        order[:visible],
+        starts,
+        tiles,
+        tiles_per_gaussian,
+        cursors,
+        first_slots,
+        tile_ranks,
+        tile_slots,
+    )
+    ends = np.empty(columns * rows, np.int64)
+    run(
+        blending.blend,
+        packed,
+        tile_ranks,
+        tile_starts,
+        columns,
+        width,
+        height,
+        background,
+        image,
+        transmittance,
+        ends,
+    )
+    return Drawing(camera, packed, rank, first_slots, tile_starts, tile_ranks, tile_slots, ends)
+
+
+def _blend_backward(
+    drawing: Drawing,
+    image: Array,
+    transmittance: Array,
+    image_gradient: Array,
+    alpha_gradient: Array,
+    settings: Settings,
+) -> tuple[Array, Array]:
+    """The sums over each (Gaussian, tile) pair: [pairs * MOMENTS] and [pairs * extra_width], see `layout`."""
+    pairs = len(drawing.tile_ranks)
+    moments = scratch("moments", (pairs * MOMENTS,), np.float32)
+    extras = scratch("extras", (pairs * settings.extra_width,), np.float32)
+    run(
+        blending.blend_backward,
+        drawing.packed,
+        drawing.tile_ranks,
+        drawing.tile_slots,
+        drawing.tile_starts,
+        drawing.ends,
+        -(-settings.width // TILE_WIDTH),
+        settings.width,
+        settings.height,
+        image,
+        transmittance,
+        image_gradient,
+        alpha_gradient,
+        moments,
+        extras,
+        settings.extra_width,
+        settings.absgrad,
+    )
+    return moments, extras
+
+
+def _camera_array(viewmat: Tensor, K: Tensor) -> Array:
+    """The camera as the kernels want it, see `layout.CAMERA`."""
+    view = viewmat.detach().double().numpy()
+    intrinsics = K.detach().double().numpy()
+    camera = np.empty(CAMERA, np.float32)
+    camera[:TX] = view[:3, :3].ravel()
+    camera[TX:FX] = view[:3, 3]
+    camera[FX:POSITION] = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    camera[POSITION:] = -view[:3, :3].T @ view[:3, 3]
+    return camera
+
+
+def _viewmat_gradient(pieces: Array, viewmat: Tensor) -> Tensor:
+    """[4, 4] from the sums that `project_backward` leaves, through position = -R^T t."""
+    sums = pieces.sum(0)
+    rotation, translation, position = sums[:9].reshape(3, 3), sums[9:12], sums[12:15]
+    view = viewmat.detach().double().numpy()
+    gradient = np.zeros((4, 4))
+    gradient[:3, :3] = rotation - np.outer(view[:3, 3], position)
+    gradient[:3, 3] = translation - view[:3, :3] @ position
+    return torch.from_numpy(gradient)

@@ -1,0 +1,376 @@
+"""Explicit vectors of 8 float32 for numba kernels, and a few scalar operations that numba lacks.
+
+LLVM does not vectorise the row loops of the rasterizer by itself, so the kernels say what is a vector.
+The type maps to LLVM's <8 x float>, which every target can execute: one AVX register, two SSE or NEON
+registers. `+`, `-` and `*` work between vectors and between a vector and a float32.
+
+Arrays are indexed flat, must be contiguous, and are not bounds-checked.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
+
+from __future__ import annotations
+
+import operator
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+
+_FLOAT = ir.FloatType()
+_INT = ir.IntType(32)
+_VECTOR = ir.VectorType(_FLOAT, 8)
+_INT_VECTOR = ir.VectorType(_INT, 8)
+_FAST = ("fast",)
+
+
+class Float32x8(types.Type):
+    """The numba type of a vector of 8 float32."""
+
+    def __init__(self):
+        super().__init__(name="float32x8")
+
+
+float32x8 = Float32x8()
+
+
+@register_model(Float32x8)
+class _Float32x8Model(models.PrimitiveModel):
+    def __init__(self, manager, numba_type):
+        super().__init__(manager, numba_type, _VECTOR)
+
+
+# ---------------------------------------------------------------------------------------- building blocks
+
+
+def _constant(value):
+    return ir.Constant(_VECTOR, [float(np.float32(value))] * 8)
+
+
+def _shuffle(builder, a, b, lanes):
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, 8), lanes))
+
+
+def _splat(builder, scalar):
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    return _shuffle(builder, builder.insert_element(undefined, scalar, _INT(0)), undefined, [0] * 8)
+
+
+def _operand(argument_type):
+    """How an argument is passed: a vector as it is, any number as float32."""
+    return argument_type if isinstance(argument_type, Float32x8) else types.float32
+
+
+def _as_vectors(builder, signature, values):
+    return [
+        value if isinstance(argument, Float32x8) else _splat(builder, value)
+        for argument, value in zip(signature.args, values, strict=True)
+    ]
+
+
+def _multiply_add(builder, a, b, c):
+    return builder.fadd(builder.fmul(a, b, flags=_FAST), c, flags=_FAST)
+
+
+def _element(context, builder, array_type, array, index):
+    return builder.gep(context.make_array(array_type)(context, builder, array).data, [index])
+
+
+def _llvm_function(builder, name, result, arguments):
+    return cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, arguments), name)
+
+
+# ---------------------------------------------------------------------------------------- + - *
+
+
+def _register_operator(python_operator, instruction):
+    @type_callable(python_operator)
+    def type_of(context):
+        def typer(a, b):
+            vectors = [isinstance(t, Float32x8) for t in (a, b)]
+            if all(vectors) or (any(vectors) and types.float32 in (a, b)):
+                return float32x8
+            return None
+
+        return typer
+
+    def lower(context, builder, signature, values):
+        a, b = _as_vectors(builder, signature, values)
+        return getattr(builder, instruction)(a, b, flags=_FAST)
+
+    for operands in ((Float32x8, Float32x8), (Float32x8, types.Float), (types.Float, Float32x8)):
+        lower_builtin(python_operator, *operands)(lower)
+
+
+_register_operator(operator.add, "fadd")
+_register_operator(operator.sub, "fsub")
+_register_operator(operator.mul, "fmul")
+
+
+# ---------------------------------------------------------------------------------------- vectors
+
+
+@intrinsic
+def load8(typingctx, array, index):
+    """The 8 floats from flat position `index`."""
+
+    def codegen(context, builder, signature, arguments):
+        address = builder.bitcast(
+            _element(context, builder, signature.args[0], *arguments), _VECTOR.as_pointer()
+        )
+        value = builder.load(address)
+        value.align = 4
+        return value
+
+    return float32x8(array, index), codegen
+
+
+@intrinsic
+def store8(typingctx, array, index, value):
+    """Write the 8 floats from flat position `index`."""
+
+    def codegen(context, builder, signature, arguments):
+        address = _element(context, builder, signature.args[0], *arguments[:2])
+        builder.store(arguments[2], builder.bitcast(address, _VECTOR.as_pointer())).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, index, value), codegen
+
+
+@intrinsic
+def splat(typingctx, scalar):
+    """The vector with `scalar` in every lane."""
+
+    def codegen(context, builder, signature, arguments):
+        return _splat(builder, arguments[0])
+
+    return float32x8(types.float32), codegen
+
+
+@intrinsic
+def ramp(typingctx, start):
+    """(start, start + 1, ... start + 7)."""
+
+    def codegen(context, builder, signature, arguments):
+        steps = ir.Constant(_VECTOR, [float(i) for i in range(8)])
+        return builder.fadd(_splat(builder, arguments[0]), steps, flags=_FAST)
+
+    return float32x8(types.float32), codegen
+
+
+@intrinsic
+def multiply_add(typingctx, a, b, c):
+    """a * b + c, one instruction where the CPU has it."""
+
+    def codegen(context, builder, signature, arguments):
+        return _multiply_add(builder, *_as_vectors(builder, signature, arguments))
+
+    return float32x8(_operand(a), _operand(b), _operand(c)), codegen
+
+
+@intrinsic
+def divide(typingctx, a, b):
+    """a / b."""
+
+    def codegen(context, builder, signature, arguments):
+        return builder.fdiv(*_as_vectors(builder, signature, arguments), flags=_FAST)
+
+    return float32x8(_operand(a), _operand(b)), codegen
+
+
+def _selection(predicate):
+    @intrinsic
+    def select(typingctx, a, b, yes, no):
+        def codegen(context, builder, signature, arguments):
+            a, b, yes, no = _as_vectors(builder, signature, arguments)
+            return builder.select(builder.fcmp_ordered(predicate, a, b), yes, no)
+
+        return float32x8(*(_operand(argument) for argument in (a, b, yes, no))), codegen
+
+    return select
+
+
+select_ge = _selection(">=")  # (a, b, yes, no): per lane `yes` where a >= b, else `no`
+select_gt = _selection(">")
+select_le = _selection("<=")
+
+
+def _extremum(predicate):
+    @intrinsic
+    def extremum(typingctx, a, b):
+        def codegen(context, builder, signature, arguments):
+            a, b = _as_vectors(builder, signature, arguments)
+            return builder.select(builder.fcmp_ordered(predicate, a, b), a, b)
+
+        return float32x8(_operand(a), _operand(b)), codegen
+
+    return extremum
+
+
+minimum = _extremum("<")
+maximum = _extremum(">")
+
+
+@intrinsic
+def negative_abs(typingctx, a):
+    """-|a|."""
+
+    def codegen(context, builder, signature, arguments):
+        bits = builder.bitcast(arguments[0], _INT_VECTOR)
+        return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(1 << 31)] * 8)), _VECTOR)
+
+    return float32x8(float32x8), codegen
+
+
+@intrinsic
+def any_gt(typingctx, a, b):
+    """True where a > b in any lane."""
+
+    def codegen(context, builder, signature, arguments):
+        mask = builder.fcmp_ordered(">", *_as_vectors(builder, signature, arguments))
+        lanes = ir.IntType(8)
+        return builder.icmp_unsigned("!=", builder.bitcast(mask, lanes), lanes(0))
+
+    return types.boolean(_operand(a), _operand(b)), codegen
+
+
+@intrinsic
+def lane(typingctx, a, index):
+    """One of the 8 floats."""
+
+    def codegen(context, builder, signature, arguments):
+        return builder.extract_element(*arguments)
+
+    return types.float32(float32x8, index), codegen
+
+
+@intrinsic
+def sum_lanes(typingctx, a):
+    """The sum of the 8 lanes, always taken in the same order."""
+
+    def codegen(context, builder, signature, arguments):
+        value = arguments[0]
+        for lanes in ([4, 5, 6, 7, 0, 1, 2, 3], [2, 3, 0, 1, 6, 7, 4, 5], [1, 0, 3, 2, 5, 4, 7, 6]):
+            value = builder.fadd(value, _shuffle(builder, value, value, lanes), flags=_FAST)
+        return builder.extract_element(value, _INT(0))
+
+    return types.float32(float32x8), codegen
+
+
+@intrinsic
+def sum_lanes_of_8(typingctx, a0, a1, a2, a3, a4, a5, a6, a7):
+    """The vector whose lane i is the sum of the lanes of a_i: 7 steps instead of 8 times 3."""
+
+    def codegen(context, builder, signature, arguments):
+        def add_neighbours(a, b):
+            even = _shuffle(builder, a, b, [0, 2, 8, 10, 4, 6, 12, 14])
+            odd = _shuffle(builder, a, b, [1, 3, 9, 11, 5, 7, 13, 15])
+            return builder.fadd(even, odd, flags=_FAST)
+
+        pairs = [add_neighbours(arguments[i], arguments[i + 1]) for i in range(0, 8, 2)]
+        low, high = add_neighbours(*pairs[:2]), add_neighbours(*pairs[2:])
+        left = _shuffle(builder, low, high, [0, 1, 2, 3, 8, 9, 10, 11])
+        right = _shuffle(builder, low, high, [4, 5, 6, 7, 12, 13, 14, 15])
+        return builder.fadd(left, right, flags=_FAST)
+
+    return float32x8(*[float32x8] * 8), codegen
+
+
+def _fit_exp2(degree):
+    """Coefficients of a polynomial for 2^x on [-1/2, 1/2] with the least relative error (Lawson's method)."""
+    x = 0.5 * np.cos(np.pi * (np.arange(400) + 0.5) / 400)
+    powers = np.stack([x**i for i in range(degree + 1)], 1) / (2.0**x)[:, None]
+    weights = np.ones(len(x))
+    for _ in range(60):
+        root = np.sqrt(weights)
+        coefficients = np.linalg.lstsq(powers * root[:, None], root, rcond=None)[0]
+        weights = weights * np.abs(powers @ coefficients - 1)
+        weights /= weights.sum()
+    return coefficients
+
+
+_EXP2_COEFFICIENTS = _fit_exp2(6)
+_LOG2_E = 1.4426950408889634
+
+
+@intrinsic
+def exp(typingctx, x):
+    """e^x for x < 87, and 0 below -87; the relative error is about 1e-7 (1 + |x|)."""
+
+    def codegen(context, builder, signature, arguments):
+        (x,) = arguments
+        scaled = builder.fmul(x, _constant(_LOG2_E), flags=_FAST)
+        round_to_nearest = _llvm_function(builder, "llvm.rint.v8f32", _VECTOR, [_VECTOR])
+        exponent = builder.call(round_to_nearest, [scaled])
+        fraction = builder.fsub(scaled, exponent, flags=_FAST)
+        result = _constant(_EXP2_COEFFICIENTS[-1])
+        for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
+            result = _multiply_add(builder, result, fraction, _constant(coefficient))
+        shift = builder.shl(builder.fptosi(exponent, _INT_VECTOR), ir.Constant(_INT_VECTOR, [23] * 8))
+        result = builder.bitcast(builder.add(builder.bitcast(result, _INT_VECTOR), shift), _VECTOR)
+        return builder.select(builder.fcmp_ordered(">", x, _constant(-87.0)), result, _constant(0.0))
+
+    return float32x8(float32x8), codegen
+
+
+# ---------------------------------------------------------------------------------------- scalars
+
+
+@intrinsic
+def at(typingctx, array, index):
+    """array.flat[index], without numba's test for negative indices."""
+
+    def codegen(context, builder, signature, arguments):
+        return builder.load(_element(context, builder, signature.args[0], *arguments))
+
+    return array.dtype(array, index), codegen
+
+
+@intrinsic
+def fetch_add(typingctx, array, index, value):
+    """Atomically add to an integer element; returns what it was before."""
+
+    def codegen(context, builder, signature, arguments):
+        address = _element(context, builder, signature.args[0], *arguments[:2])
+        return builder.atomic_rmw("add", address, arguments[2], "monotonic")
+
+    return array.dtype(array, index, array.dtype), codegen
+
+
+def _prefetch(write):
+    @intrinsic
+    def prefetch(typingctx, array, index):
+        def codegen(context, builder, signature, arguments):
+            address = _element(context, builder, signature.args[0], *arguments)
+            address = builder.bitcast(address, ir.IntType(8).as_pointer())
+            kinds = [address.type, _INT, _INT, _INT]
+            function = _llvm_function(builder, "llvm.prefetch.p0", ir.VoidType(), kinds)
+            builder.call(function, [address, _INT(write), _INT(3), _INT(1)])
+            return context.get_dummy_value()
+
+        return types.void(array, index), codegen
+
+    return prefetch
+
+
+prefetch_read = _prefetch(0)  # (array, index): ask for the cache line of array.flat[index]
+prefetch_write = _prefetch(1)
+
+
+def _rounding(name):
+    @intrinsic
+    def to_integer(typingctx, x):
+        def codegen(context, builder, signature, arguments):
+            function = _llvm_function(builder, f"llvm.{name}.f32", _FLOAT, [_FLOAT])
+            return builder.fptosi(builder.call(function, arguments), ir.IntType(64))
+
+        return types.int64(types.float32), codegen
+
+    return to_integer
+
+
+# numba makes a library call of math.floor and math.ceil; these are one instruction each.
+floor = _rounding("floor")
+ceil = _rounding("ceil")

@@ -1,0 +1,135 @@
+"""`rasterization`: gsplat's function of that name, on whichever device the Gaussians are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from keyss.core import UsageError
+from keyss.render import cuda
+from keyss.render.arguments import check_arguments
+from keyss.render.cpu.layout import EPS2D_MIN
+from keyss.render.cpu.rasterization import Settings
+from keyss.render.cpu.rasterization import rasterize as rasterize_on_cpu
+
+
+def rasterization(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [N, K, 3] or [N, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = EPS2D_MIN,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,  # [C, 3]
+    absgrad: bool = False,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Draw N Gaussians into C images (3DGS, Kerbl et al. 2023, eq. 3 to 5): `gsplat.rasterization`, unpacked.
+
+    Gaussians on the CPU are drawn by the kernels in `keyss.render.cpu`, those on a GPU by gsplat.
+
+    Args:
+        means: centres in the world.
+        quats: rotations as wxyz, of any length.
+        scales: standard deviations, positive.
+        opacities: in [0, 1].
+        colors: SH coefficients where `sh_degree` is given, with colour = max(0.5 + basis . colors, 0);
+            else RGB.
+        viewmats: world to camera, rigid motions, OpenCV axes.
+        Ks: pinhole intrinsics in pixels, without skew; pixel centres lie at half-integers.
+        width: pixels.
+        height: pixels.
+        near_plane: nearest depth that is drawn, positive.
+        far_plane: farthest depth that is drawn.
+        radius_clip: Gaussians with no larger radius, in pixels, are not drawn.
+        eps2d: variance in pixels^2 added to every footprint, 0.3 or more.
+        sh_degree: degree up to which to use the SH coefficients, 0 to 3, with K >= (sh_degree + 1)^2.
+        backgrounds: colour behind everything; black when None.
+        absgrad: also sum absolute gradients into `meta["means2d"].absgrad` (AbsGS).
+        render_mode: "RGB".
+        rasterize_mode: "classic".
+
+    Returns:
+        Images [C, H, W, 3], not clamped above; alphas [C, H, W, 1] in [0, 1]; and a dictionary with what
+        gsplat's strategies read: means2d [C, N, 2] in pixels (after backward its `.grad` holds
+        dL/d(means2d)), radii [C, N, 2] int32 in pixels (0 where not drawn), depths [C, N], width, height,
+        n_cameras, gaussian_ids (None: nothing is packed).
+
+    On the CPU there are gradients to all tensors but Ks, everything is computed in float32 and is
+    bit-identical from run to run and for any number of threads, Gaussians that are not finite are not
+    drawn, and means2d is a leaf: losses on it do not reach the means.
+
+    Raises:
+        ValueError: a shape, dtype or number is not as above.
+        UsageError: a render mode, number of channels or device that is not supported.
+        BackendError: gsplat's CUDA kernels are missing, or memory for the lists of tiles is out of reach.
+    """
+    check_arguments(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
+        near_plane, far_plane, eps2d, sh_degree, backgrounds, render_mode, rasterize_mode,
+    )  # fmt: skip
+    if means.device.type == "cuda":
+        return cuda.rasterize(
+            means=means,
+            quats=quats,
+            scales=scales,
+            opacities=opacities,
+            colors=colors,
+            viewmats=viewmats,
+            Ks=Ks,
+            width=width,
+            height=height,
+            near_plane=near_plane,
+            far_plane=far_plane,
+            radius_clip=radius_clip,
+            eps2d=eps2d,
+            sh_degree=sh_degree,
+            backgrounds=backgrounds,
+            absgrad=absgrad,
+        )
+    if means.device.type != "cpu":
+        raise UsageError(f"means: only tensors on 'cpu' or 'cuda' can be drawn, got {means.device}")
+    settings = Settings(
+        width=int(width),
+        height=int(height),
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        eps2d=eps2d,
+        sh_count=0 if sh_degree is None else (sh_degree + 1) ** 2,
+        absgrad=absgrad,
+    )
+    if backgrounds is None:
+        backgrounds = torch.zeros(len(viewmats), 3)
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = (
+        tensor.float().contiguous() for tensor in tensors
+    )
+    if sh_degree is None:
+        colors = colors[:, None]
+    images, alphas, meta = rasterize_on_cpu(
+        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, settings
+    )
+    meta.update(
+        width=settings.width,
+        height=settings.height,
+        n_cameras=len(viewmats),
+        n_batches=1,
+        batch_ids=None,
+        camera_ids=None,
+        gaussian_ids=None,
+        opacities=opacities.expand(len(viewmats), -1),
+    )
+    return images, alphas, meta

@@ -1,0 +1,43 @@
+"""One picture of `Gaussians` from one `Camera`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from keyss.core import Camera, Gaussians
+from keyss.render.rasterize import rasterization
+
+
+def render(
+    gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
+) -> Tensor:
+    """The picture [H, W, 3] that the camera takes; 0 is black, 1 is white, and it is not clamped above.
+
+    `background` [3] lies behind everything, black when None. `sh_degree` limits the spherical harmonics
+    (default: all that the Gaussians have). Drawn on the device of the Gaussians; differentiable. Raises
+    what `rasterization` raises.
+    """
+    return render_with_meta(gaussians, camera, background, sh_degree=sh_degree)[0]
+
+
+def render_with_meta(
+    gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
+) -> tuple[Tensor, dict[str, Any]]:
+    """Like `render`, with the meta of `rasterization` for this one camera and `alpha` [H, W] in it."""
+    device = gaussians.device
+    images, alphas, meta = rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        camera.viewmat.to(device)[None],
+        camera.K.to(device)[None],
+        camera.width,
+        camera.height,
+        sh_degree=gaussians.sh_degree if sh_degree is None else sh_degree,
+        backgrounds=None if background is None else background.to(device)[None],
+    )
+    return images[0], meta | {"alpha": alphas[0, ..., 0]}

@@ -1,0 +1,410 @@
+"""The verbs a person would say, over files or over objects: what the command line calls.
+
+Each takes paths or what they hold, and writes files only where `out` is given.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import torch
+from torch import Tensor
+
+from keyss._version import __version__
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera, Scene, View
+from keyss.files.atomic import write_bytes
+from keyss.files.output import OutputFolder, check_output_file
+from keyss.files.ply import read_ply, write_ply
+from keyss.files.scenes import load_scene
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import quality
+from keyss.fitting.loop import Reporter
+from keyss.fitting.plain import FitResult, fit_scene
+from keyss.hiding.config import HideConfig
+from keyss.hiding.decoder_file import SavedDecoder, load_decoder, save_decoder
+from keyss.hiding.pipeline import hide_scenes
+from keyss.hiding.revealing import Frame, reveal_gaussians
+from keyss.measure.hiding import measure_hiding
+from keyss.rendering import Backend, resolve_device
+from keyss.rendering import render as render_image
+
+Split = Literal["test", "train", "all"]
+Background = Tensor | Sequence[float] | None
+PathLike = str | Path
+
+STEGO, DECODER, CONFIG, METRICS, MODEL = "stego.ply", "decoder.safetensors", "config.json", "metrics.json", "model.ply"
+PRIVATE = "private"  # plain models of cover and secrets: for measuring, never to be published
+
+
+@dataclass(frozen=True)
+class Secret:
+    """A scene to hide and the key that is to open it."""
+
+    scene: PathLike | Scene
+    key: str
+    model: PathLike | Gaussians | None = None  # a plain 3DGS model of it, if there is one already
+
+    def __repr__(self) -> str:
+        return f"Secret(scene={self.scene!r}, key=<hidden>)"
+
+
+@dataclass(frozen=True)
+class HideResult:
+    """A hiding and how well it works."""
+
+    stego: Gaussians  # to be published
+    decoder: SavedDecoder  # for those who hold a key
+    metrics: dict[str, Any]
+
+
+def fit(
+    scene: PathLike | Scene,
+    *,
+    config: FitConfig | None = None,
+    width: int | None = None,
+    background: Background = None,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> FitResult:
+    """Train plain 3DGS on a scene.
+
+    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply`,
+    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    Raises KeyssError and its children; Interrupted on Ctrl-C.
+    """
+    config = config or FitConfig()
+    target = resolve_device(device)
+    folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
+    loaded = _scene(scene, width, background)
+    result = fit_scene(
+        loaded,
+        config,
+        device=target,
+        title=f"fit {loaded.name}",
+        checkpoint=folder.checkpoints() / "fit.safetensors" if folder else None,
+        resume=resume,
+        reporter=reporter,
+    )
+    if folder is not None:
+        test = quality(result.gaussians.to(target), loaded.test, loaded.background.to(target))
+        metrics = {
+            **asdict(test),
+            "gaussians": len(result.gaussians),
+            "iterations": config.iterations,
+            "seconds": round(result.seconds, 1),
+            "width": _width(loaded),
+            "seed": config.seed,
+            "version": __version__,
+        }
+        settings = {"scene": _name(scene), "width": width, "config": asdict(config), "version": __version__}
+        folder.fill(
+            {
+                MODEL: lambda path: write_ply(path, result.gaussians),
+                CONFIG: _json_writer(settings),
+                METRICS: _json_writer(metrics),
+            }
+        )
+    return result
+
+
+def hide(
+    cover: PathLike | Scene,
+    secrets: Sequence[Secret],
+    *,
+    config: HideConfig | None = None,
+    width: int | None = None,
+    background: Background = None,
+    cover_model: PathLike | Gaussians | None = None,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> HideResult:
+    """Hide every secret in the cover, and measure the result on the test photos.
+
+    Plain models of all scenes come first unless they are given. `out` (a folder) gets `stego.ply`,
+    `decoder.safetensors`, `config.json`, `metrics.json` and `private/` with the plain models; while it
+    runs, checkpoints from which `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+    """
+    config = config or HideConfig()
+    if not secrets:
+        raise UsageError("expected at least one secret")
+    target = resolve_device(device)
+    folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
+    sources = [cover, *(secret.scene for secret in secrets)]
+    given = [cover_model, *(secret.model for secret in secrets)]
+    plains = [None if model is None else _model(model) for model in given]
+    scenes = [_scene(source, width, background) for source in sources]
+    keys = [secret.key for secret in secrets]
+    hidden = hide_scenes(
+        scenes,
+        keys,
+        config,
+        plains=plains,
+        device=target,
+        checkpoints=folder.checkpoints() if folder else None,
+        resume=resume,
+        reporter=reporter,
+    )
+    metrics = measure_hiding(
+        hidden.stego.to(target),
+        hidden.decoder,
+        scenes,
+        keys,
+        [plain.to(target) for plain in hidden.plains],
+        seed=config.fit.seed,
+    )
+    metrics |= {
+        "iterations": config.fit.iterations,
+        "seconds": round(hidden.seconds, 1),
+        "width": _width(scenes[0]),
+        "seed": config.fit.seed,
+        "version": __version__,
+    }
+    if folder is not None:
+        settings = {
+            "cover": _name(cover),
+            "secrets": [_name(secret.scene) for secret in secrets],
+            "models_given": [model is not None for model in given],
+            "width": width,
+            "background": None if background is None else [float(x) for x in background],
+            "config": asdict(config),
+            "version": __version__,
+        }
+        writers: dict[str, Callable[[Path], None]] = {
+            STEGO: lambda path: write_ply(path, hidden.stego),
+            DECODER: lambda path: save_decoder(path, hidden.decoder),
+            CONFIG: _json_writer(settings),
+            METRICS: _json_writer(metrics),
+        }
+        for name, plain in zip(_plain_names(len(secrets)), hidden.plains, strict=True):
+            writers[name] = _ply_writer(plain)
+        folder.fill(writers)
+    return HideResult(hidden.stego, hidden.decoder, metrics)
+
+
+def reveal(
+    stego: PathLike | Gaussians,
+    key: str,
+    *,
+    decoder: PathLike | SavedDecoder | None = None,
+    frame: Frame = "secret",
+    decoy: bool = False,
+    force: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> Gaussians:
+    """The secret that `key` opens in a stego model, as an ordinary model; see `reveal_gaussians`.
+
+    The decoder of a file is looked for beside it. `out` (a file) gets the revealed PLY. Raises
+    WrongKeyError for a key that opens nothing (with `decoy` the cover comes instead), InputError for
+    files that are not what they should be or do not belong together.
+    """
+    target = resolve_device(device)
+    path = None if out is None else check_output_file(out, overwrite)
+    model = _model(stego)
+    if decoder is None:
+        if isinstance(stego, Gaussians):
+            raise UsageError("revealing from Gaussians in memory needs the decoder")
+        decoder = Path(stego).with_name(DECODER)
+        if not decoder.exists():
+            raise InputError(f"{decoder}: no decoder beside the model; name it with --decoder FILE")
+    saved = decoder if isinstance(decoder, SavedDecoder) else load_decoder(decoder)
+    revealed = reveal_gaussians(model.to(target), saved, key, frame=frame, decoy=decoy, force=force).to("cpu")
+    if path is not None:
+        write_ply(path, revealed)
+    return revealed
+
+
+def render(
+    model: PathLike | Gaussians,
+    cameras: PathLike | Scene,
+    *,
+    split: Split = "test",
+    width: int | None = None,
+    background: Background = None,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> list[tuple[str, Tensor]]:
+    """Pictures of a model from a scene's cameras: their names and uint8 images [H, W, 3].
+
+    `out` (a folder) gets a PNG per camera.
+    """
+    target = resolve_device(device)
+    folder = OutputFolder(out, overwrite=overwrite) if out is not None else None
+    gaussians = _model(model).to(target)
+    scene = _scene(cameras, width, background)
+    views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
+    pictures = []
+    with torch.no_grad():
+        for view in views[split]:
+            image = render_image(gaussians, view.camera, scene.background.to(target))
+            pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+            pictures.append((_picture_name(view.camera), pixels))
+    if folder is not None:
+        folder.fill({name: _png_writer(image) for name, image in pictures})
+    return pictures
+
+
+def evaluate(
+    run: PathLike,
+    keys: Sequence[str],
+    *,
+    wrong_keys: int = 32,
+    seed: int = 0,
+    device: Backend = "auto",
+    reporter: Reporter | None = None,
+) -> dict[str, Any]:
+    """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
+
+    `keys`: those of all its secrets, in any order.
+    """
+    target = resolve_device(device)
+    folder = Path(run)
+    settings = _read_json(folder / CONFIG)
+    old = _read_json(folder / METRICS)
+    try:
+        sources = [settings["cover"], *settings["secrets"]]
+        width, background = settings["width"], settings["background"]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder / CONFIG}: not the configuration of a hiding ({error} is missing)") from error
+    if not all(isinstance(source, str) for source in sources):
+        raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
+    stego, saved = read_ply(folder / STEGO), load_decoder(folder / DECODER)
+    saved.check_belongs_to(stego)
+    scenes = [load_scene(source, width=width, background=background) for source in sources]
+    bounds = [read_ply(folder / name) for name in _plain_names(len(scenes) - 1)]
+    metrics = measure_hiding(
+        stego.to(target),
+        saved,
+        scenes,
+        keys,
+        [bound.to(target) for bound in bounds],
+        wrong_keys=wrong_keys,
+        seed=seed,
+    )
+    metrics = {**old, **metrics}
+    write_bytes(folder / METRICS, _json_bytes(metrics))
+    return metrics
+
+
+def info(path: PathLike) -> dict[str, Any]:
+    """What is in a PLY, a decoder, a scene folder or a folder of results, as JSON-able facts."""
+    path = Path(path)
+    if path.is_dir():
+        if (path / STEGO).exists():
+            return {"kind": "hiding", "path": str(path), "metrics": _read_json(path / METRICS)}
+        if (path / MODEL).exists():
+            return {"kind": "plain model", "path": str(path), "metrics": _read_json(path / METRICS)}
+        return _describe_scene(load_scene(path))
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder")
+    if path.suffix.lower() == ".ply":
+        return {"kind": "3DGS model", "path": str(path), "bytes": path.stat().st_size, **_describe(read_ply(path))}
+    saved = load_decoder(path)
+    return {
+        "kind": "decoder",
+        "path": str(path),
+        "bytes": path.stat().st_size,
+        "secrets": len(saved.secrets),
+        "mask": ",".join(saved.decoder.shape.mask),
+        "parameters": sum(parameter.numel() for parameter in saved.decoder.parameters()),
+        "key_derivation": {
+            "function": "Argon2id",
+            "memory_kib": saved.derivation.memory_kib,
+            "time_cost": saved.derivation.time_cost,
+            "parallelism": saved.derivation.parallelism,
+        },
+    }
+
+
+def _describe(gaussians: Gaussians) -> dict[str, Any]:
+    low, high = gaussians.means.amin(0), gaussians.means.amax(0)
+    return {
+        "gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "bounding_box": [[round(float(x), 4) for x in corner] for corner in (low, high)],
+        "opacity_below_0.05": round(float((gaussians.opacities < 0.05).float().mean()), 4),
+    }
+
+
+def _describe_scene(scene: Scene) -> dict[str, Any]:
+    camera = scene.train[0].camera
+    return {
+        "kind": "scene",
+        "name": scene.name,
+        "train_views": len(scene.train),
+        "test_views": len(scene.test),
+        "image_size": [camera.width, camera.height],
+        "points": len(scene.points),
+        "extent": round(scene.extent, 4),
+        "background": [round(float(x), 4) for x in scene.background],
+    }
+
+
+def _scene(source: PathLike | Scene, width: int | None, background: Background) -> Scene:
+    return source if isinstance(source, Scene) else load_scene(source, width=width, background=background)
+
+
+def _model(source: PathLike | Gaussians) -> Gaussians:
+    return source.to("cpu") if isinstance(source, Gaussians) else read_ply(source)
+
+
+def _name(source: PathLike | Scene) -> str | None:
+    """Where a scene can be found again, None for one in memory."""
+    return None if isinstance(source, Scene) else str(Path(source).resolve())
+
+
+def _width(scene: Scene) -> int:
+    return scene.train[0].camera.width
+
+
+def _plain_names(secrets: int) -> list[str]:
+    return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
+
+
+def _picture_name(camera: Camera) -> str:
+    """A flat file name: folders in a camera's name become part of it."""
+    return Path(camera.name.replace("/", "_").replace("\\", "_")).stem + ".png"
+
+
+def _ply_writer(gaussians: Gaussians) -> Callable[[Path], None]:
+    return lambda path: write_ply(path, gaussians)
+
+
+def _png_writer(image: Tensor) -> Callable[[Path], None]:
+    encoded = cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes()
+    return lambda path: write_bytes(path, encoded)
+
+
+def _json_writer(data: dict[str, Any]) -> Callable[[Path], None]:
+    return lambda path: write_bytes(path, _json_bytes(data))
+
+
+def _json_bytes(data: dict[str, Any]) -> bytes:
+    return (json.dumps(data, indent=2) + "\n").encode()
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: missing; is this a folder that keyss made?") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a JSON object")
+    return data

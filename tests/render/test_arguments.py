@@ -1,0 +1,107 @@
+"""Wrong arguments are refused, each by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from keyss.core import BackendError, UsageError
+from keyss.render import rasterization, resolve_device
+
+
+def good_arguments() -> dict[str, Any]:
+    return {
+        "means": torch.zeros(2, 3),
+        "quats": torch.ones(2, 4),
+        "scales": torch.ones(2, 3),
+        "opacities": torch.ones(2),
+        "colors": torch.ones(2, 3),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.eye(3)[None],
+        "width": 4,
+        "height": 4,
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("means", torch.zeros(2, 4)),
+        ("means", torch.zeros(1, 2, 3)),
+        ("means", torch.zeros(2, 3, dtype=torch.int64)),
+        ("quats", torch.ones(3, 4)),
+        ("scales", torch.ones(2)),
+        ("opacities", torch.ones(2, 1)),
+        ("colors", torch.ones(3, 3)),
+        ("colors", torch.ones(1, 2, 3)),
+        ("viewmats", torch.eye(4)),
+        ("viewmats", torch.eye(3)[None]),
+        ("Ks", torch.eye(3)),
+        ("Ks", torch.eye(3).expand(2, 3, 3)),
+        ("backgrounds", torch.zeros(3)),
+        ("width", 0),
+        ("height", -1),
+        ("width", 2**20),
+        ("near_plane", 0.0),
+        ("far_plane", 0.001),
+        ("eps2d", 0.1),
+        ("eps2d", float("nan")),
+        ("sh_degree", 4),
+    ],
+)
+def test_wrong_shapes_and_values(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=name):
+        rasterization(**{**good_arguments(), name: value})
+
+
+def test_sh_degree_needs_its_coefficients() -> None:
+    with pytest.raises(ValueError, match=r"sh_degree 2 needs at least 9 coefficients, got \[2, 4, 3\]"):
+        rasterization(**{**good_arguments(), "colors": torch.zeros(2, 4, 3), "sh_degree": 2})
+    with pytest.raises(ValueError, match=r"colors: expected shape \[2, K, 3\]"):
+        rasterization(**{**good_arguments(), "sh_degree": 0})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("render_mode", "RGB+ED"),
+        ("rasterize_mode", "antialiased"),
+        ("colors", torch.ones(2, 8)),
+    ],
+)
+def test_what_is_not_supported_is_named(name: str, value: object) -> None:
+    with pytest.raises(UsageError, match=name):
+        rasterization(**{**good_arguments(), name: value})
+
+
+def test_mixed_devices_and_unknown_devices() -> None:
+    with pytest.raises(ValueError, match="quats: is on meta"):
+        rasterization(**{**good_arguments(), "quats": torch.ones(2, 4, device="meta")})
+    everything = {
+        name: value.to("meta") if isinstance(value, torch.Tensor) else value
+        for name, value in good_arguments().items()
+    }
+    with pytest.raises(UsageError, match="meta"):
+        rasterization(**everything)
+
+
+def test_resolve_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert resolve_device("cpu") == torch.device("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert resolve_device() == resolve_device("auto") == torch.device("cpu")
+    with pytest.raises(BackendError, match="no CUDA GPU"):
+        resolve_device("cuda")
+    with pytest.raises(UsageError, match="tpu"):
+        resolve_device("tpu")  # type: ignore[arg-type]
+
+
+def test_gpu_without_gsplat_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    import gsplat.cuda._backend
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gsplat.cuda._backend, "_C", None)
+    for backend in ("auto", "cuda"):
+        with pytest.raises(BackendError, match="gsplat's CUDA kernels are missing"):
+            resolve_device(backend)  # type: ignore[arg-type]

@@ -1,0 +1,110 @@
+"""The conventions of 3DGS, each in numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from keyss.core import Camera, Gaussians
+from keyss.core.gaussians import SH_C0
+from keyss.render import rasterization, render, render_with_alpha
+
+
+def draw(
+    means: list[list[float]],
+    opacities: list[float],
+    colors: list[list[float]],
+    scale: float = 0.01,
+    background: list[float] | None = None,
+    size: int = 9,
+) -> tuple[Tensor, Tensor]:
+    """Draw small round Gaussians with a camera at the origin looking along z, focal length 10."""
+    count = len(means)
+    images, alphas, _ = rasterization(
+        torch.tensor(means),
+        torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        torch.full((count, 3), scale),
+        torch.tensor(opacities),
+        torch.tensor(colors),
+        torch.eye(4)[None],
+        torch.tensor([[[10.0, 0, size / 2], [0, 10, size / 2], [0, 0, 1]]]),
+        size,
+        size,
+        backgrounds=None if background is None else torch.tensor([background]),
+    )
+    return images[0], alphas[0, ..., 0]
+
+
+def test_pixel_centres_lie_at_half_integers() -> None:
+    # The principal point of 9 pixels is 4.5: the middle of pixel 4, where alpha is the opacity itself.
+    image, alpha = draw([[0, 0, 1]], [0.5], [[1, 0.5, 0.25]])
+    assert alpha[4, 4] == pytest.approx(0.5, abs=1e-6)
+    assert image[4, 4].tolist() == pytest.approx([0.5, 0.25, 0.125], abs=1e-6)
+    # One pixel to the side: variance (10 * 0.01)^2 + 0.3 pixels^2.
+    assert alpha[4, 5] == pytest.approx(0.5 * math.exp(-0.5 / 0.31), abs=1e-6)
+    assert alpha[5, 4] == alpha[4, 5] == alpha[3, 4] == alpha[4, 3]
+
+
+def test_x_is_right_and_y_is_down() -> None:
+    _, alpha = draw([[0.2, 0.1, 1]], [0.5], [[1, 1, 1]])
+    assert divmod(int(alpha.argmax()), 9) == (5, 6)
+
+
+def test_front_covers_back_and_background_lies_behind() -> None:
+    image, _ = draw([[0, 0, 2], [0, 0, 1]], [0.5, 0.25], [[1, 0, 0], [0, 1, 0]], background=[0, 0, 1])
+    assert image[4, 4].tolist() == pytest.approx([0.75 * 0.5, 0.25, 0.75 * 0.5], abs=1e-6)
+
+
+def test_alpha_is_cut_off_below_1_in_255_and_clamped_at_0_999() -> None:
+    assert draw([[0, 0, 1]], [0.99 / 255], [[1, 1, 1]])[1].max() == 0
+    assert draw([[0, 0, 1]], [1.01 / 255], [[1, 1, 1]])[1].max() == pytest.approx(1.01 / 255, rel=1e-5)
+    assert draw([[0, 0, 1]], [1.0], [[1, 1, 1]])[1].max() == pytest.approx(0.999, abs=1e-6)
+    _, alpha = draw([[0, 0, 1]], [0.5], [[1, 1, 1]])
+    assert (alpha[alpha > 0] >= 1 / 255).all()
+
+
+def test_a_pixel_stops_before_its_transmittance_falls_to_1_in_10000() -> None:
+    # 0.1^3 = 1e-3 passes; the fourth would leave 1e-4 exactly or less, and is not drawn.
+    _, alpha = draw([[0, 0, 1.0 + i] for i in range(5)], [0.91] * 5, [[1, 1, 1]] * 5, scale=0.3)
+    assert 1 - alpha[4, 4] == pytest.approx(0.09**3, rel=1e-3)
+
+
+def test_colour_is_half_plus_the_constant_harmonic_and_is_not_clamped_above() -> None:
+    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]), 9, 9)
+    dc = torch.tensor([[[1.0, -0.5, 4.0]]])
+    gaussians = Gaussians(
+        torch.tensor([[0.0, 0, 1]]),
+        torch.tensor([[2.0, 0, 0, 0]]),
+        torch.full((1, 3), -2.0),
+        torch.tensor([3.0]),
+        dc,
+    )
+    image, alpha = render_with_alpha(gaussians, camera)
+    expected = (0.5 + SH_C0 * dc[0, 0]).tolist()
+    assert (image[4, 4] / alpha[4, 4]).tolist() == pytest.approx(expected, abs=1e-6)
+    assert image.max() > 1
+    assert alpha[4, 4] == pytest.approx(torch.tensor(3.0).sigmoid().item(), abs=1e-6)
+    assert torch.equal(render(gaussians, camera), image)
+    white = render(gaussians, camera, torch.ones(3))
+    torch.testing.assert_close(white, image + (1 - alpha)[..., None])
+    below = Gaussians(*(getattr(gaussians, name) for name in ("means", "quats", "log_scales")),
+                      gaussians.opacity_logits, -dc * 10)  # fmt: skip
+    assert render(below, camera)[4, 4, 0] == 0
+
+
+def test_sh_degree_limits_the_harmonics() -> None:
+    generator = torch.Generator().manual_seed(0)
+    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]), 9, 9)
+    gaussians = Gaussians(
+        torch.tensor([[0.1, 0.2, 1]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), -2.0),
+        torch.tensor([3.0]),
+        torch.randn(1, 16, 3, generator=generator),
+    )
+    for degree in range(4):
+        expected = render(gaussians.with_sh_degree(degree), camera)
+        assert torch.equal(render(gaussians, camera, sh_degree=degree), expected)
