@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
+
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:

@@ -1,11 +1,14 @@
 """Hide a 3D Gaussian Splatting scene inside another one and open it only with a key.
 
-    from keyss import Secret, hide, reveal
+from keyss import Secret, hide, reveal
 
-    hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
-    reveal("runs/hidden/stego.ply", key, out="treasure.ply")
+hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
+reveal("runs/hidden/stego.ply", key, out="treasure.ply")
 """
 
+from keyss import _threads  # noqa: F401
+
+# Everything below imports torch.
 from keyss._version import __version__
 from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
 from keyss.files import load_scene, read_ply, write_ply

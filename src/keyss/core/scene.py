@@ -67,7 +67,7 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """Radius of the training cameras: 1.1 x the largest distance from their mean (3DGS's `cameras_extent`)."""
+        """1.1 x the largest distance of a training camera from their mean (3DGS's `cameras_extent`)."""
         positions = camera_positions([view.camera for view in self.train])
         return 1.1 * float((positions - positions.mean(0)).norm(dim=1).max())
 

@@ -29,9 +29,13 @@ class OutputFolder:
                 raise OutputError(f"{self.path} exists and is not a folder")
             names = {entry.name for entry in self.path.iterdir()}
             if names == {CHECKPOINTS} and not (overwrite or resume):
-                raise OutputError(f"{self.path} holds an interrupted run: --resume continues it, --overwrite drops it")
+                raise OutputError(
+                    f"{self.path} holds an interrupted run: --resume continues it, --overwrite drops it"
+                )
             if names and not (overwrite or resume):
-                raise OutputError(f"{self.path} exists: choose another folder, or --overwrite to replace its results")
+                raise OutputError(
+                    f"{self.path} exists: choose another folder, or --overwrite to replace its results"
+                )
         self._drop_checkpoints = overwrite
 
     def checkpoints(self) -> Path:

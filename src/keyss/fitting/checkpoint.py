@@ -55,9 +55,7 @@ def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimize
         optimizer.state.pop(old, None)
         optimizer.param_groups[0]["params"] = [parameter]
         prefix = f"{name}."
-        moments = {
-            key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)
-        }
+        moments = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         if moments:
             optimizer.state[parameter] = {
                 key: value if key == "step" else value.to(old.device) for key, value in moments.items()

@@ -23,9 +23,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     hiding it is the largest opacity over all scenes, so that none loses what only it needs.
     """
 
-    def __init__(
-        self, config: FitConfig, opacity_for_pruning: Callable[[], Tensor] | None = None
-    ) -> None:
+    def __init__(self, config: FitConfig, opacity_for_pruning: Callable[[], Tensor] | None = None) -> None:
         super().__init__(
             prune_opa=config.prune_opacity,
             grow_grad2d=config.grow_gradient,
@@ -52,9 +50,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         return counts
 
     @torch.no_grad()
-    def _prune_gs(
-        self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int
-    ) -> int:
+    def _prune_gs(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> int:
         if self.opacity_for_pruning is None:
             opacities = torch.sigmoid(params["opacities"])
         else:

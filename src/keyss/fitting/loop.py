@@ -17,7 +17,7 @@ from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during training, after the state was saved. `checkpoint` is None where nothing was to be saved."""
+    """Ctrl-C during training, after saving to `checkpoint` (None: there was none to write)."""
 
     def __init__(self, checkpoint: Path | None, iteration: int) -> None:
         super().__init__()
@@ -86,9 +86,9 @@ def train(
     """Take `run` to its last iteration; returns the seconds spent, those before a resume included.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds` and on Ctrl-C (raises
-    Interrupted) and at the end; with `resume`, it continues from there if the file exists. `fingerprint` (JSON-able) is
-    what must be the same for a resumed run to mean the same; a checkpoint of another one raises InputError.
-    The same seed gives the same run on a CPU, interrupted or not: the global random state, which gsplat's
+    Interrupted) and at the end; with `resume`, it continues from there if the file exists. `fingerprint`
+    (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of another one
+    raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global random state, which gsplat's
     densification draws from, is seeded here, kept in the checkpoint, and given back to the caller.
     """
     reporter = reporter or Silent()

@@ -12,9 +12,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from keyss.core.alignment import focus_point
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Scene
-from keyss.core.alignment import focus_point
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
@@ -64,7 +64,9 @@ def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) ->
     }
 
 
-def initial_gaussians(points: Tensor, colors: Tensor, sh_degree: int, limit: int, generator: torch.Generator) -> Gaussians:
+def initial_gaussians(
+    points: Tensor, colors: Tensor, sh_degree: int, limit: int, generator: torch.Generator
+) -> Gaussians:
     """3DGS's start: at each sparse point an isotropic Gaussian as wide as the distance to its neighbours.
 
     points [P, 3] and colors [P, 3] uint8; at most `limit` of them, drawn at random, are used.

@@ -96,7 +96,7 @@ def _products(counter: Any, planes: Any, target: Any, stacked: Any) -> None:
 
 @finite_kernel
 def _similarity(counter: Any, stats: Any, target_mean: Any, target_variance: Any, row_sums: Any) -> None:
-    """Row sums of the SSIM map; `stats` [9, H, W] is overwritten by its derivatives to mean, square, product."""
+    """Row sums of the SSIM map; its derivatives to mean, square, product overwrite `stats` [9, H, W]."""
     _, height, width = target_mean.shape
     while True:
         job = fetch_add(counter, 0, 1)
@@ -124,7 +124,7 @@ def _similarity(counter: Any, stats: Any, target_mean: Any, target_variance: Any
 
 @finite_kernel
 def _chain(counter: Any, planes: Any, target: Any, derivatives: Any, scale: Any, gradient: Any) -> None:
-    """gradient [3, H, W] = scale (d mean + 2 x d square + y d product), after the derivatives were blurred."""
+    """gradient [3, H, W] = scale (d mean + 2 x d square + y d product) of the blurred derivatives."""
     _, height, width = planes.shape
     while True:
         job = fetch_add(counter, 0, 1)
@@ -140,12 +140,12 @@ def _chain(counter: Any, planes: Any, target: Any, derivatives: Any, scale: Any,
 
 
 def blur(source: Array, result: Array) -> None:
-    """Write SSIM's window (11x11, sigma 1.5, zeros outside) over the last two axes of [B, H, W] to `result`."""
+    """`result` = SSIM's window (11x11, sigma 1.5, zeros outside) over the last two axes of [B, H, W]."""
     parallel.run(_blur, source, result)
 
 
 def ssim_and_gradient(planes: Array, target: Array, mean: Array, variance: Array) -> tuple[float, Array]:
-    """Mean SSIM of two images [3, H, W] and its gradient to the first; `mean`, `variance` are the target's."""
+    """Mean SSIM of [3, H, W] and a target, whose `mean` and `variance` are given, and its gradient."""
     stacked = np.empty((9, *planes.shape[1:]), np.float32)
     stats = np.empty_like(stacked)
     parallel.run(_products, planes, target, stacked)

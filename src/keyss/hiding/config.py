@@ -17,7 +17,9 @@ class HideConfig:
     fit: FitConfig = field(default_factory=FitConfig)  # schedule, cap and rates, also of the plain models
 
     mask: Mask = ("op", "ro", "sc", "xyz")  # theta: the attributes that the decoder updates
-    start: Literal["warm", "points"] = "warm"  # from the plain models' Gaussians, or from sparse points (paper)
+    start: Literal["warm", "points"] = (
+        "warm"  # from the plain models' Gaussians, or from sparse points (paper)
+    )
     hidden: int = 128  # width of the decoder's common branch
     branch: int = 32  # width of its branch per attribute
     frequencies: int = 6  # octaves of its positional encoding

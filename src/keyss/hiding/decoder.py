@@ -91,10 +91,12 @@ class Decoder(nn.Module):
     def _attributes(self, gaussians: Gaussians) -> Tensor:
         position = self._contracted(gaussians.means)
         opacity = gaussians.opacity_logits[:, None]
-        return torch.cat([position, opacity, gaussians.quats, gaussians.log_scales, gaussians.sh.flatten(1)], dim=1)
+        return torch.cat(
+            [position, opacity, gaussians.quats, gaussians.log_scales, gaussians.sh.flatten(1)], dim=1
+        )
 
     def _contracted(self, means: Tensor) -> Tensor:
-        """[N, 3] in a ball of radius 2: near positions as they are, far ones drawn in (Mip-NeRF 360, eq. 10)."""
+        """[N, 3] in a ball of radius 2: far positions are drawn in (Mip-NeRF 360, eq. 10)."""
         position = (means - self.center) / (2 * self.extent)
         distance = position.norm(dim=1, keepdim=True).clamp_min(1e-9)
         return torch.where(distance <= 1, position, (2 - 1 / distance) * position / distance)
@@ -108,7 +110,9 @@ class Decoder(nn.Module):
         standardised = (attributes - self.offset) / self.spread
         return torch.cat([standardised, angles.sin(), angles.cos()], dim=1)
 
-    def forward(self, gaussians: Gaussians, embedding: Tensor, description: Tensor | None = None) -> Gaussians:
+    def forward(
+        self, gaussians: Gaussians, embedding: Tensor, description: Tensor | None = None
+    ) -> Gaussians:
         """Decode with the embedding [64]; `description` saves computing `describe(gaussians)` again."""
         if description is None:
             description = self.describe(gaussians)

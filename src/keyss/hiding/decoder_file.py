@@ -35,6 +35,16 @@ MAX_SECRETS = 256
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
+# What reading a damaged header or damaged weights can raise.
+_DAMAGE = (
+    safetensors.SafetensorError,
+    KeyError,
+    TypeError,
+    ValueError,
+    RuntimeError,
+    AttributeError,
+    UsageError,
+)
 
 
 @dataclass(frozen=True)
@@ -70,8 +80,8 @@ class SavedDecoder:
         if found < ANCHORS_NEEDED:
             raise InputError(
                 f"this decoder was made for another model: {found:.0%} of its anchors are in this PLY, "
-                f"at least {ANCHORS_NEEDED:.0%} expected (a conversion that quantises positions does that too: "
-                "--force tries all the same)"
+                f"at least {ANCHORS_NEEDED:.0%} expected "
+                "(quantising the positions does that too: --force tries all the same)"
             )
 
 
@@ -109,17 +119,18 @@ def load_decoder(path: Path | str) -> SavedDecoder:
         raise InputError(f"{path}: {error}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot read the decoder: {error.strerror or error}") from error
-    except (
-        safetensors.SafetensorError, KeyError, TypeError, ValueError, RuntimeError, AttributeError, UsageError,
-    ) as error:  # fmt: skip
-        raise InputError(f"{path}: not a decoder, or damaged: {str(error).splitlines()[0]}") from error
+    except _DAMAGE as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path}: not a decoder, or damaged: {reason}") from error
 
 
 def _check_version(header: Any) -> None:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError("not a keyss decoder")
     if header.get("version") != VERSION:
-        raise InputError(f"decoder of version {header.get('version')!r}; this program reads version {VERSION}")
+        raise InputError(
+            f"decoder of version {header.get('version')!r}; this program reads version {VERSION}"
+        )
 
 
 def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> SavedDecoder:
@@ -135,7 +146,9 @@ def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> SavedDeco
     anchors = tensors.pop("anchors")
     if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
         raise InputError(f"anchors: expected up to {ANCHORS} positions, got shape {list(anchors.shape)}")
-    if not all(value.dtype == torch.float32 and value.isfinite().all() for value in (anchors, *tensors.values())):
+    if not all(
+        value.dtype == torch.float32 and value.isfinite().all() for value in (anchors, *tensors.values())
+    ):
         raise InputError("weights: expected finite float32 numbers")
     decoder = Decoder(DecoderShape(mask=parse_mask(str(shape["mask"])), **sizes))
     decoder.load_state_dict(tensors)

@@ -89,7 +89,11 @@ class JointRun:
         index = self.shuffles[owner].draw()
         camera = self.poses.camera(owner, index)
         self.iteration += 1
-        degree = config.fit.sh_degree if self.opacity_logits is not None else config.fit.sh_degree_at(self.iteration)
+        degree = (
+            config.fit.sh_degree
+            if self.opacity_logits is not None
+            else config.fit.sh_degree_at(self.iteration)
+        )
 
         def loss_of(drawn: Gaussians, scene: int, target: Target) -> tuple[Tensor, dict[str, Any]]:
             image, meta = render_with_meta(drawn, camera, self.backgrounds[scene], sh_degree=degree)
@@ -124,7 +128,9 @@ class JointRun:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         combined = combine_densification(drawn, len(self))
-        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, combined)
+        self.strategy.step_post_backward(
+            self.parameters, self.optimizers, self.density, self.iteration, combined
+        )
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
@@ -143,8 +149,12 @@ class JointRun:
         x, y, z = (gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
         radius = 3 * gaussians.scales.amax(1) + 0.02 * self.extent
         depth = z + radius
-        half_width = max(float(intrinsics[0, 2]), camera.width - float(intrinsics[0, 2])) / float(intrinsics[0, 0])
-        half_height = max(float(intrinsics[1, 2]), camera.height - float(intrinsics[1, 2])) / float(intrinsics[1, 1])
+        half_width = max(float(intrinsics[0, 2]), camera.width - float(intrinsics[0, 2])) / float(
+            intrinsics[0, 0]
+        )
+        half_height = max(float(intrinsics[1, 2]), camera.height - float(intrinsics[1, 2])) / float(
+            intrinsics[1, 1]
+        )
         seen = (
             (depth > 0.01)
             & (x.abs() - radius < 1.1 * half_width * depth)

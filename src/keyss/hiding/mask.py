@@ -14,5 +14,7 @@ def parse_mask(text: str) -> Mask:
     names = {name.strip() for name in text.split(",") if name.strip()}
     unknown = sorted(names - set(ATTRIBUTES))
     if unknown or not names:
-        raise UsageError(f"mask {text!r}: expected some of {','.join(ATTRIBUTES)}, got {','.join(unknown) or 'none'}")
+        raise UsageError(
+            f"mask {text!r}: expected some of {','.join(ATTRIBUTES)}, got {','.join(unknown) or 'none'}"
+        )
     return tuple(name for name in ATTRIBUTES if name in names)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -34,9 +35,7 @@ def reveal_gaussians(
     derived = DerivedKey(key, saved.derivation)
     if not force:
         saved.check_belongs_to(stego)
-    decoder = saved.decoder.to(stego.device)
-    model = stego.with_sh_degree(decoder.shape.sh_degree)
-    decoded = decoder(model, derived.embedding().to(stego.device))
+    decoded = decode(stego, saved, derived.embedding())
     try:
         secret = saved.find(derived)
     except WrongKeyError:
@@ -46,3 +45,11 @@ def reveal_gaussians(
     if frame == "cover":
         return decoded
     return secret.frame.inverse().apply_gaussians(decoded.to("cpu"))
+
+
+@torch.no_grad()
+def decode(stego: Gaussians, saved: SavedDecoder, embedding: Tensor) -> Gaussians:
+    """What the decoder makes of `stego` for a key's embedding [64], in the cover's frame."""
+    decoder = saved.decoder.to(stego.device)
+    decoded: Gaussians = decoder(stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device))
+    return decoded

@@ -68,7 +68,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
 
 
 def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
-    """At most `total` items divided by `weights`, none more than `available`; what is left over is given on."""
+    """`total` items divided by `weights`, nowhere more than `available`; what is left over is given on."""
     shares = [0] * len(available)
     while (left := total - sum(shares)) > 0:
         open_ends = [i for i in range(len(available)) if shares[i] < available[i]]

@@ -23,7 +23,7 @@ CACHE_BYTES = 2 << 30
 
 @dataclass(frozen=True)
 class PlacedScene:
-    """A scene and its plain model, both brought into the cover's frame by `frame` (identity for the cover)."""
+    """A scene and its plain model, both brought into the cover's frame by `frame`."""
 
     scene: Scene
     plain: Gaussians
@@ -61,7 +61,11 @@ class CombinedPoses:
 
     def target(self, scene: int, owner: int, index: int) -> Target:
         """What `scene` looks like from training pose `index` of `owner`."""
-        image = self.scenes[owner].scene.train[index].image if scene == owner else self._render(scene, owner, index)
+        image = (
+            self.scenes[owner].scene.train[index].image
+            if scene == owner
+            else self._render(scene, owner, index)
+        )
         return Target.of(image.to(self.device))
 
     def _render(self, scene: int, owner: int, index: int) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import string
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -14,8 +13,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import Quality, mean_psnr, quality
 from keyss.hiding.decoder_file import SavedDecoder
-from keyss.hiding.revealing import reveal_gaussians
-from keyss.seal.keys import DerivedKey
+from keyss.hiding.revealing import decode, reveal_gaussians
+from keyss.seal.keys import DerivedKey, random_embeddings
 
 
 def measure_hiding(
@@ -30,11 +29,13 @@ def measure_hiding(
 ) -> dict[str, Any]:
     """Qualities of cover and secrets, their bounds, and what wrong keys show.
 
-    `bound`: the plain models. `wrong_key`: PSNR of what fresh random 16-character keys give, against the
-    cover's photos and, seen from the secrets' own cameras, against theirs; `floor` is the stego cover
+    `bound`: the plain models. `wrong_key`: PSNR of what wrong keys give (embeddings drawn as those of
+    random keys fall), against the cover's photos and, seen from the secrets' own cameras, against theirs; `floor` is the stego cover
     itself against the secrets' photos, which is what a wrong key should look like.
     Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
     """
+    if wrong_keys < 1:
+        raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     cover, secrets = scenes[0], scenes[1:]
     key_of: dict[int, str] = {}
     for key in keys:
@@ -43,12 +44,14 @@ def measure_hiding(
     if sorted(key_of) != list(range(len(secrets))):
         raise UsageError(f"expected the keys of all {len(secrets)} secret(s), got {len(key_of)} of them")
 
-    revealed = [reveal_gaussians(stego, saved, key_of[index]).to(stego.device) for index in range(len(secrets))]
+    revealed = [
+        reveal_gaussians(stego, saved, key_of[index]).to(stego.device) for index in range(len(secrets))
+    ]
     frames = [saved.secrets[index].frame for index in range(len(secrets))]
     against_cover: list[float] = []
     against_secrets: list[list[float]] = [[] for _ in secrets]
-    for key in _random_keys(wrong_keys, seed):
-        decoy = reveal_gaussians(stego, saved, key, decoy=True)
+    for embedding in random_embeddings(wrong_keys, torch.Generator().manual_seed(seed)):
+        decoy = decode(stego, saved, embedding)
         against_cover.append(mean_psnr(decoy, cover.test, _background(cover, stego)))
         for index, secret in enumerate(secrets):
             against_secrets[index].append(_psnr_in(secret, frames[index].inverse().apply_gaussians(decoy)))
@@ -84,12 +87,3 @@ def _psnr_in(scene: Scene, model: Gaussians) -> float:
 def _background(scene: Scene, model: Gaussians) -> torch.Tensor:
     return scene.background.to(model.device)
 
-
-def _random_keys(count: int, seed: int) -> list[str]:
-    """Keys of 16 alphanumeric characters from a seeded generator, so that measurements can be repeated."""
-    if count < 1:
-        raise UsageError(f"expected at least one wrong key, got {count}")
-    alphabet = string.ascii_letters + string.digits
-    generator = torch.Generator().manual_seed(seed)
-    draws = torch.randint(len(alphabet), (count, 16), generator=generator)
-    return ["".join(alphabet[i] for i in row) for row in draws.tolist()]

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tiny_scenes import random_gaussians
+
+from keyss.fitting.config import FitConfig
+from keyss.fitting.density import CappedStrategy
+from keyss.fitting.parameters import Optimizers, Parameters, make_optimizers, to_parameters
+
+COUNT = 100
+
+
+def _setup(max_gaussians: int) -> tuple[CappedStrategy, Parameters, Optimizers, dict[str, Any]]:
+    config = FitConfig(max_gaussians=max_gaussians)
+    parameters = to_parameters(random_gaussians(COUNT), torch.device("cpu"))
+    optimizers = make_optimizers(parameters, config, extent=1.0)
+    strategy = CappedStrategy(config)
+    state = strategy.initialize_state(1.0)
+    state["grad2d"] = torch.linspace(0, 1, COUNT)  # nearly all above the threshold
+    state["count"] = torch.ones(COUNT)
+    return strategy, parameters, optimizers, state
+
+
+def test_growth_stops_at_the_cap_and_takes_the_largest_gradients() -> None:
+    strategy, parameters, optimizers, state = _setup(COUNT + 10)
+    before = parameters["means"].detach().clone()
+    strategy._grow_gs(parameters, optimizers, state, step=1000)
+    assert len(parameters["means"]) == COUNT + 10
+    kept = (parameters["means"].detach()[:, None] == before[None]).all(-1).any(0)
+    # A split replaces its Gaussian: only the ten with the largest gradients may be gone.
+    assert kept[:-10].all()
+
+
+def test_without_a_cap_in_reach_all_that_ask_grow() -> None:
+    strategy, parameters, optimizers, state = _setup(10 * COUNT)
+    strategy._grow_gs(parameters, optimizers, state, step=1000)
+    assert len(parameters["means"]) == 2 * COUNT - 1  # all but the first, whose gradient is 0
+
+
+def test_pruning_goes_on_at_the_cap_and_looks_at_the_opacity_it_is_given() -> None:
+    strategy, parameters, optimizers, state = _setup(COUNT)
+    opacities = torch.full((COUNT,), 0.5)
+    opacities[:7] = 0.001
+    strategy.opacity_for_pruning = lambda: opacities
+    assert strategy._prune_gs(parameters, optimizers, state, step=1000) == 7
+    assert all(len(parameter) == COUNT - 7 for parameter in parameters.values())
+
+
+def test_never_prunes_everything() -> None:
+    strategy, parameters, optimizers, state = _setup(COUNT)
+    strategy.opacity_for_pruning = lambda: torch.zeros(COUNT)
+    strategy._prune_gs(parameters, optimizers, state, step=1000)
+    assert len(parameters["means"]) == COUNT

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from keyss.fitting.losses import Target, photometric_loss, ssim, ssim_torch
+
+
+def _images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.rand(height, width, 3, generator=generator)
+    return a, (a + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
+
+
+def _ssim_by_definition(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Window by window in float64, with zeros outside, straight from Wang et al. 2004."""
+    offsets = torch.arange(-5, 6, dtype=torch.float64)
+    weights = torch.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    weights = (weights / weights.sum())[..., None]
+    pad = (0, 0, 5, 5, 5, 5)
+    a, b = (torch.nn.functional.pad(x.double(), pad) for x in (a, b))
+    values = []
+    for y in range(a.shape[0] - 10):
+        for x in range(a.shape[1] - 10):
+            p, q = a[y : y + 11, x : x + 11], b[y : y + 11, x : x + 11]
+            mp, mq = (weights * p).sum((0, 1)), (weights * q).sum((0, 1))
+            vp, vq = (weights * p * p).sum((0, 1)) - mp**2, (weights * q * q).sum((0, 1)) - mq**2
+            cov = (weights * p * q).sum((0, 1)) - mp * mq
+            c1, c2 = 0.01**2, 0.03**2
+            values.append(
+                ((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2))).mean()
+            )
+    return float(torch.stack(values).mean())
+
+
+def test_ssim_is_what_its_definition_says() -> None:
+    a, b = _images(17, 14)
+    expected = _ssim_by_definition(a, b)
+    assert float(ssim(a, Target.of(b))) == pytest.approx(expected, abs=2e-6)
+    assert float(ssim_torch(a, Target.of(b))) == pytest.approx(expected, abs=2e-6)
+
+
+def test_ssim_of_an_image_with_itself_is_one() -> None:
+    a, _ = _images(20, 30)
+    assert float(ssim(a, Target.of(a))) == pytest.approx(1, abs=1e-6)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(1, 70), st.integers(1, 40), st.integers(0, 99))
+def test_kernel_and_its_gradient_agree_with_autograd_in_float64(height: int, width: int, seed: int) -> None:
+    a, b = _images(height, width, seed)
+    fast = a.clone().requires_grad_()
+    slow = a.double().requires_grad_()
+    target = Target.of(b)
+    double = Target(*(getattr(target, name).double() for name in ("image", "planes", "mean", "variance")))
+    value, reference = ssim(fast, target), ssim_torch(slow, double)
+    (3 * value).backward()
+    (3 * reference).backward()
+    assert value.item() == pytest.approx(reference.item(), abs=2e-5)
+    assert fast.grad is not None
+    assert slow.grad is not None
+    scale = slow.grad.abs().max()
+    assert (fast.grad - slow.grad).abs().max() <= 2e-4 * scale
+
+
+def test_photometric_loss_mixes_l1_and_ssim() -> None:
+    a, b = _images(24, 24)
+    target = Target.of(b)
+    l1 = float((a - b).abs().mean())
+    assert float(photometric_loss(a, target, 0)) == pytest.approx(l1)
+    assert float(photometric_loss(a, target, 1)) == pytest.approx(1 - float(ssim(a, target)), abs=1e-6)
+    mixed = float(photometric_loss(a, target, 0.2))
+    assert mixed == pytest.approx(0.8 * l1 + 0.2 * (1 - float(ssim(a, target))), abs=1e-6)
+
+
+def test_target_of_bytes_is_target_of_their_fractions() -> None:
+    pixels = (torch.rand(9, 8, 3) * 255).to(torch.uint8)
+    assert torch.equal(Target.of(pixels).image, pixels.float() / 255)

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_scenes import tiny_scene
+
+from keyss.core import Gaussians, InputError
+from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import mean_psnr
+from keyss.fitting.loop import Interrupted, Silent
+from keyss.fitting.plain import PlainRun, fit_scene
+
+CONFIG = FitConfig(iterations=150, max_gaussians=260, grow_start=0.1, grow_every=20, evaluate_every=50)
+
+
+def _same(a: Gaussians, b: Gaussians) -> bool:
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
+
+
+class InterruptAt(Silent):
+    """Presses Ctrl-C at one iteration."""
+
+    def __init__(self, iteration: int) -> None:
+        self.iteration = iteration
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        if iteration == self.iteration:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_fitting_gets_nearer_to_photos_it_has_not_seen() -> None:
+    scene, config = tiny_scene(), replace(CONFIG, iterations=400)
+    start = PlainRun(scene, config, torch.device("cpu")).gaussians()
+    fitted = fit_scene(scene, config).gaussians
+    before, after = (mean_psnr(model, scene.test, scene.background) for model in (start, fitted))
+    assert after > before + 3
+    assert len(start) < len(fitted) <= config.max_gaussians
+
+
+def test_one_seed_gives_one_model_and_leaves_the_global_random_state_alone() -> None:
+    scene = tiny_scene()
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    first = fit_scene(scene, CONFIG).gaussians
+    assert torch.equal(state, torch.get_rng_state())
+    torch.manual_seed(2)
+    assert _same(first, fit_scene(scene, CONFIG).gaussians)
+    assert not _same(first, fit_scene(scene, replace(CONFIG, seed=1)).gaussians)
+
+
+@pytest.mark.parametrize("iteration", [1, 33, 80])
+def test_an_interrupted_run_resumes_to_the_same_model(tmp_path: Path, iteration: int) -> None:
+    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
+    with pytest.raises(Interrupted) as caught:
+        fit_scene(scene, CONFIG, checkpoint=path, reporter=InterruptAt(iteration))
+    assert caught.value.iteration == iteration
+    resumed = fit_scene(scene, CONFIG, checkpoint=path, resume=True).gaussians
+    assert _same(resumed, fit_scene(scene, CONFIG).gaussians)
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
+    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
+    fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path)
+    with pytest.raises(InputError, match="other settings"):
+        fit_scene(scene, CONFIG, checkpoint=path, resume=True)
+    with pytest.raises(InputError, match="other settings"):
+        fit_scene(tiny_scene(3), replace(CONFIG, iterations=5), checkpoint=path, resume=True)
+
+
+def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, {"a": torch.ones(3)}, {"iteration": 1})
+    data = path.read_bytes()
+    for size in range(0, len(data), 7):
+        path.write_bytes(data[:size])
+        with pytest.raises(InputError):
+            load_checkpoint(path)
+
+
+def test_a_scene_without_points_starts_from_random_ones() -> None:
+    scene = replace(tiny_scene(), points=torch.zeros(0, 3), colors=torch.zeros(0, 3, dtype=torch.uint8))
+    fitted = fit_scene(scene, CONFIG).gaussians
+    assert mean_psnr(fitted, scene.test, scene.background) > 18
+
+
+def test_sh_degree_rises_within_a_run_of_any_length() -> None:
+    for iterations in (10, 300, 30_000):
+        config = FitConfig(iterations=iterations)
+        assert config.sh_degree_at(0) == 0
+        assert config.sh_degree_at(iterations) == 3

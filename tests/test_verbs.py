@@ -1,0 +1,214 @@
+"""The verbs over files: what is written is what is measured."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_scenes import HEIGHT, WIDTH, tiny_scene
+
+import keyss
+from keyss import FitConfig, HideConfig, Secret
+from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
+
+CONFIG = HideConfig(
+    fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
+    distil_steps=120,
+    hidden=32,
+)
+
+
+def write_nerfstudio(folder: Path, scene: Scene) -> Path:
+    """A scene as Nerfstudio has it."""
+    (folder / "images").mkdir(parents=True)
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = []
+    for view in sorted(scene.views, key=lambda view: view.camera.name):
+        camera = view.camera
+        cv2.imwrite(str(folder / "images" / camera.name), view.image.numpy()[:, :, ::-1])
+        pose = np.linalg.inv(camera.viewmat.double().numpy()) @ flip
+        frames.append({"file_path": f"images/{camera.name}", "transform_matrix": pose.tolist()})
+    K = scene.train[0].camera.K
+    intrinsics = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    data = {"w": WIDTH, "h": HEIGHT, **intrinsics, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("scenes")
+    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
+
+
+@pytest.fixture(scope="module")
+def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "hidden"
+    keyss.hide(folders[0], [Secret(folders[1], "the key")], config=CONFIG, out=out)
+    return out
+
+
+def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
+    files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+    assert files == {
+        "stego.ply",
+        "decoder.safetensors",
+        "config.json",
+        "metrics.json",
+        "private/cover.ply",
+        "private/secret-1.ply",
+    }
+    for path in run.rglob("*.json"):
+        assert "the key" not in path.read_text()
+
+
+def test_metrics_have_their_shape(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert set(metrics) == {
+        *("cover", "secrets", "bound", "wrong_key", "gaussians", "iterations", "seconds"),
+        *("width", "seed", "version"),
+    }
+    assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim"}
+    assert set(metrics["bound"]) == {"cover", "secrets"}
+    wrong = metrics["wrong_key"]
+    assert wrong["keys"] == 32
+    assert set(wrong["vs_cover"]) == {"mean", "min"}
+    assert set(wrong["vs_secrets"][0]) == {"mean", "max"}
+    assert wrong["vs_cover"]["min"] <= wrong["vs_cover"]["mean"]
+    assert len(wrong["floor"]) == 1
+    assert metrics["iterations"] == 60
+    assert metrics["width"] == WIDTH
+
+
+def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
+    before = json.loads((run / "metrics.json").read_text())
+    after = keyss.evaluate(run, ["the key"])
+    assert after == before
+    assert json.loads((run / "metrics.json").read_text()) == before
+    with pytest.raises(WrongKeyError):
+        keyss.evaluate(run, ["another"])
+
+
+def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    secret = keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "secret.ply")
+    again = keyss.read_ply(tmp_path / "secret.ply")
+    assert torch.equal(secret.means, again.means)
+    assert torch.equal(secret.sh, again.sh)
+    pictures = dict(keyss.render(tmp_path / "secret.ply", folders[1]))
+    scene = keyss.load_scene(folders[1])
+    errors = [
+        (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
+        for view in scene.test
+    ]
+    psnr = float(-10 * torch.log10(torch.stack(errors)).mean())
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert psnr == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.1)
+
+
+def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    keyss.hide(folders[0], [Secret(folders[1], "the key")], config=CONFIG, out=tmp_path / "again")
+    for name in ("stego.ply", "decoder.safetensors", "private/secret-1.ply"):
+        assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
+
+
+def test_existing_models_are_bounds_and_are_not_fitted_again(
+    run: Path, folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    given = run / "private" / "cover.ply"
+    secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
+    keyss.hide(folders[0], [secret], config=CONFIG, cover_model=given, out=tmp_path / "again")
+    assert (tmp_path / "again" / "stego.ply").read_bytes() == (run / "stego.ply").read_bytes()
+
+
+def test_wrong_key_writes_nothing_and_decoy_writes_the_cover(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(WrongKeyError):
+        keyss.reveal(run / "stego.ply", "wrong", out=tmp_path / "x.ply")
+    assert not list(tmp_path.iterdir())
+    decoy = keyss.reveal(run / "stego.ply", "wrong", decoy=True, out=tmp_path / "x.ply")
+    assert len(decoy) == len(keyss.read_ply(tmp_path / "x.ply"))
+
+
+def test_a_decoder_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "stego.ply").write_bytes((run / "stego.ply").read_bytes())
+    with pytest.raises(InputError, match="--decoder"):
+        keyss.reveal(tmp_path / "stego.ply", "the key")
+    keyss.reveal(tmp_path / "stego.ply", "the key", decoder=run / "decoder.safetensors")
+    with pytest.raises(InputError, match="another model"):
+        keyss.reveal(run / "private" / "secret-1.ply", "the key", decoder=run / "decoder.safetensors")
+    with pytest.raises(UsageError, match="decoder"):
+        keyss.reveal(keyss.read_ply(run / "stego.ply"), "the key")
+
+
+def test_outputs_that_exist_are_refused_before_any_work(
+    run: Path, folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "x.ply").write_text("mine")
+    with pytest.raises(OutputError, match="exists"):
+        keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "x.ply")
+    with pytest.raises(OutputError, match="exists"):
+        keyss.hide(folders[0], [Secret(folders[1], "k")], config=CONFIG, out=tmp_path)
+    with pytest.raises(OutputError, match="exists"):
+        keyss.fit(folders[0], out=tmp_path)
+    assert (tmp_path / "x.ply").read_text() == "mine"
+    keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
+    assert len(keyss.read_ply(tmp_path / "x.ply"))
+
+
+def test_a_full_disk_leaves_no_results_but_keeps_the_work(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(CONFIG.fit, iterations=5)
+    real = os.replace
+
+    def full(source: Any, target: Any) -> None:
+        if str(target).endswith("metrics.json"):
+            raise OSError(28, "No space left on device")
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OutputError, match="No space left"):
+        keyss.fit(folders[0], config=config, out=tmp_path / "run")
+    left = {path.name for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    assert left == {"fit.safetensors"}
+    monkeypatch.undo()
+    keyss.fit(folders[0], config=config, out=tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "model.ply").exists()
+    assert not (tmp_path / "run" / "checkpoint").exists()
+
+
+def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    pictures = keyss.render(run / "stego.ply", folders[0], out=tmp_path / "images")
+    assert sorted(p.name for p in (tmp_path / "images").iterdir()) == sorted(name for name, _ in pictures)
+    name, image = pictures[0]
+    read = cv2.imread(str(tmp_path / "images" / name))
+    assert np.array_equal(read[:, :, ::-1], image.numpy())
+    assert len(keyss.render(run / "stego.ply", folders[0], split="all")) == 16
+
+
+def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tuple[Path, Path]) -> None:
+    assert keyss.info(run / "stego.ply")["sh_degree"] == 3
+    assert keyss.info(run / "decoder.safetensors")["mask"] == "op,ro,sc,xyz"
+    assert keyss.info(folders[0])["test_views"] == 2
+    assert keyss.info(run)["metrics"]["gaussians"] == len(keyss.read_ply(run / "stego.ply"))
+    with pytest.raises(InputError, match="no such"):
+        keyss.info(run / "nothing")
+
+
+def test_a_secret_does_not_show_its_key() -> None:
+    assert "hunter2" not in repr(Secret("scene", "hunter2"))
+
+
+def test_public_api() -> None:
+    """Names that programs rely on: removing one is a breaking change."""
+    assert set(keyss.__all__) == {
+        *("Camera", "FitConfig", "Gaussians", "HideConfig", "HideResult", "KeyssError", "Scene", "Secret"),
+        *("View", "WrongKeyError", "__version__", "evaluate", "fit", "generate_key", "hide", "info"),
+        *("load_scene", "read_ply", "render", "reveal", "write_ply"),
+    }
