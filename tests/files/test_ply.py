@@ -308,7 +308,7 @@ def test_flipped_bytes_in_the_header(tmp_path: Path, form: str) -> None:
     rng = np.random.default_rng(0)
     path = tmp_path / "a.ply"
     valid = 0
-    for _ in range(1500):
+    for _ in range(600):
         damaged = bytearray(data)
         for at in rng.integers(0, body, size=rng.integers(1, 4)):
             damaged[at] = rng.choice([damaged[at] ^ (1 << rng.integers(0, 8)), rng.integers(0, 256)])
@@ -319,7 +319,7 @@ def test_flipped_bytes_in_the_header(tmp_path: Path, form: str) -> None:
             continue
         valid += 1
         assert all(getattr(gaussians, name).isfinite().all() for name in FIELDS)
-    assert valid < 1000
+    assert valid < 400
 
 
 # --- other people's models and tools ---------------------------------------------------------------------

@@ -45,9 +45,16 @@ def tea_table(seed: int) -> World:
 
     porcelain = _porcelain(seed)
     teapot = Cluster(
-        (-0.15, 0.12, 0.0), (0.0, 0.0, 0.36), 0.84, (Part(_teapot, porcelain), Part(_lid, porcelain)), turn=-0.6
+        (-0.15, 0.12, 0.0),
+        (0.0, 0.0, 0.36),
+        0.84,
+        (Part(_teapot, porcelain), Part(_lid, porcelain)),
+        turn=-0.6,
     )
-    cup = (Part(_cup, _cup_glaze), Part(partial(turned_profile, profile=[(0.0, 0.15), (0.14, 0.15)], thickness=0.006), tea))
+    cup = (
+        Part(_cup, _cup_glaze),
+        Part(partial(turned_profile, profile=[(0.0, 0.15), (0.14, 0.15)], thickness=0.006), tea),
+    )
     cups = [
         Cluster((0.62, -0.62, 0.0), (0.0, 0.0, 0.12), 0.32, cup, turn=0.4),
         Cluster((-0.95, -0.55, 0.0), (0.0, 0.0, 0.12), 0.32, cup, turn=2.6),
@@ -63,13 +70,34 @@ def tea_table(seed: int) -> World:
         (0.0, 0.0, 0.22),
         0.46,
         (
-            Part(partial(turned_profile, profile=[(0.0, 0.03), (0.12, 0.03), (0.27, 0.09), (0.36, 0.22)], thickness=0.018), _bowl_glaze),
-            *(Part(partial(sphere, center=center, radius=radius), _peel(color, seed)) for center, radius, color in fruits),
+            Part(
+                partial(
+                    turned_profile,
+                    profile=[(0.0, 0.03), (0.12, 0.03), (0.27, 0.09), (0.36, 0.22)],
+                    thickness=0.018,
+                ),
+                _bowl_glaze,
+            ),
+            *(
+                Part(partial(sphere, center=center, radius=radius), _peel(color, seed))
+                for center, radius, color in fruits
+            ),
         ),
     )
     sugar = Cluster(
-        (-0.9, 0.75, 0.0), (0.0, 0.0, 0.12), 0.3,
-        (Part(partial(turned_profile, profile=[(0.0, 0.02), (0.13, 0.03), (0.17, 0.12), (0.13, 0.2)], thickness=0.016), white),),
+        (-0.9, 0.75, 0.0),
+        (0.0, 0.0, 0.12),
+        0.3,
+        (
+            Part(
+                partial(
+                    turned_profile,
+                    profile=[(0.0, 0.02), (0.13, 0.03), (0.17, 0.12), (0.13, 0.2)],
+                    thickness=0.016,
+                ),
+                white,
+            ),
+        ),
     )
     return World(
         slabs=(ground, table, leg, foot),
@@ -85,22 +113,42 @@ def tea_table(seed: int) -> World:
 def golden_knot(seed: int) -> World:
     """A golden trefoil knot around a sapphire, on marble steps between four columns."""
     marble, stone = _marble(seed), _porphyry(seed)
-    steps = [Slab(radius, bottom, bottom + 0.13, marble) for radius, bottom in ((1.15, 0.0), (0.86, 0.13), (0.57, 0.26))]
+    steps = [
+        Slab(radius, bottom, bottom + 0.13, marble)
+        for radius, bottom in ((1.15, 0.0), (0.86, 0.13), (0.57, 0.26))
+    ]
     columns: list[Slab] = []
     lamps: list[Cluster] = []
     for k in range(4):
         x, y = (1.75 * f(math.pi / 4 + k * math.pi / 2) for f in (math.cos, math.sin))
-        columns += [Slab(0.19, 0.0, 0.08, stone, x, y), Slab(0.125, 0.08, 0.44, stone, x, y), Slab(0.19, 0.44, 0.51, stone, x, y)]
-        ruby = Part(partial(octahedron, center=(0.0, 0.0, 0.19), radius=0.115, stretch=1.5), _gem((0.75, 0.03, 0.06)))
+        columns += [
+            Slab(0.19, 0.0, 0.08, stone, x, y),
+            Slab(0.125, 0.08, 0.44, stone, x, y),
+            Slab(0.19, 0.44, 0.51, stone, x, y),
+        ]
+        ruby = Part(
+            partial(octahedron, center=(0.0, 0.0, 0.19), radius=0.115, stretch=1.5), _gem((0.75, 0.03, 0.06))
+        )
         lamps.append(Cluster((x, y, 0.51), (0.0, 0.0, 0.19), 0.2, (ruby,), turn=0.3 + k))
     gold = _gold(seed)
     knot = Cluster(
-        (0.0, 0.0, 0.39), (0.0, 0.0, 0.68), 0.72,
-        (Part(partial(braid, center=(0.0, 0.0, 0.68), ring=0.42, wind=0.155, tube=0.1), gold),), turn=0.35,
+        (0.0, 0.0, 0.39),
+        (0.0, 0.0, 0.68),
+        0.72,
+        (Part(partial(braid, center=(0.0, 0.0, 0.68), ring=0.42, wind=0.155, tube=0.1), gold),),
+        turn=0.35,
     )
     sapphire = Cluster(
-        (0.0, 0.0, 1.07), (0.0, 0.0, 0.0), 0.24,
-        (Part(partial(octahedron, center=(0.0, 0.0, 0.0), radius=0.14, stretch=1.5), _gem((0.04, 0.20, 0.85))),), turn=0.7,
+        (0.0, 0.0, 1.07),
+        (0.0, 0.0, 0.0),
+        0.24,
+        (
+            Part(
+                partial(octahedron, center=(0.0, 0.0, 0.0), radius=0.14, stretch=1.5),
+                _gem((0.04, 0.20, 0.85)),
+            ),
+        ),
+        turn=0.7,
     )
     return World(
         slabs=(Slab(40.0, -1.0, 0.0, _mosaic(seed)), *steps, *columns),
@@ -200,12 +248,17 @@ def _porcelain(seed: int) -> Material:
     wash = ripples(14.0, seed + 4)
 
     def material(p: Floats, n: Floats) -> Surface:
-        angle = np.arctan2(p[1], p[0])
+        angle, r = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
         belly = np.abs(p[2] - 0.29) / 0.13
         petals = smoothstep(-0.06, 0.06, np.abs(np.cos(4 * angle)) - belly)
         cores = smoothstep(0.42, 0.52, np.abs(np.cos(4 * angle)) - belly)
-        bands = np.maximum.reduce([1 - smoothstep(0.010, 0.022, np.abs(p[2] - z)) for z in (0.11, 0.47, 0.56, 0.665)])
-        blue = np.clip(np.maximum(petals - 0.6 * cores, bands) * (0.85 + 0.15 * wash(p)), 0, 1)
+        bands = np.maximum.reduce(
+            [1 - smoothstep(0.010, 0.022, np.abs(p[2] - z)) for z in (0.11, 0.47, 0.56, 0.665)]
+        )
+        spout = smoothstep(0.58, 0.60, r)
+        on_body = 1 - smoothstep(0.43, 0.45, r)
+        drawn = np.maximum(petals - 0.6 * cores, bands) * on_body
+        blue = np.clip(drawn * (0.85 + 0.15 * wash(p)) + spout, 0, 1)
         return Surface(mix((0.87, 0.87, 0.84), (0.03, 0.09, 0.42), blue), gloss=0.06, power=70)
 
     return material
@@ -239,10 +292,21 @@ def _coins(gold: Material) -> list[Cluster]:
     piles = []
     for x, y, layers in ((1.42, 0.25, 5), (-0.35, 1.45, 3), (-1.35, -0.30, 6), (0.2, -1.45, 4)):
         coins = [
-            Part(partial(disc, center=(0.02 * math.sin(2.3 * i), 0.02 * math.cos(3.1 * i), 0.022 + 0.04 * i), tilt=0.0, radius=0.10, half_height=0.008), gold)
+            Part(
+                partial(
+                    disc,
+                    center=(0.02 * math.sin(2.3 * i), 0.02 * math.cos(3.1 * i), 0.022 + 0.04 * i),
+                    tilt=0.0,
+                    radius=0.10,
+                    half_height=0.008,
+                ),
+                gold,
+            )
             for i in range(layers)
         ]
-        leaning = Part(partial(disc, center=(0.145, 0.0, 0.09), tilt=-1.1, radius=0.10, half_height=0.008), gold)
+        leaning = Part(
+            partial(disc, center=(0.145, 0.0, 0.09), tilt=-1.1, radius=0.10, half_height=0.008), gold
+        )
         piles.append(Cluster((x, y, 0.0), (0.0, 0.0, 0.1), 0.32, (*coins, leaning), turn=x - y))
     return piles
 
@@ -300,8 +364,18 @@ def _mosaic(seed: int) -> Material:
         tiles *= 0.85 + 0.3 * (scattered(np.floor(wedge), ring) - 0.5) + 0.12 * tone(p)
         grout = joints(r, 0.32, 0.045)
         tiles = mix(tiles, (0.55, 0.36, 0.10), grout)
-        flags = mix((0.13, 0.11, 0.17), (0.26, 0.22, 0.28), np.clip(0.5 + 0.4 * tone(p) + 0.5 * (scattered(np.floor(p[0] / 0.8), np.floor(p[1] / 0.8)) - 0.5), 0, 1))
-        flags *= 1 - 0.6 * np.maximum(joints(p[0], 0.8, 0.06), joints(p[1], 0.8, 0.06))
+        flags = mix(
+            (0.13, 0.11, 0.17),
+            (0.26, 0.22, 0.28),
+            np.clip(
+                0.5 + 0.4 * tone(p) + 0.5 * (scattered(np.floor(p[0] / 0.8), np.floor(p[1] / 0.8)) - 0.5),
+                0,
+                1,
+            ),
+        )
+        seams = np.maximum(joints(p[0], 0.8, 0.07), joints(p[1], 0.8, 0.07))
+        # Far seams are finer than a pixel.
+        flags *= 1 - 0.6 * seams * (1 - smoothstep(3.0, 5.5, r))
         return Surface(mix(tiles, flags, smoothstep(2.54, 2.58, r)), gloss=0.06, power=40, mirror=0.8)
 
     return material

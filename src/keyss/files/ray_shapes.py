@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -47,7 +47,7 @@ def torus(points: Floats, center: Vector, ring: float, tube: float) -> Floats:
 
 
 def octahedron(points: Floats, center: Vector, radius: float, stretch: float) -> Floats:
-    """Points at `radius` in the horizontal plane and at `stretch` x `radius` above and below; rounded edges."""
+    """Corners at `radius` around the vertical axis and at `stretch` x `radius` on it; edges rounded."""
     x, y, z = _from(points, center)
     rise = np.float32(1 / stretch)
     shrink = np.float32(1 / np.sqrt(2 + rise * rise))
@@ -70,7 +70,7 @@ def turned_profile(points: Floats, profile: list[tuple[float, float]], thickness
     """A vessel: the polyline `profile` of (radius, height), turned about the vertical axis."""
     r, z = np.sqrt(points[0] ** 2 + points[1] ** 2), points[2]
     nearest = np.full(r.shape, 1e9, dtype=np.float32)
-    for (r0, z0), (r1, z1) in zip(profile, profile[1:], strict=False):
+    for (r0, z0), (r1, z1) in itertools.pairwise(profile):
         dr, dz = np.float32(r1 - r0), np.float32(z1 - z0)
         along = np.clip(((r - np.float32(r0)) * dr + (z - np.float32(z0)) * dz) / (dr * dr + dz * dz), 0, 1)
         nearest = np.minimum(
@@ -85,10 +85,14 @@ def braid(points: Floats, center: Vector, ring: float, wind: float, tube: float)
     x, y, z = _from(points, center)
     half_twist = np.float32(1.5) * np.arctan2(z, x)
     c, s = np.cos(half_twist), np.sin(half_twist)
-    out = np.sqrt(x * x + z * z) - np.float32(ring)
+    from_axis = np.sqrt(x * x + z * z)
+    out = from_axis - np.float32(ring)
     u, v = c * out - s * y, s * out + c * y
-    # The twist stretches space, most near the axis: the factor keeps the distance an underestimate.
-    distance: Floats = (np.sqrt((np.abs(u) - np.float32(wind)) ** 2 + v * v) - np.float32(tube)) * np.float32(0.7)
+    across = np.sqrt((np.abs(u) - np.float32(wind)) ** 2 + v * v) - np.float32(tube)
+    # The twist stretches space, most near the axis; far away the ring that holds the strand bounds better.
+    away2 = out * out + y * y
+    stretch = np.sqrt(1 + np.float32(2.25) * away2 / np.maximum(from_axis, 0.05) ** 2)
+    distance: Floats = np.maximum(across / stretch, np.sqrt(away2) - np.float32(wind + tube))
     return distance
 
 
@@ -109,17 +113,20 @@ def ripples(frequency: float, seed: int, stretch: Vector = (1.0, 1.0, 1.0)) -> C
     waves = rng.normal(size=(6, 3))
     waves *= frequency * rng.uniform(0.6, 1.3, size=(6, 1)) / np.linalg.norm(waves, axis=1, keepdims=True)
     waves = (waves * np.array(stretch)).astype(np.float32)
-    phases = rng.uniform(0, 2 * np.pi, size=(6, 1)).astype(np.float32)
+    phases = rng.uniform(0, 2 * np.pi, size=6).astype(np.float32)
 
     def value(points: Floats) -> Floats:
-        summed: Floats = functools.reduce(np.add, np.sin(waves @ points + phases)) / np.float32(3)
-        return summed
+        summed = np.zeros(points.shape[1], dtype=np.float32)
+        # No matrix product: its last digits depend on the number of threads.
+        for (a, b, c), phase in zip(waves, phases, strict=True):
+            summed += np.sin(a * points[0] + b * points[1] + c * points[2] + phase)
+        return summed / np.float32(3)
 
     return value
 
 
 def mix(first: Vector | Floats, second: Vector | Floats, share: Floats) -> Floats:
-    """[3, M] colours from `first` at share 0 to `second` at share 1; colours or [3, M] arrays."""
+    """[3, M] colours from `first` at share 0 to `second` at share 1; one colour or [3, M] of them each."""
     a, b = (
         np.array(color, dtype=np.float32)[:, None] if isinstance(color, tuple) else color
         for color in (first, second)
