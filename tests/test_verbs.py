@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tiny_scenes import HEIGHT, WIDTH, tiny_scene
 
 import keyss
 from keyss import FitConfig, HideConfig, Secret
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
+from tiny_scenes import HEIGHT, WIDTH, tiny_scene
 
 CONFIG = HideConfig(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),

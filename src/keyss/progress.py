@@ -120,7 +120,8 @@ class PlainLines:
         self.last = (iteration, describe(gaussians, numbers))
         if now - self.said >= self.every:
             self.said = now
-            self._say(f"{self.title}: {iteration}/{self.iterations}, {self.speed.text()}, {self.last[1]}")
+            facts = ", ".join(filter(None, [self.speed.text(), self.last[1]]))
+            self._say(f"{self.title}: {iteration}/{self.iterations}, {facts}")
 
     def finish(self) -> None:
         if not self.running:
@@ -136,8 +137,9 @@ class PlainLines:
 
 
 def describe(gaussians: int, numbers: dict[str, float]) -> str:
-    """For example `12,345 Gaussians, PSNR cover 25.13, PSNR secret 22.40`."""
-    return ", ".join([f"{gaussians:,} Gaussians", *(f"{k} {v:.2f}" for k, v in numbers.items())])
+    """For example `12,345 Gaussians, PSNR cover 25.13, PSNR secret 22.40`; empty where there are none."""
+    count = [f"{gaussians:,} Gaussians"] if gaussians else []
+    return ", ".join(count + [f"{name} {value:.2f}" for name, value in numbers.items()])
 
 
 def clock(seconds: float) -> str:

@@ -39,7 +39,13 @@ Split = Literal["test", "train", "all"]
 Background = Tensor | Sequence[float] | None
 PathLike = str | Path
 
-STEGO, DECODER, CONFIG, METRICS, MODEL = "stego.ply", "decoder.safetensors", "config.json", "metrics.json", "model.ply"
+STEGO, DECODER, CONFIG, METRICS, MODEL = (
+    "stego.ply",
+    "decoder.safetensors",
+    "config.json",
+    "metrics.json",
+    "model.ply",
+)
 PRIVATE = "private"  # plain models of cover and secrets: for measuring, never to be published
 
 
@@ -280,7 +286,9 @@ def evaluate(
         sources = [settings["cover"], *settings["secrets"]]
         width, background = settings["width"], settings["background"]
     except (KeyError, TypeError) as error:
-        raise InputError(f"{folder / CONFIG}: not the configuration of a hiding ({error} is missing)") from error
+        raise InputError(
+            f"{folder / CONFIG}: not the configuration of a hiding ({error} is missing)"
+        ) from error
     if not all(isinstance(source, str) for source in sources):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego, saved = read_ply(folder / STEGO), load_decoder(folder / DECODER)
@@ -313,7 +321,12 @@ def info(path: PathLike) -> dict[str, Any]:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if path.suffix.lower() == ".ply":
-        return {"kind": "3DGS model", "path": str(path), "bytes": path.stat().st_size, **_describe(read_ply(path))}
+        return {
+            "kind": "3DGS model",
+            "path": str(path),
+            "bytes": path.stat().st_size,
+            **_describe(read_ply(path)),
+        }
     saved = load_decoder(path)
     return {
         "kind": "decoder",

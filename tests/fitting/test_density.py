@@ -3,11 +3,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tiny_scenes import random_gaussians
 
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy
 from keyss.fitting.parameters import Optimizers, Parameters, make_optimizers, to_parameters
+from tiny_scenes import random_gaussians
 
 COUNT = 100
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_scenes import tiny_scene
 
 from keyss.core import Gaussians, InputError
 from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint
@@ -15,6 +14,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, Silent
 from keyss.fitting.plain import PlainRun, fit_scene
+from tiny_scenes import tiny_scene
 
 CONFIG = FitConfig(iterations=150, max_gaussians=260, grow_start=0.1, grow_every=20, evaluate_every=50)
 

@@ -4,12 +4,12 @@ from dataclasses import fields
 
 import pytest
 import torch
-from tiny_scenes import random_gaussians
 
 from keyss.core import Gaussians, UsageError
 from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.mask import ATTRIBUTES, parse_mask
 from keyss.seal import random_embeddings
+from tiny_scenes import random_gaussians
 
 FIELD_OF = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}
 

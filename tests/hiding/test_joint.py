@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_scenes import random_gaussians, tiny_scene
 
 from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
@@ -22,6 +21,7 @@ from keyss.hiding.pipeline import Hidden, hide_scenes
 from keyss.hiding.revealing import reveal_gaussians
 from keyss.hiding.targets import CombinedPoses, PlacedScene
 from keyss.rendering import render
+from tiny_scenes import random_gaussians, tiny_scene
 
 CONFIG = HideConfig(
     fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0),

@@ -3,13 +3,13 @@ from __future__ import annotations
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_scenes import random_gaussians, tiny_scene
 
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.hiding.config import HideConfig
 from keyss.hiding.start import _shares, make_start
 from keyss.hiding.targets import PlacedScene
+from tiny_scenes import random_gaussians, tiny_scene
 
 
 @given(

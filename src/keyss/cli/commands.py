@@ -35,7 +35,11 @@ Width = Annotated[
 ]
 Background = Annotated[
     tuple[float, float, float] | None,
-    optional("R G B", "Colour behind everything, 0 to 1 each; transparent photos get it.", "black"),
+    optional(
+        "R G B",
+        "Colour behind everything, 0 to 1 each; transparent photos get it.",
+        "white if there are any, else black",
+    ),
 ]
 Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
 MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
@@ -275,7 +279,7 @@ def evaluate(
     key_file: KeyFiles = (),
     wrong_keys: Annotated[int, arg(metavar="N", help="Number of random wrong keys to try.")] = 32,
     device: Device = "auto",
-    seed: UnusedSeed = 0,
+    seed: Annotated[int, arg(metavar="N", help="Seed of the wrong keys.")] = 0,
 ) -> None:
     """Measure a hiding run against the test photos, with the keys and with wrong ones.
 
@@ -287,7 +291,12 @@ def evaluate(
     from keyss.progress import reporter
 
     metrics = verbs.evaluate(
-        run, keys(key_file, len(key_file) or 1), wrong_keys=wrong_keys, device=device, reporter=reporter()
+        run,
+        keys(key_file, len(key_file) or 1),
+        wrong_keys=wrong_keys,
+        seed=seed,
+        device=device,
+        reporter=reporter(),
     )
     print_metrics(metrics)
     print_files(run, {"metrics.json": "the numbers"})
@@ -328,11 +337,12 @@ def demo(
     example: keyss demo -o out/demo
     """
     from keyss.cli.tables import print_files, print_metrics
-    from keyss.demo import run_demo
+    from keyss.demo import WRONG_KEYS, run_demo
     from keyss.progress import reporter
 
-    metrics = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=reporter())
-    print_metrics(metrics)
+    result = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=reporter())
+    print_metrics(result.metrics)
+    print(f"Of {len(WRONG_KEYS)} wrong keys tried at the door, {result.refused} were refused.")
     print_files(
         out,
         {

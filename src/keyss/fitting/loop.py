@@ -88,8 +88,9 @@ def train(
     With `checkpoint`, the state is saved there every `checkpoint_seconds` and on Ctrl-C (raises
     Interrupted) and at the end; with `resume`, it continues from there if the file exists. `fingerprint`
     (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of another one
-    raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global random state, which gsplat's
-    densification draws from, is seeded here, kept in the checkpoint, and given back to the caller.
+    raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global random
+    state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given back
+    to the caller.
     """
     reporter = reporter or Silent()
     spent = 0.0

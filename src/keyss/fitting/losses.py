@@ -60,7 +60,7 @@ class _SsimCpu(torch.autograd.Function):
         return image.new_tensor(value)
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
         return (upstream * gradient).permute(1, 2, 0), None
 
@@ -79,7 +79,7 @@ def ssim_torch(image: Tensor, target: Target) -> Tensor:
 def ssim(image: Tensor, target: Target) -> Tensor:
     """Mean structural similarity of `image` [H, W, 3] and the target: a differentiable scalar, at most 1."""
     if image.device.type == "cpu":
-        value: Tensor = _SsimCpu.apply(image, target)
+        value: Tensor = _SsimCpu.apply(image, target)  # type: ignore[no-untyped-call]
         return value
     return ssim_torch(image, target)
 

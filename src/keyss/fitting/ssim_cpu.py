@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.render.cpu import parallel
-from keyss.render.cpu.jit import finite_kernel
-from keyss.render.cpu.simd8 import fetch_add
+from keyss.rendering.cpu import parallel
+from keyss.rendering.cpu.jit import finite_kernel
+from keyss.rendering.cpu.simd8 import fetch_add
 
 RADIUS = 5  # SSIM's 11x11 window
 SIGMA = 1.5

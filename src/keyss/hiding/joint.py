@@ -25,6 +25,10 @@ from keyss.rendering import render_with_meta
 from keyss.seal.keys import random_embeddings
 
 
+# A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
+Drawn = tuple[dict[str, Any], Tensor | None, float]
+
+
 class JointRun:
     """The state of a hiding, and its step: the tripled loss at one pose of all scenes' poses."""
 
@@ -103,7 +107,7 @@ class JointRun:
         cover_target = self.poses.target(0, owner, index)
         cover_loss, meta = loss_of(cover, 0, cover_target)
         total = config.cover_weight * cover_loss
-        drawn = [(meta, None, config.cover_weight)]
+        drawn: list[Drawn] = [(meta, None, config.cover_weight)]
 
         seen = self._possibly_seen(cover, camera)
         part = cover[seen]
@@ -213,9 +217,7 @@ class JointRun:
         self.iteration = int(meta["iteration"])
 
 
-def combine_densification(
-    drawn: Sequence[tuple[dict[str, Any], Tensor | None, float]], count: int
-) -> dict[str, Any]:
+def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
     """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
 
     `drawn` holds for each render its meta, the indices of the Gaussians it was made of (None: all

@@ -30,8 +30,8 @@ def measure_hiding(
     """Qualities of cover and secrets, their bounds, and what wrong keys show.
 
     `bound`: the plain models. `wrong_key`: PSNR of what wrong keys give (embeddings drawn as those of
-    random keys fall), against the cover's photos and, seen from the secrets' own cameras, against theirs; `floor` is the stego cover
-    itself against the secrets' photos, which is what a wrong key should look like.
+    random keys fall), against the cover's photos and, seen from the secrets' own cameras, against theirs;
+    `floor` is the stego cover itself against the secrets' photos, which a wrong key should look like.
     Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
     """
     if wrong_keys < 1:
@@ -86,4 +86,3 @@ def _psnr_in(scene: Scene, model: Gaussians) -> float:
 
 def _background(scene: Scene, model: Gaussians) -> torch.Tensor:
     return scene.background.to(model.device)
-

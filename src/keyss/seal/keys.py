@@ -103,7 +103,8 @@ class DerivedKey:
 
 def unit_vector(normal: Tensor) -> Tensor:
     """float32 direction of a vector of independent normal numbers [..., 64]."""
-    return (normal / normal.norm(dim=-1, keepdim=True)).float()
+    length: Tensor = normal.norm(dim=-1, keepdim=True)
+    return (normal / length).float()
 
 
 def random_embeddings(count: int, generator: torch.Generator) -> Tensor:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from render.toy_scenes import INPUT_NAMES, SCENES
 
 from keyss.core import BackendError
-from keyss.render import rasterization, resolve_device
+from keyss.rendering import rasterization, resolve_device
+from rendering.toy_scenes import INPUT_NAMES, SCENES
 
 pytestmark = pytest.mark.cuda
 

@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from keyss.core import Camera, Gaussians
-from keyss.render.rasterize import rasterization
+from keyss.rendering.rasterize import rasterization
 
 
 def render(

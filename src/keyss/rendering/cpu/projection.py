@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from keyss.render.cpu.binning import tile_box
-from keyss.render.cpu.jit import kernel
-from keyss.render.cpu.layout import (
+from keyss.rendering.cpu.binning import tile_box
+from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     BLUE,
     CHUNK,
@@ -34,6 +34,7 @@ from keyss.render.cpu.layout import (
     NORM_MIN,
     ONE,
     OPACITY,
+    PACKED,
     POSITION,
     RADIUS_SIGMAS,
     RED,
@@ -49,8 +50,10 @@ from keyss.render.cpu.layout import (
     Y,
     f32,
 )
-from keyss.render.cpu.sh import sh_basis
-from keyss.render.cpu.simd8 import ceil, fetch_add
+from keyss.rendering.cpu.sh import sh_basis
+from keyss.rendering.cpu.simd8 import ceil, fetch_add, prefetch_write
+
+PREFETCH = 12  # how many Gaussians ahead to ask for memory
 
 
 @kernel
@@ -183,8 +186,9 @@ def project(
             sigmas = math.sqrt(level)
             sigma_x = math.sqrt(cov_xx)
             sigma_y = math.sqrt(cov_yy)
-            radius_x = ceil(min(sigmas, RADIUS_SIGMAS) * sigma_x)
-            radius_y = ceil(min(sigmas, RADIUS_SIGMAS) * sigma_y)
+            reach = sigmas if sigmas < RADIUS_SIGMAS else RADIUS_SIGMAS
+            radius_x = ceil(reach * sigma_x)
+            radius_y = ceil(reach * sigma_y)
             if f32(max(radius_x, radius_y)) <= radius_clip:
                 continue
             if not (
@@ -231,7 +235,8 @@ def pack(
     """Copy the footprints of visible Gaussians into depth order, with their colours as seen from the camera.
 
     sh_count is the number of SH coefficients to use, or 0 where colors[:, 0] is the colour itself.
-    tile_bounds[r] becomes a number of tiles that Gaussian r of the depth order meets at most. A Gaussian without a finite colour is hidden: its rank becomes -1, its radii and extents are made empty.
+    tile_bounds[r] becomes a number of tiles that Gaussian r of the depth order meets at most. A Gaussian
+    without a finite colour is hidden: its rank becomes -1, its radii and extents are made empty.
     """
     count = rank.shape[0]
     basis = np.empty(16, np.float32)
@@ -240,6 +245,7 @@ def pack(
         if start >= count:
             break
         for i in range(start, min(start + CHUNK, count)):
+            prefetch_write(packed, np.int64(rank[min(i + PREFETCH, count - 1)]) * PACKED)
             r = rank[i]
             if r < 0:
                 continue

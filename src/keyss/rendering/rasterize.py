@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from keyss.core import UsageError
-from keyss.render import cuda
-from keyss.render.arguments import check_arguments
-from keyss.render.cpu.layout import EPS2D_MIN
-from keyss.render.cpu.rasterization import Settings
-from keyss.render.cpu.rasterization import rasterize as rasterize_on_cpu
+from keyss.rendering import cuda
+from keyss.rendering.arguments import check_arguments
+from keyss.rendering.cpu.layout import EPS2D_MIN
+from keyss.rendering.cpu.rasterization import Settings
+from keyss.rendering.cpu.rasterization import rasterize as rasterize_on_cpu
 
 
 def rasterization(
@@ -38,7 +38,7 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Draw N Gaussians into C images (3DGS, Kerbl et al. 2023, eq. 3 to 5): `gsplat.rasterization`, unpacked.
 
-    Gaussians on the CPU are drawn by the kernels in `keyss.render.cpu`, those on a GPU by gsplat.
+    Gaussians on the CPU are drawn by the kernels in `keyss.rendering.cpu`, those on a GPU by gsplat.
 
     Args:
         means: centres in the world.

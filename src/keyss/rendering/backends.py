@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Literal
 
 import torch
@@ -14,21 +15,27 @@ Backend = Literal["auto", "cpu", "cuda"]
 def resolve_device(backend: Backend = "auto") -> torch.device:
     """The device on which to keep Gaussians: it decides which rasterizer draws them.
 
-    "auto" takes CUDA where torch sees a GPU, otherwise the CPU. Raises BackendError when "cuda" is asked
-    for and there is no GPU, or gsplat cannot use it.
+    "auto" takes CUDA where torch sees a GPU, otherwise the CPU; a GPU that gsplat cannot use is passed
+    over with a RuntimeWarning. Raises BackendError when "cuda" is asked for and cannot be used.
     """
     if backend not in ("auto", "cpu", "cuda"):
         raise UsageError(f"device: expected 'auto', 'cpu' or 'cuda', got {backend!r}")
     if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
-    if not torch.cuda.is_available():
-        raise BackendError("device 'cuda': torch sees no CUDA GPU on this machine; use 'auto' or 'cpu'")
-    require_gsplat_cuda()
+    try:
+        require_gsplat_cuda()
+    except BackendError as error:
+        if backend == "cuda":
+            raise
+        warnings.warn(f"rendering on the CPU: {error}", RuntimeWarning, stacklevel=2)
+        return torch.device("cpu")
     return torch.device("cuda")
 
 
 def require_gsplat_cuda() -> None:
-    """Raise BackendError unless gsplat's CUDA kernels can run. May compile them, which takes minutes."""
+    """Raise BackendError unless gsplat can draw on a GPU. May compile its kernels, which takes minutes."""
+    if not torch.cuda.is_available():
+        raise BackendError("torch sees no CUDA GPU on this machine; use device 'auto' or 'cpu'")
     try:
         from gsplat.cuda._backend import _C
     except (ImportError, OSError, RuntimeError) as error:

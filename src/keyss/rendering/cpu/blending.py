@@ -1,13 +1,14 @@
 """Alpha blending of the Gaussians of each tile, front to back, and its gradient (3DGS, eq. 3).
 
-Down a column of pixels a Gaussian's footprint E is a Gaussian in y, so it follows from two recurrences:
-E(y + 1) = E(y) ratio(y) and ratio(y + 1) = ratio(y) decay. A row costs two multiplications for it, and
-exp is needed only where a run of rows starts. A run is short enough that exp(-sigma) at its first row is
-a normal float whenever any later row of it counts: with eps2d >= 0.3 the curvature in y is at most
-1/0.3, so sigma grows by no more than 78 over ANCHOR_ROWS - 1 rows away from a pixel with alpha >= 1/255.
-
 A tile is 8 pixels wide: one vector is one row. A pixel's transmittance is stored negated once it has
 stopped.
+
+Down a column of pixels a Gaussian's footprint is a Gaussian in y, so it follows from two recurrences:
+footprint(y + 1) = footprint(y) ratio(y) and ratio(y + 1) = ratio(y) decay. A row costs two
+multiplications for it, and exp is needed only where a run of ANCHOR_ROWS rows starts. There the
+footprint may be far below the smallest float though a row further down counts: with eps2d >= 0.3 the
+curvature in y is at most 1/0.3, so 7 rows above a pixel with alpha >= 1/255 it can be e^-130. Therefore
+footprints and alphas are kept multiplied by 2^64, and transmittances divided by it, which is exact.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -16,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.render.cpu.jit import finite_kernel
-from keyss.render.cpu.layout import (
+from keyss.rendering.cpu.jit import finite_kernel
+from keyss.rendering.cpu.layout import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLUE,
@@ -43,12 +44,13 @@ from keyss.render.cpu.layout import (
     Y,
     f32,
 )
-from keyss.render.cpu.simd8 import (
+from keyss.rendering.cpu.simd8 import (
     any_gt,
     at,
     ceil,
     divide,
     exp,
+    exp_times_2_64,
     fetch_add,
     floor,
     load8,
@@ -68,9 +70,15 @@ from keyss.render.cpu.simd8 import (
     sum_lanes_of_8,
 )
 
-ANCHOR_ROWS = 6  # rows between two evaluations of exp, see above
+ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
 PREFETCH = 6  # how many list entries ahead to ask for memory
 STOP_CHECK = 16  # Gaussians between two tests whether the whole tile has stopped
+
+SCALE = f32(2.0**64)
+INVERSE = f32(2.0**-64)
+SCALED_ALPHA_MIN = ALPHA_MIN * SCALE
+SCALED_ALPHA_MAX = ALPHA_MAX * SCALE
+SCALED_TRANSMITTANCE_MIN = TRANSMITTANCE_MIN * INVERSE
 
 
 @finite_kernel
@@ -80,7 +88,7 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
     Returns the entry before which the whole tile had stopped.
     """
     for k in range(0, TILE_PIXELS, 8):
-        store8(planes, k, splat(ONE))
+        store8(planes, k, splat(INVERSE))
     for k in range(TILE_PIXELS, 4 * TILE_PIXELS, 8):
         store8(planes, k, splat(ZERO))
     centre_x = f32(left) + HALF
@@ -106,17 +114,17 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
             exponent_1 = dx * at(packed, g + XY)
             for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
                 dy = f32(anchor) - y
-                footprint = exp(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
+                footprint = exp_times_2_64(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
                 ratio = exp(exponent_1 + yy * (dy + dy + ONE))
                 for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
-                    alpha = select_ge(footprint, ALPHA_MIN, minimum(footprint, ALPHA_MAX), ZERO)
+                    alpha = select_ge(footprint, SCALED_ALPHA_MIN, minimum(footprint, SCALED_ALPHA_MAX), ZERO)
                     footprint = footprint * ratio
                     ratio = ratio * decay
                     before = load8(planes, k)
                     weight = alpha * maximum(before, ZERO)
-                    after = before - weight
-                    store8(planes, k, select_gt(after, TRANSMITTANCE_MIN, after, negative_abs(before)))
-                    weight = select_gt(after, TRANSMITTANCE_MIN, weight, ZERO)
+                    after = multiply_add(weight, -INVERSE, before)
+                    store8(planes, k, select_gt(after, SCALED_TRANSMITTANCE_MIN, after, negative_abs(before)))
+                    weight = select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
                     p = k + TILE_PIXELS
                     store8(planes, p, multiply_add(weight, red, load8(planes, p)))
                     p = k + 2 * TILE_PIXELS
@@ -127,16 +135,27 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
         most = load8(planes, 0)
         for k in range(8, TILE_PIXELS, 8):
             most = maximum(most, load8(planes, k))
-        if not any_gt(most, TRANSMITTANCE_MIN):
+        if not any_gt(most, SCALED_TRANSMITTANCE_MIN):
             break
     return entry
 
 
 @finite_kernel
 def blend(
-    counter, packed, tile_ranks, tile_starts, tile_columns, width, height, background, image, transmittance, ends
+    counter,
+    packed,
+    tile_ranks,
+    tile_starts,
+    tile_columns,
+    width,
+    height,
+    background,
+    image,
+    alpha,
+    transmittance,
+    ends,
 ):
-    """Draw all tiles into `image` and `transmittance`; ends[t] is the first list entry of tile t not looked at."""
+    """Draw all tiles; ends[t] is the first list entry of tile t that was not looked at."""
     planes = np.empty(4 * TILE_PIXELS + 16, np.float32)
     while True:
         tile = fetch_add(counter, 0, 1)
@@ -151,11 +170,12 @@ def blend(
         for y in range(rows):
             for x in range(min(TILE_WIDTH, width - left)):
                 k = y * 8 + x
-                rest = abs(planes[k])
+                rest = abs(planes[k]) * SCALE
                 image[top + y, left + x, 0] = planes[k + TILE_PIXELS] + rest * background[0]
                 image[top + y, left + x, 1] = planes[k + 2 * TILE_PIXELS] + rest * background[1]
                 image[top + y, left + x, 2] = planes[k + 3 * TILE_PIXELS] + rest * background[2]
                 transmittance[top + y, left + x] = rest
+                alpha[top + y, left + x] = ONE - rest
 
 
 @finite_kernel
@@ -164,10 +184,9 @@ def _blend_tile_backward(
 ):
     """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
 
-    planes = [transmittance | gradient still to come | red, green and blue gradient]. The gradient still
-    to come is what everything behind the current Gaussian contributes to dL/d(transmittance) times it:
-    the pixel's total minus what has been passed. Within a row dx is fixed per lane, so the loop over rows
-    sums powers of dy only.
+    planes = [transmittance | behind | red, green and blue gradient], where behind is the part of the loss
+    gradient times the pixel that is drawn behind the current Gaussian: the whole minus what has been
+    passed. Within a row dx is fixed per lane, so the loop over rows sums powers of dy only.
     """
     centre_x = f32(left) + HALF
     centre_y = f32(top) + HALF
@@ -202,28 +221,28 @@ def _blend_tile_backward(
         sum_abs_y = zero
         for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
             dy = f32(anchor) - y
-            footprint = exp(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
+            footprint = exp_times_2_64(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
             ratio = exp(exponent_1 + yy * (dy + dy + ONE))
             row_dy = splat(dy)
             for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
-                alpha = select_ge(footprint, ALPHA_MIN, minimum(footprint, ALPHA_MAX), ZERO)
-                stored = load8(planes, k)
-                before = maximum(stored, ZERO)
-                weight = alpha * before
-                after = stored - weight
-                store8(planes, k, select_gt(after, TRANSMITTANCE_MIN, after, negative_abs(stored)))
-                alpha = select_gt(after, TRANSMITTANCE_MIN, alpha, ZERO)
-                weight = select_gt(after, TRANSMITTANCE_MIN, weight, ZERO)
+                alpha = select_ge(footprint, SCALED_ALPHA_MIN, minimum(footprint, SCALED_ALPHA_MAX), ZERO)
+                before = load8(planes, k)
+                weight = alpha * maximum(before, ZERO)
+                after = multiply_add(weight, -INVERSE, before)
+                store8(planes, k, select_gt(after, SCALED_TRANSMITTANCE_MIN, after, negative_abs(before)))
+                alpha = select_gt(after, SCALED_TRANSMITTANCE_MIN, alpha, ZERO)
+                weight = select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
                 gradient_red = load8(planes, k + 2 * TILE_PIXELS)
                 gradient_green = load8(planes, k + 3 * TILE_PIXELS)
                 gradient_blue = load8(planes, k + 4 * TILE_PIXELS)
-                own = multiply_add(
+                own = weight * multiply_add(
                     gradient_red, red, multiply_add(gradient_green, green, gradient_blue * blue)
                 )
-                behind = load8(planes, k + TILE_PIXELS) - weight * own
+                behind = load8(planes, k + TILE_PIXELS) - own
                 store8(planes, k + TILE_PIXELS, behind)
-                alpha_gradient = before * own - divide(behind, ONE - alpha)
-                s = select_le(footprint, ALPHA_MAX, alpha, ZERO) * alpha_gradient
+                # alpha dL/d(alpha), where what lies behind is dimmed by 1 - alpha.
+                s = own - behind * divide(alpha, SCALE - alpha)
+                s = select_le(footprint, SCALED_ALPHA_MAX, s, ZERO)
                 footprint = footprint * ratio
                 ratio = ratio * decay
                 s_dy = s * row_dy
@@ -296,7 +315,7 @@ def blend_backward(
                     red = image_gradient[top + y, left + x, 0]
                     green = image_gradient[top + y, left + x, 1]
                     blue = image_gradient[top + y, left + x, 2]
-                    planes[k] = ONE
+                    planes[k] = INVERSE
                     planes[k + TILE_PIXELS] = (
                         red * image[top + y, left + x, 0]
                         + green * image[top + y, left + x, 1]
@@ -307,7 +326,7 @@ def blend_backward(
                     planes[k + 3 * TILE_PIXELS] = green
                     planes[k + 4 * TILE_PIXELS] = blue
                 else:
-                    planes[k] = -ONE
+                    planes[k] = -INVERSE
                     planes[k + TILE_PIXELS] = ZERO
                     planes[k + 2 * TILE_PIXELS] = ZERO
                     planes[k + 3 * TILE_PIXELS] = ZERO

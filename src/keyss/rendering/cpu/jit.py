@@ -11,44 +11,44 @@ import hashlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numba
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+_numba: Any = numba  # typed in some versions only
 
 # Everything `fastmath` allows except assuming that no NaN and no infinity occurs: a Gaussian with a NaN
 # must fail the comparisons that select it, not index wildly.
 _NAN_SAFE = {"contract", "arcp", "nsz", "reassoc", "afn"}
 
 
-def kernel(function: Function) -> Function:
+def kernel(function: Any) -> Any:
     """Compile `function` at its first call; NaN and infinity compare as IEEE says."""
     return _compiled(function, fastmath=_NAN_SAFE)
 
 
-def finite_kernel(function: Function) -> Function:
+def finite_kernel(function: Any) -> Any:
     """Compile `function` at its first call; the compiler may assume that all numbers are finite."""
     return _compiled(function, fastmath=True)
 
 
-def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
+def _compiled(function: Any, fastmath: bool | set[str]) -> Any:
     options = {"fastmath": fastmath, "error_model": "numpy", "nogil": True}
     folder = cache_folder()
     if folder is None:
-        return cast(Function, numba.njit(**options)(function))
+        return _numba.njit(**options)(function)
     # A kernel takes the cache folder of the moment in which it is decorated.
-    folder_before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder)
+    folder_before = _numba.config.CACHE_DIR
+    _numba.config.CACHE_DIR = str(folder)
     try:
-        return cast(Function, numba.njit(cache=True, **options)(function))
+        return _numba.njit(cache=True, **options)(function)
     except RuntimeError:  # the folder went away, and numba's own places are not writable either
-        return cast(Function, numba.njit(**options)(function))
+        return _numba.njit(**options)(function)
     finally:
-        numba.config.CACHE_DIR = folder_before
+        _numba.config.CACHE_DIR = folder_before
 
 
 @cache
@@ -73,16 +73,14 @@ def cache_folder() -> Path | None:
 
 def _cache_parents() -> list[Path]:
     parents = [Path(__file__).parent / "__pycache__"]
-    if numba.config.CACHE_DIR:
-        parents.insert(0, Path(numba.config.CACHE_DIR))
+    if _numba.config.CACHE_DIR:
+        parents.insert(0, Path(_numba.config.CACHE_DIR))
     user_cache = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME")
     if user_cache:
         parents.append(Path(user_cache))
     else:
-        try:
+        with suppress(RuntimeError):  # no home folder is known
             parents.append(Path.home() / ".cache")
-        except RuntimeError:  # no home folder is known
-            pass
     return parents
 
 
@@ -91,4 +89,4 @@ def announce_compilation() -> None:
     """Say on stderr that the first render takes a while, if nothing is compiled yet. Says it once."""
     folder = cache_folder()
     if folder is None or next(folder.rglob("*.nbi"), None) is None:
-        print("keyss: compiling the CPU rasterizer, about 20 s, once", file=sys.stderr, flush=True)
+        print("keyss: compiling the CPU rasterizer, 10 to 20 s, once", file=sys.stderr, flush=True)

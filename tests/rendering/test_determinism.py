@@ -9,10 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from render.toy_scenes import ToyScene, toy_scene
 from torch import Tensor
 
-from keyss.render import rasterization
+from keyss.rendering import rasterization
+from rendering.toy_scenes import ToyScene, toy_scene
 
 
 @pytest.fixture(autouse=True)
@@ -70,28 +70,29 @@ def test_python_threads_may_render_at_once() -> None:
             assert all(same(a, b) for a, b in zip(results, expected, strict=True))
 
 
-def _render_in_child(queue: multiprocessing.Queue[float]) -> None:
-    scene = toy_scene(count=500)
+def _draw(scene: ToyScene, inputs: list[Tensor]) -> float:
     with torch.no_grad():
-        inputs = scene.tensors(torch.float32)
         images, _, _ = rasterization(
-            *inputs[:5], inputs[5][None], scene.K.float()[None], scene.width, scene.height, sh_degree=3
+            *inputs[:5], inputs[5][None], scene.K[None], scene.width, scene.height, sh_degree=3
         )
-    queue.put(float(images.numpy().sum(dtype="float64")))
+    return float(images.numpy().sum(dtype="float64"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="fork is the default nowhere else")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_rendering_works_in_a_forked_child() -> None:
-    context = multiprocessing.get_context("fork")
+    # The scene is made before the fork, because torch's own threads do not survive it.
+    scene = toy_scene(count=500, width=300, height=200)
+    scene.K = scene.K.float()
+    inputs = scene.tensors(torch.float32)
     torch.set_num_threads(2)
-    queue = context.Queue()
-    _render_in_child(queue)
-    expected = queue.get(timeout=10)
-    child = context.Process(target=_render_in_child, args=(queue,))
+    expected = _draw(scene, inputs)
+    context = multiprocessing.get_context("fork")
+    queue: multiprocessing.Queue[float] = context.Queue()
+    child = context.Process(target=lambda: queue.put(_draw(scene, inputs)))
     child.start()
     try:
-        assert queue.get(timeout=60) == expected
+        assert queue.get(timeout=20) == expected
     finally:
         child.join(10)
         child.kill()

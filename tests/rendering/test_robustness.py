@@ -8,11 +8,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from render.toy_scenes import SCENES, toy_scene
 from torch import Tensor
 
-from keyss.render import rasterization
-from keyss.render.cpu import rasterization as cpu_rasterization
+from keyss.rendering import rasterization
+from keyss.rendering.cpu import rasterization as cpu_rasterization
+from rendering.toy_scenes import SCENES, toy_scene
 
 HOSTILE = (math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-38, -1e-38, 1e15, -1e15, 1e30, -1e30, 3e38, 1.0)
 

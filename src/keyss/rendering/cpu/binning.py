@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from keyss.render.cpu.jit import kernel
-from keyss.render.cpu.layout import (
+from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.layout import (
     EXTENT_X,
     EXTENT_Y,
     HALF,
@@ -34,7 +34,7 @@ from keyss.render.cpu.layout import (
     Y,
     f32,
 )
-from keyss.render.cpu.simd8 import at, ceil, fetch_add, floor
+from keyss.rendering.cpu.simd8 import at, ceil, fetch_add, floor
 
 
 @kernel
@@ -219,8 +219,10 @@ def offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_sl
 
 
 @kernel
-def sort_pairs(counter, order, starts, tiles, tiles_per_gaussian, cursors, first_slots, tile_ranks, tile_slots):
-    """Sort the pairs that `list_pairs` listed into tiles, from the cursors that `offsets_from_counts` left."""
+def sort_pairs(
+    counter, order, starts, tiles, tiles_per_gaussian, cursors, first_slots, tile_ranks, tile_slots
+):
+    """Sort the pairs of `list_pairs` into tiles, from the cursors that `offsets_from_counts` left."""
     shares = cursors.shape[0]
     count = order.shape[0]
     while True:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from keyss.core import Camera, Gaussians
 from keyss.core.gaussians import SH_C0
-from keyss.render import rasterization, render, render_with_alpha
+from keyss.rendering import rasterization, render, render_with_meta
 
 
 def draw(
@@ -24,16 +24,16 @@ def draw(
     """Draw small round Gaussians with a camera at the origin looking along z, focal length 10."""
     count = len(means)
     images, alphas, _ = rasterization(
-        torch.tensor(means),
+        torch.tensor(means, dtype=torch.float32),
         torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
         torch.full((count, 3), scale),
         torch.tensor(opacities),
-        torch.tensor(colors),
+        torch.tensor(colors, dtype=torch.float32),
         torch.eye(4)[None],
         torch.tensor([[[10.0, 0, size / 2], [0, 10, size / 2], [0, 0, 1]]]),
         size,
         size,
-        backgrounds=None if background is None else torch.tensor([background]),
+        backgrounds=None if background is None else torch.tensor([background], dtype=torch.float32),
     )
     return images[0], alphas[0, ..., 0]
 
@@ -82,7 +82,8 @@ def test_colour_is_half_plus_the_constant_harmonic_and_is_not_clamped_above() ->
         torch.tensor([3.0]),
         dc,
     )
-    image, alpha = render_with_alpha(gaussians, camera)
+    image, meta = render_with_meta(gaussians, camera)
+    alpha = meta["alpha"]
     expected = (0.5 + SH_C0 * dc[0, 0]).tolist()
     assert (image[4, 4] / alpha[4, 4]).tolist() == pytest.approx(expected, abs=1e-6)
     assert image.max() > 1

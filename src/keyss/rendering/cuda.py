@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from keyss.render.backends import require_gsplat_cuda
+from keyss.rendering.backends import require_gsplat_cuda
 
 
 def rasterize(**arguments: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:

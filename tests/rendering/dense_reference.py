@@ -60,10 +60,12 @@ def dense_rasterization(
     sh_degree: int | None = None,
     near_plane: float = 0.01,
     eps2d: float = 0.3,
+    shifts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image [H, W, 3], alpha [H, W], and a mask [H, W] of the pixels where no decision was a close call.
 
-    All inputs float64; a colour is SH coefficients where sh_degree is given.
+    All inputs float64; a colour is SH coefficients where sh_degree is given. `shifts` [N, H * W, 2] moves
+    each projected centre as each pixel sees it: its gradient is that of means2d, pixel by pixel.
     """
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     if sh_degree is not None:
@@ -90,6 +92,8 @@ def dense_rasterization(
     pixels = torch.stack([columns, rows], -1).to(means).reshape(-1, 2)
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     offsets = pixels - centres[:, None]  # [N, P, 2]
+    if shifts is not None:
+        offsets = offsets - shifts[order]
     sigma = 0.5 * torch.einsum("npi,nij,npj->np", offsets, conic, offsets)
     footprint = opacities[order, None] * torch.exp(-sigma)
     alpha = torch.where(footprint >= ALPHA_MIN, footprint.clamp_max(ALPHA_MAX), 0.0)

@@ -8,23 +8,32 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
 from keyss.core import BackendError
-from keyss.render.cpu import binning, blending, projection, projection_backward
-from keyss.render.cpu.jit import announce_compilation
-from keyss.render.cpu.layout import CAMERA, CHUNK, DECAY, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
-from keyss.render.cpu.parallel import run
-from keyss.render.cpu.scratch import aligned, scratch
-
-Array = np.ndarray[Any, Any]
+from keyss.rendering.cpu import binning, blending, memory, projection, projection_backward
+from keyss.rendering.cpu.jit import announce_compilation
+from keyss.rendering.cpu.layout import (
+    CAMERA,
+    CHUNK,
+    DECAY,
+    FX,
+    MOMENTS,
+    PACKED,
+    POSITION,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TX,
+)
+from keyss.rendering.cpu.memory import Array
+from keyss.rendering.cpu.parallel import run
 
 MAX_PAIRS = 2**31 - 1  # places in the lists of tiles are int32
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a call is made with besides tensors; see `keyss.render.rasterization`."""
+    """What a call is made with besides tensors; see `keyss.rendering.rasterization`."""
 
     width: int
     height: int
@@ -86,7 +95,7 @@ def rasterize(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         means: Tensor,
         quats: Tensor,
@@ -103,7 +112,8 @@ class _Rasterize(torch.autograd.Function):
         announce_compilation()
         shape = (len(viewmats), settings.height, settings.width)
         images = torch.empty(*shape, 3)
-        transmittances = torch.empty(shape)
+        alphas = torch.empty(*shape, 1)
+        transmittances = torch.empty(shape)  # 1 - alphas, without the rounding where alpha is nearly 1
         gaussians = tuple(tensor.detach().numpy() for tensor in (means, quats, scales, opacities, colors))
         drawings = []
         for c in range(len(viewmats)):
@@ -116,6 +126,7 @@ class _Rasterize(torch.autograd.Function):
                 meta["depths"][c].numpy(),
                 meta["radii"][c].numpy(),
                 images[c].numpy(),
+                alphas[c, ..., 0].numpy(),
                 transmittances[c].numpy(),
             )
             if any(ctx.needs_input_grad):
@@ -125,10 +136,10 @@ class _Rasterize(torch.autograd.Function):
         ctx.drawings = drawings
         ctx.settings = settings
         ctx.set_materialize_grads(False)
-        return images, (1.0 - transmittances)[..., None]
+        return images, alphas
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(
         ctx: Any, images_gradient: Tensor | None, alphas_gradient: Tensor | None
     ) -> tuple[Tensor | None, ...]:
@@ -206,15 +217,16 @@ def _draw(
     depths: Array,
     radii: Array,
     image: Array,
+    alpha: Array,
     transmittance: Array,
 ) -> Drawing:
-    """One camera's forward pass; fills the last five arrays."""
+    """One camera's forward pass; fills the last six arrays."""
     means, quats, scales, opacities, colors = gaussians
     count = len(means)
     width, height = settings.width, settings.height
     columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
-    footprints = scratch("footprints", (count, DECAY + 1), np.float32)
+    footprints = memory.empty((count, DECAY + 1), np.float32)
     run(
         projection.project,
         means,
@@ -233,12 +245,12 @@ def _draw(
         depths,
         radii,
     )
-    rank = np.empty(count, np.int32)
-    order, spare_order = (scratch(name, (count,), np.int32) for name in ("order", "spare_order"))
-    keys, spare_keys = (scratch(name, (count,), np.uint32) for name in ("keys", "spare_keys"))
+    rank = memory.empty((count,), np.int32)
+    order, spare_order = (memory.empty((count,), np.int32) for _ in range(2))
+    keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
     visible = binning.sort_by_depth(depths, rank, order, spare_order, keys, spare_keys)
-    packed = aligned((visible, PACKED), np.float32)
-    tile_bounds = scratch("tile_bounds", (visible,), np.int64)
+    packed = memory.empty((visible, PACKED), np.float32)
+    tile_bounds = memory.empty((visible,), np.int32)
     run(
         projection.pack,
         footprints,
@@ -255,22 +267,22 @@ def _draw(
     )
 
     shares = 4 * torch.get_num_threads() if torch.get_num_threads() > 1 else 1
-    starts = np.empty(shares + 1, np.int64)
+    starts = memory.empty((shares + 1,), np.int64)
     binning.share_bounds(tile_bounds, starts)
     if starts[-1] >= MAX_PAIRS:
         raise BackendError(
             f"{visible} Gaussians cover {starts[-1]} tiles together, more than the CPU rasterizer can list "
             f"({MAX_PAIRS}): render fewer or smaller Gaussians, or at a lower resolution"
         )
-    tiles = scratch("tiles", (int(starts[-1]),), np.int32)
-    tiles_per_gaussian = scratch("tiles_per_gaussian", (visible,), np.int32)
-    cursors = scratch("cursors", (shares, columns * rows), np.int64)
+    tiles = memory.empty((int(starts[-1]),), np.int32)
+    tiles_per_gaussian = memory.empty((visible,), np.int32)
+    cursors = memory.empty((shares, columns * rows), np.int64)
     run(binning.list_pairs, packed, columns, rows, starts, tiles, tiles_per_gaussian, cursors)
-    tile_starts = np.empty(columns * rows + 1, np.int64)
-    first_slots = np.empty(count + 1, np.int64)
+    tile_starts = memory.empty((columns * rows + 1,), np.int64)
+    first_slots = memory.empty((count + 1,), np.int64)
     pairs = binning.offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_slots)
-    tile_ranks = np.empty(pairs, np.int32)
-    tile_slots = np.empty(pairs, np.int32)
+    tile_ranks = memory.empty((pairs,), np.int32)
+    tile_slots = memory.empty((pairs,), np.int32)
     run(
         binning.sort_pairs,
         order[:visible],
@@ -282,7 +294,7 @@ def _draw(
         tile_ranks,
         tile_slots,
     )
-    ends = np.empty(columns * rows, np.int64)
+    ends = memory.empty((columns * rows,), np.int64)
     run(
         blending.blend,
         packed,
@@ -293,6 +305,7 @@ def _draw(
         height,
         background,
         image,
+        alpha,
         transmittance,
         ends,
     )
@@ -309,8 +322,8 @@ def _blend_backward(
 ) -> tuple[Array, Array]:
     """The sums over each (Gaussian, tile) pair: [pairs * MOMENTS] and [pairs * extra_width], see `layout`."""
     pairs = len(drawing.tile_ranks)
-    moments = scratch("moments", (pairs * MOMENTS,), np.float32)
-    extras = scratch("extras", (pairs * settings.extra_width,), np.float32)
+    moments = memory.empty((pairs * MOMENTS,), np.float32)
+    extras = memory.empty((pairs * settings.extra_width,), np.float32)
     run(
         blending.blend_backward,
         drawing.packed,
@@ -337,7 +350,7 @@ def _camera_array(viewmat: Tensor, K: Tensor) -> Array:
     """The camera as the kernels want it, see `layout.CAMERA`."""
     view = viewmat.detach().double().numpy()
     intrinsics = K.detach().double().numpy()
-    camera = np.empty(CAMERA, np.float32)
+    camera = memory.empty((CAMERA,), np.float32)
     camera[:TX] = view[:3, :3].ravel()
     camera[TX:FX] = view[:3, 3]
     camera[FX:POSITION] = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from keyss.core import UsageError
-from keyss.render.cpu.layout import EPS2D_MIN
+from keyss.rendering.cpu.layout import EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from keyss.core import BackendError, UsageError
-from keyss.render import rasterization, resolve_device
+from keyss.rendering import rasterization, resolve_device
 
 
 def good_arguments() -> dict[str, Any]:
@@ -98,10 +100,11 @@ def test_resolve_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_gpu_without_gsplat_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    import gsplat.cuda._backend
-
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(gsplat.cuda._backend, "_C", None)
-    for backend in ("auto", "cuda"):
-        with pytest.raises(BackendError, match="gsplat's CUDA kernels are missing"):
-            resolve_device(backend)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=object()))
+    assert resolve_device("auto") == resolve_device("cuda") == torch.device("cuda")
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=None))
+    with pytest.raises(BackendError, match="gsplat's CUDA kernels are missing"):
+        resolve_device("cuda")
+    with pytest.warns(RuntimeWarning, match="gsplat's CUDA kernels are missing"):
+        assert resolve_device("auto") == torch.device("cpu")

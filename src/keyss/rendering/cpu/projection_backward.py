@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from keyss.render.cpu.jit import kernel
-from keyss.render.cpu.layout import (
+from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.layout import (
     BLUE,
     CHUNK,
     FX,
@@ -30,9 +30,9 @@ from keyss.render.cpu.layout import (
     YY,
     ZERO,
 )
-from keyss.render.cpu.projection import rotation_matrix, slope_limits
-from keyss.render.cpu.sh import sh_basis, sh_direction_gradient
-from keyss.render.cpu.simd8 import at, fetch_add, lane, load8, prefetch_read, splat
+from keyss.rendering.cpu.projection import rotation_matrix, slope_limits
+from keyss.rendering.cpu.sh import sh_basis, sh_direction_gradient
+from keyss.rendering.cpu.simd8 import at, fetch_add, lane, load8, prefetch_read, splat
 
 PREFETCH = 12  # how many Gaussians ahead to ask for memory
 
@@ -216,15 +216,9 @@ def project_backward(
                 qy *= scale
                 qz *= scale
                 ew = TWO * (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01))
-                ex = TWO * (
-                    qy * (d10 + d01) + qz * (d20 + d02) + qw * (d21 - d12) - TWO * qx * (d11 + d22)
-                )
-                ey = TWO * (
-                    qx * (d10 + d01) + qz * (d21 + d12) + qw * (d02 - d20) - TWO * qy * (d00 + d22)
-                )
-                ez = TWO * (
-                    qx * (d20 + d02) + qy * (d21 + d12) + qw * (d10 - d01) - TWO * qz * (d00 + d11)
-                )
+                ex = TWO * (qy * (d10 + d01) + qz * (d20 + d02) + qw * (d21 - d12) - TWO * qx * (d11 + d22))
+                ey = TWO * (qx * (d10 + d01) + qz * (d21 + d12) + qw * (d02 - d20) - TWO * qy * (d00 + d22))
+                ez = TWO * (qx * (d20 + d02) + qy * (d21 + d12) + qw * (d10 - d01) - TWO * qz * (d00 + d11))
                 along = ew * qw + ex * qx + ey * qy + ez * qz
                 quats_gradient[i, 0] += (ew - along * qw) * scale
                 quats_gradient[i, 1] += (ex - along * qx) * scale

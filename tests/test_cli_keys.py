@@ -1,0 +1,110 @@
+"""Where keys come from."""
+
+from __future__ import annotations
+
+import getpass
+from pathlib import Path
+
+import pytest
+
+from keyss.cli.keys import key_of_file, keys
+from keyss.core import InputError, UsageError
+
+
+@pytest.fixture(autouse=True)
+def _no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("KEYSS_KEY", raising=False)
+
+
+def write(folder: Path, data: bytes) -> Path:
+    path = folder / "key"
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("data", "key"),
+    [
+        (b"abc", "abc"),
+        (b"abc\n", "abc"),
+        (b"abc\r\n", "abc"),
+        (b"abc\n\n", "abc\n"),
+        (b" a b ", " a b "),
+        ("Schlüssel 鍵\n".encode(), "Schlüssel 鍵"),
+        ("abc\r\n".encode("utf-8-sig"), "abc"),
+        (b"x" * 4096, "x" * 4096),
+    ],
+)
+def test_one_line_end_is_dropped_and_nothing_else(tmp_path: Path, data: bytes, key: str) -> None:
+    assert key_of_file(write(tmp_path, data)) == key
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "empty"),
+        (b"\n", "empty"),
+        (b"\r\n", "empty"),
+        (b"x" * 4097, "4096 bytes"),
+        (b"\xff\xfe", "UTF-8"),
+    ],
+)
+def test_files_that_hold_no_key_are_refused(tmp_path: Path, data: bytes, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        key_of_file(write(tmp_path, data))
+
+
+def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        key_of_file(tmp_path / "missing")
+    with pytest.raises(InputError, match="cannot be read"):
+        key_of_file(tmp_path)
+
+
+def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KEYSS_KEY", "from the environment")
+    assert keys([write(tmp_path, b"from the file\n")], 1) == ["from the file"]
+    assert keys([], 1) == ["from the environment"]
+    with pytest.raises(UsageError, match="2 secrets"):
+        keys([], 2)
+    monkeypatch.setenv("KEYSS_KEY", "")
+    with pytest.raises(UsageError, match="empty"):
+        keys([], 1)
+
+
+def test_as_many_files_as_secrets(tmp_path: Path) -> None:
+    path = write(tmp_path, b"k")
+    assert keys([path, path], 2) == ["k", "k"]
+    with pytest.raises(UsageError, match="got 1"):
+        keys([path], 2)
+
+
+def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
+    with pytest.raises(UsageError, match="no key"):
+        keys([], 1)
+
+
+class TestPrompt:
+    @pytest.fixture
+    def typed(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+        """What a person types, to be filled by the test."""
+        answers: list[str] = []
+        monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+        monkeypatch.setattr(getpass, "getpass", lambda prompt: answers.pop(0))
+        return answers
+
+    def test_asks_once_to_open_and_twice_to_lock(self, typed: list[str]) -> None:
+        typed += ["one", "one", "two", "two"]
+        assert keys([], 2, confirm=True) == ["one", "two"]
+        typed += ["three"]
+        assert keys([], 1) == ["three"]
+        assert typed == []
+
+    def test_refuses_a_slip(self, typed: list[str]) -> None:
+        typed += ["one", "onw"]
+        with pytest.raises(UsageError, match="differ"):
+            keys([], 1, confirm=True)
+        typed += [""]
+        with pytest.raises(UsageError, match="empty"):
+            keys([], 1)

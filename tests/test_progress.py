@@ -1,0 +1,101 @@
+"""Progress lines."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from keyss.progress import LiveLine, PlainLines, clock, reporter
+
+
+class Timer:
+    """A clock that the test sets."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def timer() -> Timer:
+    return Timer()
+
+
+def console(terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=120)
+
+
+def text(of: Console) -> str:
+    assert isinstance(of.file, io.StringIO)
+    return of.file.getvalue()
+
+
+def test_the_stream_decides() -> None:
+    assert isinstance(reporter(console(True)), LiveLine)
+    assert isinstance(reporter(console(False)), PlainLines)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(0, "0:00"), (59.6, "1:00"), (302, "5:02"), (3723, "1:02:03"), (-1, "0:00")]
+)
+def test_clock(seconds: float, shown: str) -> None:
+    assert clock(seconds) == shown
+
+
+def test_plain_lines_come_now_and_then(timer: Timer) -> None:
+    log = console(False)
+    lines = PlainLines(log, 10.0, timer)
+    lines.start("hide", 300, 0)
+    for iteration in range(1, 101):
+        timer.now += 0.25
+        lines.update(iteration, 12345, {"PSNR cover": 25.127})
+    lines.finish()
+    lines.finish()
+    assert text(log).splitlines() == [
+        "hide: 300 iterations",
+        "hide: 40/300, 4.0 it/s, 1:05 left, 12,345 Gaussians, PSNR cover 25.13",
+        "hide: 80/300, 4.0 it/s, 0:55 left, 12,345 Gaussians, PSNR cover 25.13",
+        "hide: stopped at 100 in 0:25, 12,345 Gaussians, PSNR cover 25.13",
+    ]
+
+
+def test_plain_lines_of_a_resumed_run(timer: Timer) -> None:
+    log = console(False)
+    lines = PlainLines(log, 10.0, timer)
+    lines.start("fit [x]", 300, 200)
+    timer.now += 10
+    lines.update(300, 0, {})
+    lines.finish()
+    assert text(log).splitlines() == [
+        "fit [x]: 300 iterations, continuing at 200",
+        "fit [x]: 300/300, 10.0 it/s, 0:00 left",
+        "fit [x]: done in 0:10",
+    ]
+
+
+def test_the_time_left_is_of_the_recent_speed(timer: Timer) -> None:
+    log = console(False)
+    lines = PlainLines(log, 0.0, timer)
+    lines.start("fit", 1000, 0)
+    for iteration, seconds in [(1, 100.0), *((i, 0.5) for i in range(2, 101))]:
+        timer.now += seconds
+        lines.update(iteration, 0, {})
+    assert text(log).splitlines()[-1] == "fit: 100/1000, 2.0 it/s, 7:30 left"
+
+
+def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> None:
+    screen = console(True)
+    line = LiveLine(screen, timer)
+    line.start("hide", 300, 0)
+    for iteration in range(1, 301):
+        timer.now += 0.1
+        line.update(iteration, 12345, {"PSNR cover": 25.127})
+    line.finish()
+    line.finish()
+    shown = text(screen)
+    assert "150/300 10.0 it/s, 0:15 left, 12,345 Gaussians, PSNR cover 25.13" in shown
+    assert shown.count("12,345") < 150
+    assert "300/300 in 0:30, 12,345 Gaussians, PSNR cover 25.13" in shown

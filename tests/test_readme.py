@@ -1,0 +1,34 @@
+"""What the README shows works."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from files.scene_files import write_blender, write_nerfstudio
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+
+
+def test_the_python_example_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(example.splitlines()) <= 20
+    short = example.replace("max_gaussians=20_000", "max_gaussians=100, iterations=10")
+    assert short != example
+    write_blender(tmp_path / "scenes" / "bonsai", count=2)
+    write_nerfstudio(tmp_path / "scenes" / "fox")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(short, "README.md", "exec"), {})
+    assert "100 Gaussians" in capsys.readouterr().out
+    assert (tmp_path / "secret.ply").exists()
+
+
+def test_the_files_it_links_to_exist() -> None:
+    root = Path(__file__).parents[1]
+    links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
+    assert links
+    assert [link for link in links if not (root / link).exists()] == []

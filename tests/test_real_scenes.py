@@ -1,0 +1,46 @@
+"""What is promised, on real photos: slow, run by `make test-slow`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import keyss
+from keyss import FitConfig, HideConfig, Secret
+
+pytestmark = pytest.mark.slow
+CONFIG = HideConfig(fit=FitConfig(max_gaussians=20_000))
+
+
+@pytest.fixture(scope="module")
+def run(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Bonsai hides fox at width 200 with 20,000 Gaussians."""
+    out = tmp_path_factory.mktemp("runs") / "hidden"
+    secret = Secret(real_data / "fox", "a key for a fox")
+    keyss.hide(real_data / "bonsai", [secret], config=CONFIG, width=200, out=out)
+    return out
+
+
+def test_bonsai_hides_fox_within_the_promised_losses(run: Path) -> None:
+    metrics = keyss.evaluate(run, ["a key for a fox"])
+    bound, wrong = metrics["bound"], metrics["wrong_key"]
+    assert metrics["seconds"] < 45 * 60
+    assert bound["cover"]["psnr"] > 26.2
+    assert bound["secrets"][0]["psnr"] > 30.4
+    assert metrics["cover"]["psnr"] > bound["cover"]["psnr"] - 1.5
+    assert metrics["secrets"][0]["psnr"] > bound["secrets"][0]["psnr"] - 3.5
+    assert wrong["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 1
+    assert wrong["vs_secrets"][0]["max"] < wrong["floor"][0] + 1
+
+
+@pytest.mark.parametrize(("cover", "secret"), [("miku", "lego"), ("lego", "fox"), ("fox", "miku")])
+def test_other_pairs_do_not_collapse(real_data: Path, cover: str, secret: str) -> None:
+    """White and empty backgrounds, scenes without points, half rings and full domes."""
+    config = CONFIG.with_fit(iterations=1000, max_gaussians=10_000)
+    metrics = keyss.hide(
+        real_data / cover, [Secret(real_data / secret, "key")], config=config, width=160
+    ).metrics
+    assert metrics["cover"]["psnr"] > metrics["bound"]["cover"]["psnr"] - 1.5
+    assert metrics["secrets"][0]["psnr"] > metrics["bound"]["secrets"][0]["psnr"] - 3.5
+    assert metrics["wrong_key"]["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 1
