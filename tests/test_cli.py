@@ -176,7 +176,7 @@ class TestTheWholePath:
         out = tmp_path / "plain"
         said = keyss("fit", world / "a", "-o", out, *SMALL, "--width", 8)
         assert said.status == 0
-        assert "fit a: 20 iterations" in said.err
+        assert "fit a: 20 steps" in said.err
         assert str(out / "model.ply") in said.out
         assert json.loads((out / "metrics.json").read_text())["width"] == 8
 
@@ -518,7 +518,7 @@ def test_ctrl_c_saves_and_resume_ends_in_the_same_files(
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         line = process.stderr.readline()
-        while line and not line.startswith("fit b: 400 iterations"):
+        while line and not line.startswith("fit b: 400 steps"):
             line = process.stderr.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 from pathlib import Path
 
 import pytest
@@ -68,7 +69,10 @@ def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(UsageError, match="2 secrets"):
         keys([], 2)
     monkeypatch.setenv("KEYSS_KEY", "")
-    with pytest.raises(UsageError, match="empty"):
+    with pytest.raises(UsageError, match="KEYSS_KEY is empty"):
+        keys([], 1)
+    monkeypatch.setenv("KEYSS_KEY", os.fsdecode(b"\xff"))
+    with pytest.raises(UsageError, match="UTF-8"):
         keys([], 1)
 
 
@@ -107,4 +111,12 @@ class TestPrompt:
             keys([], 1, confirm=True)
         typed += [""]
         with pytest.raises(UsageError, match="empty"):
+            keys([], 1, confirm=True)
+
+    def test_an_end_of_input_is_no_key(self, typed: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+        def ctrl_d(prompt: str) -> str:
+            raise EOFError
+
+        monkeypatch.setattr(getpass, "getpass", ctrl_d)
+        with pytest.raises(UsageError, match="no key was typed"):
             keys([], 1)

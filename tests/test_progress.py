@@ -55,7 +55,7 @@ def test_plain_lines_come_now_and_then(timer: Timer) -> None:
     lines.finish()
     lines.finish()
     assert text(log).splitlines() == [
-        "hide: 300 iterations",
+        "hide: 300 steps",
         "hide: 40/300, 4.0 it/s, 1:05 left, 12,345 Gaussians, PSNR cover 25.13",
         "hide: 80/300, 4.0 it/s, 0:55 left, 12,345 Gaussians, PSNR cover 25.13",
         "hide: stopped at 100 in 0:25, 12,345 Gaussians, PSNR cover 25.13",
@@ -66,13 +66,14 @@ def test_plain_lines_of_a_resumed_run(timer: Timer) -> None:
     log = console(False)
     lines = PlainLines(log, 10.0, timer)
     lines.start("fit [x]", 300, 200)
-    timer.now += 10
-    lines.update(300, 0, {})
+    for iteration in (201, 300):
+        timer.now += 9.9
+        lines.update(iteration, 0, {})
     lines.finish()
     assert text(log).splitlines() == [
-        "fit [x]: 300 iterations, continuing at 200",
+        "fit [x]: 300 steps, continuing at 200",
         "fit [x]: 300/300, 10.0 it/s, 0:00 left",
-        "fit [x]: done in 0:10",
+        "fit [x]: done in 0:20",
     ]
 
 

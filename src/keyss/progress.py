@@ -28,8 +28,12 @@ class Speed:
     def __init__(self, iterations: int, iteration: int, now: float) -> None:
         self.iterations = iterations
         self.marks: deque[tuple[float, int]] = deque([(now, iteration)])
+        self.begun = False
 
     def note(self, iteration: int, now: float) -> None:
+        if not self.begun:  # the first step may have compiled things: it tells nothing of the speed
+            self.begun = True
+            self.marks.clear()
         self.marks.append((now, iteration))
         while len(self.marks) > 2 and self.marks[1][0] < now - _WINDOW_SECONDS:
             self.marks.popleft()
@@ -112,7 +116,7 @@ class PlainLines:
         self.last = (iteration, "")
         self.running = True
         where = f", continuing at {iteration}" if iteration else ""
-        self._say(f"{title}: {iterations} iterations{where}")
+        self._say(f"{title}: {iterations} steps{where}")
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         now = self.timer()

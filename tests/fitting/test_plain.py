@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from keyss.core import Gaussians, InputError
+from keyss.core import Gaussians, InputError, UsageError
 from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
@@ -95,3 +95,9 @@ def test_sh_degree_rises_within_a_run_of_any_length() -> None:
         config = FitConfig(iterations=iterations)
         assert config.sh_degree_at(0) == 0
         assert config.sh_degree_at(iterations) == 3
+
+
+@pytest.mark.parametrize("changes", [{"iterations": 0}, {"max_gaussians": -5}, {"sh_degree": 4}])
+def test_settings_out_of_range_are_refused_by_name(changes: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match=next(iter(changes))):
+        FitConfig(**changes)  # type: ignore[arg-type]

@@ -197,3 +197,9 @@ def test_combined_densification_scatters_and_unweights() -> None:
         [[0, 0], [28, 32], [0, 0]],
     ]
     assert combined["radii"].tolist() == [[[1, 1], [0, 0], [2, 2]], [[0, 0], [3, 3], [0, 0]]]
+
+
+def test_a_warm_start_without_opacity_in_the_mask_is_refused_and_one_from_points_is_not() -> None:
+    with pytest.raises(UsageError, match="--start points"):
+        HideConfig(mask=("xyz",))
+    assert HideConfig(mask=("xyz",), start="points").mask == ("xyz",)

@@ -29,9 +29,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
             raise UsageError(
                 f"{VARIABLE} holds one key, but there are {count} secrets: give --key-file for each"
             )
-        if not os.environ[VARIABLE]:
-            raise UsageError(f"{VARIABLE} is set but empty")
-        return [os.environ[VARIABLE]]
+        return [_checked(os.environ[VARIABLE], VARIABLE)]
     if not sys.stdin.isatty():
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal and be asked")
     return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
@@ -57,9 +55,21 @@ def key_of_file(path: Path) -> str:
 
 
 def _ask(prompt: str, confirm: bool) -> str:
-    key = getpass.getpass(f"{prompt}: ")
+    try:
+        key = getpass.getpass(f"{prompt}: ")
+        if confirm and key and getpass.getpass(f"{prompt} again: ") != key:
+            raise UsageError("the two keys differ")
+    except EOFError as error:
+        raise UsageError("no key was typed") from error
+    return _checked(key, "the key")
+
+
+def _checked(key: str, where: str) -> str:
+    """`key`, if it is text that can be encoded. Raises UsageError."""
     if not key:
-        raise UsageError("the key is empty")
-    if confirm and getpass.getpass(f"{prompt} again: ") != key:
-        raise UsageError("the two keys differ")
+        raise UsageError(f"{where} is empty")
+    try:
+        key.encode()
+    except UnicodeEncodeError as error:
+        raise UsageError(f"{where}: expected UTF-8 text, found other bytes") from error
     return key

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from keyss.core.errors import UsageError
+
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
@@ -34,6 +36,17 @@ class FitConfig:
 
     evaluate_every: int = 500
     checkpoint_seconds: float = 180.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("iterations", 1, 10**7),
+            ("max_gaussians", 16, 10**8),
+            ("sh_degree", 0, 3),
+            ("ssim_weight", 0, 1),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise UsageError(f"{name}: expected {low} to {high}, got {value}")
 
     def sh_degree_at(self, iteration: int) -> int:
         """SH degree in use: one more every 1,000 iterations or every sixth of a shorter run."""

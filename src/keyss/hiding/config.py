@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.fitting.config import FitConfig
 from keyss.hiding.mask import Mask
@@ -35,6 +36,13 @@ class HideConfig:
     distil_rate: float = 3e-3
     decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
     weight_decay: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.start == "warm" and "op" not in self.mask:
+            raise UsageError(
+                f"mask {','.join(self.mask)}: a warm start hides the secret's Gaussians by their opacity and "
+                "needs op in the mask; start from points instead (--start points)"
+            )
 
     def with_fit(self, **changes: object) -> HideConfig:
         """The same with changed fields of `fit`."""

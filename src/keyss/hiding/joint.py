@@ -24,7 +24,6 @@ from keyss.hiding.targets import CombinedPoses, PlacedScene
 from keyss.rendering import render_with_meta
 from keyss.seal.keys import random_embeddings
 
-
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
 
@@ -71,8 +70,9 @@ class JointRun:
             frequencies=config.frequencies,
             sh_degree=config.fit.sh_degree,
         )
-        torch.manual_seed(config.fit.seed)
-        self.decoder = Decoder(shape).to(device)
+        with torch.random.fork_rng():
+            torch.manual_seed(config.fit.seed)
+            self.decoder = Decoder(shape).to(device)
         self.decoder.standardise(self.gaussians())
         self.decoder_optimizer = torch.optim.AdamW(
             self.decoder.parameters(), lr=config.decoder_rate, weight_decay=config.weight_decay

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ class Hidden:
     stego: Gaussians  # to be published
     decoder: SavedDecoder
     plains: tuple[Gaussians, ...]  # plain models of the cover and the secrets, each in its own frame
-    seconds: float
+    seconds: float  # of all training, that before a resume included
 
 
 def hide_scenes(
@@ -53,7 +52,6 @@ def hide_scenes(
     """
     if len(keys) != len(scenes) - 1 or not keys:
         raise UsageError(f"expected one key for each of {len(scenes) - 1} secret(s), got {len(keys)}")
-    started = time.monotonic()
     device = torch.device(device)
     derivation = KeyDerivation(salt=_salt(scenes[0], config.fit.seed))
     derived = [DerivedKey(key, derivation) for key in keys]
@@ -76,13 +74,14 @@ def hide_scenes(
             reporter=reporter,
         )
         models.append(result.gaussians)
+        seconds += result.seconds
 
     cover_cameras = [view.camera for view in scenes[0].train]
     frames = [Similarity.identity()]
     frames += [align([view.camera for view in scene.train], cover_cameras) for scene in scenes[1:]]
     placed = [PlacedScene.of(*parts) for parts in zip(scenes, models, frames, strict=True)]
     run = JointRun(placed, [key.embedding() for key in derived], config, device)
-    train(
+    seconds += train(
         run,
         "hide",
         fingerprint={
@@ -109,7 +108,7 @@ def hide_scenes(
         ),
         anchors=choose_anchors(stego, generator),
     )
-    return Hidden(stego, saved, tuple(models), seconds + time.monotonic() - started)
+    return Hidden(stego, saved, tuple(models), seconds)
 
 
 def _salt(cover: Scene, seed: int) -> bytes:
