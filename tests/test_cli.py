@@ -233,14 +233,14 @@ class TestArguments:
         monkeypatch.setenv("KEYSS_KEY", "k")
         said = keyss(
             *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
-            *("--max-gaussians", 8, "--seed", 9, "--mask", "xyz,op", "--start", "points", "--width", 10),
+            *("--max-gaussians", 80, "--seed", 9, "--mask", "xyz,sc", "--start", "points", "--width", 10),
             *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
         )
         assert said.status == 0, said.err
         _, options = hidden[0]
         config = options.pop("config")
-        assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 8, 9)
-        assert config.mask == ("op", "xyz")
+        assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
+        assert config.mask == ("sc", "xyz")
         assert config.start == "points"
         assert config.distil_steps == HIDE_PRESETS["quick"].distil_steps
         assert options.pop("reporter") is not None
@@ -264,8 +264,8 @@ class TestArguments:
     @pytest.mark.parametrize(
         ("extra", "words"),
         [
-            (("--iterations", 0), "--iterations"),
-            (("--max-gaussians", -5), "--max-gaussians"),
+            (("--iterations", 0), "iterations"),
+            (("--max-gaussians", -5), "max_gaussians"),
             (("--seed", -1), "--seed"),
             (("--seed", 10**30), "--seed"),
             (("--mask", "op,colour"), "colour"),

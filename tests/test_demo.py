@@ -42,7 +42,7 @@ def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResu
     assert result.metrics == json.loads((out / "metrics.json").read_text())
     assert (out / "key.txt").read_text() == "demo-key-3\n"
     with Image.open(out / "comparison.png") as picture:
-        assert picture.size[0] > 5 * 320
+        assert picture.size[0] > 5 * 240
 
 
 def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def run_demo(
         refused = sum(_is_refused(out / verbs.STEGO, wrong, device) for wrong in WRONG_KEYS)
         metrics = verbs.evaluate(out, [key], seed=seed, device=device)
         picture = io.BytesIO()
-        _comparison(out, cover, secret, metrics, device).save(picture, "PNG")
+        _comparison(out, cover, secret, metrics, device).save(picture, "PNG", optimize=True)
         write_bytes(out / COMPARISON, picture.getvalue())
         write_bytes(out / KEY, f"{key}\n".encode())
         return DemoResult(metrics, refused)
@@ -162,7 +162,7 @@ def _pictures(model: Path | Gaussians, scene: Scene, device: Backend) -> list[to
 
 
 def contact_sheet(
-    columns: Sequence[tuple[str, str, Sequence[NDArray[np.uint8]]]], cell: int = 320
+    columns: Sequence[tuple[str, str, Sequence[NDArray[np.uint8]]]], cell: int = 240
 ) -> Image.Image:
     """Columns of images [H, W, 3] of one size, scaled to `cell` pixels' width, under two lines of text."""
     first = columns[0][2][0]

@@ -162,11 +162,12 @@ def hide(
             f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
         )
     config = PRESETS[preset]
-    config = replace(config, fit=_schedule(config.fit, iterations, max_gaussians, seed))
-    if mask is not None:
-        config = replace(config, mask=parse_mask(mask))
-    if start is not None:
-        config = replace(config, start=start)
+    config = replace(
+        config,
+        fit=_schedule(config.fit, iterations, max_gaussians, seed),
+        mask=config.mask if mask is None else parse_mask(mask),
+        start=start or config.start,
+    )
     models = secret_model or (None,) * len(secret)
     verbs.hide(
         cover,
@@ -294,7 +295,7 @@ def evaluate(
         run,
         keys(key_file, len(key_file) or 1),
         wrong_keys=wrong_keys,
-        seed=seed,
+        seed=_checked(seed),
         device=device,
         reporter=reporter(),
     )
@@ -340,7 +341,7 @@ def demo(
     from keyss.demo import WRONG_KEYS, run_demo
     from keyss.progress import reporter
 
-    result = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=reporter())
+    result = run_demo(out, seed=_checked(seed), device=device, overwrite=overwrite, reporter=reporter())
     print_metrics(result.metrics)
     print(f"Of {len(WRONG_KEYS)} wrong keys tried at the door, {result.refused} were refused.")
     print_files(
@@ -366,17 +367,21 @@ def _schedule(
     """The preset with what was asked for on the command line."""
     from dataclasses import replace
 
+    asked: dict[str, Any] = {
+        "iterations": iterations,
+        "max_gaussians": max_gaussians,
+        "seed": None if seed is None else _checked(seed),
+    }
+    return replace(config, **{name: value for name, value in asked.items() if value is not None})
+
+
+def _checked(seed: int) -> int:
+    """The seed, if every generator takes it. Raises UsageError."""
     from keyss.core.errors import UsageError
 
-    for option, value, low in (
-        ("--iterations", iterations, 1),
-        ("--max-gaussians", max_gaussians, 1),
-        ("--seed", seed, 0),
-    ):
-        if value is not None and not low <= value < 2**32:
-            raise UsageError(f"{option}: expected {low} to {2**32 - 1}, got {value}")
-    asked: dict[str, Any] = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": seed}
-    return replace(config, **{name: value for name, value in asked.items() if value is not None})
+    if not 0 <= seed < 2**32:
+        raise UsageError(f"--seed: expected 0 to {2**32 - 1}, got {seed}")
+    return seed
 
 
 def _metrics(folder: Path) -> dict[str, Any]:
