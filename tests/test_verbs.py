@@ -207,6 +207,9 @@ def test_a_secret_does_not_show_its_key() -> None:
 
 def test_public_api() -> None:
     """Names that programs rely on: removing one is a breaking change."""
+    assert all(hasattr(keyss, name) for name in keyss.__all__)
+    with pytest.raises(AttributeError):
+        _ = keyss.nothing
     assert set(keyss.__all__) == {
         *("Camera", "FitConfig", "Gaussians", "HideConfig", "HideResult", "KeyssError", "Scene", "Secret"),
         *("View", "WrongKeyError", "__version__", "evaluate", "fit", "generate_key", "hide", "info"),

@@ -1,21 +1,26 @@
 """Hide a 3D Gaussian Splatting scene inside another one and open it only with a key.
 
-from keyss import Secret, hide, reveal
+    from keyss import Secret, hide, reveal
 
-hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
-reveal("runs/hidden/stego.ply", key, out="treasure.ply")
+    hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
+    reveal("runs/hidden/stego.ply", key, out="treasure.ply")
+
+The names below are loaded at first use (PEP 562), so that the command line answers at once.
 """
 
-from keyss import _threads  # noqa: F401
+import importlib
+from typing import TYPE_CHECKING, Any
 
-# Everything below imports torch.
+from keyss import _threads  # noqa: F401  before anything imports torch
 from keyss._version import __version__
-from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
-from keyss.files import load_scene, read_ply, write_ply
-from keyss.fitting import FitConfig
-from keyss.hiding import HideConfig
-from keyss.seal import generate_key
-from keyss.verbs import HideResult, Secret, evaluate, fit, hide, info, render, reveal
+
+if TYPE_CHECKING:
+    from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
+    from keyss.files import load_scene, read_ply, write_ply
+    from keyss.fitting import FitConfig
+    from keyss.hiding import HideConfig
+    from keyss.seal import generate_key
+    from keyss.verbs import HideResult, Secret, evaluate, fit, hide, info, render, reveal
 
 __all__ = [
     "Camera",
@@ -40,3 +45,25 @@ __all__ = [
     "reveal",
     "write_ply",
 ]
+
+_HOMES = {
+    "keyss.core": ("Camera", "Gaussians", "KeyssError", "Scene", "View", "WrongKeyError"),
+    "keyss.files": ("load_scene", "read_ply", "write_ply"),
+    "keyss.fitting": ("FitConfig",),
+    "keyss.hiding": ("HideConfig",),
+    "keyss.seal": ("generate_key",),
+    "keyss.verbs": ("HideResult", "Secret", "evaluate", "fit", "hide", "info", "render", "reveal"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'keyss' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

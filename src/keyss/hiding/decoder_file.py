@@ -109,7 +109,7 @@ def load_decoder(path: Path | str) -> SavedDecoder:
     path = Path(path)
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large for a decoder ({path.stat().st_size} bytes)")
+            raise InputError(f"too large for a decoder ({path.stat().st_size} bytes)")
         with safetensors.safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("keyss", "null"))
             _check_version(header)
