@@ -21,7 +21,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.files.atomic import write_bytes
 from keyss.files.output import OutputFolder, check_output_file
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.ply import describe_ply, read_ply, write_ply
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
@@ -321,11 +321,15 @@ def info(path: PathLike) -> dict[str, Any]:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if path.suffix.lower() == ".ply":
+        facts = describe_ply(path)
         return {
             "kind": "3DGS model",
             "path": str(path),
-            "bytes": path.stat().st_size,
-            **_describe(read_ply(path)),
+            "bytes": facts.bytes,
+            "gaussians": facts.count,
+            "sh_degree": facts.sh_degree,
+            "bounding_box": [[round(x, 4) for x in corner] for corner in (facts.lower, facts.upper)],
+            "opacity_below_0.05": round(facts.faint_share, 4),
         }
     saved = load_decoder(path)
     return {
@@ -341,16 +345,6 @@ def info(path: PathLike) -> dict[str, Any]:
             "time_cost": saved.derivation.time_cost,
             "parallelism": saved.derivation.parallelism,
         },
-    }
-
-
-def _describe(gaussians: Gaussians) -> dict[str, Any]:
-    low, high = gaussians.means.amin(0), gaussians.means.amax(0)
-    return {
-        "gaussians": len(gaussians),
-        "sh_degree": gaussians.sh_degree,
-        "bounding_box": [[round(float(x), 4) for x in corner] for corner in (low, high)],
-        "opacity_below_0.05": round(float((gaussians.opacities < 0.05).float().mean()), 4),
     }
 
 

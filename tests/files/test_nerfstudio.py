@@ -124,7 +124,7 @@ def test_splits(tmp_path: Path) -> None:
         ({"frames": None}, "at least one frame, found nothing"),
         ({"frames": [1]}, "frame 0: expected an object, found 1"),
         ({"ply_file_path": 3}, "expected a relative `file_path`, found 3"),
-        ({"ply_file_path": "none.ply"}, "none.ply: expected a file, found nothing there"),
+        ({"ply_file_path": "none.ply"}, "none.ply: expected a .ply file, but there is no such file"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, extra: dict[str, object], message: str) -> None:

@@ -1,0 +1,202 @@
+"""The vertices of any PLY file as a table of numbers: what 3DGS models and point clouds have in common.
+
+The reader is our own because files come from strangers and the part of PLY in use is small: every length
+is checked against the file's size before anything is allocated, and whatever is wrong comes out as
+InputError. (The usual library, plyfile, is GPL besides.)
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from keyss.core.errors import InputError
+
+_MAX_HEADER_BYTES = 64 * 1024
+_MAX_HEADER_LINES = 1000
+_CHUNK_BYTES = 1 << 20
+
+_SCALARS = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
+
+
+def read_vertices(
+    path: Path | str, choose: Callable[[dict[str, str]], list[str]]
+) -> tuple[list[str], npt.NDArray[np.float32]]:
+    """The vertex properties that `choose` picks, and their values [N, len(names)] in that order.
+
+    `choose` gets the numpy codes of all scalar vertex properties by name ("f4", "u1", ...) and returns
+    names among them; it may raise InputError. Reads ascii and both binary byte orders; comments, other
+    elements and bytes after the data are ignored. Raises InputError for a file that is missing, damaged
+    or too short, and for list properties up to the vertices.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: expected a .ply file, but there is no such file")
+    try:
+        with path.open("rb") as file:
+            header = _read_header(file, path)
+            names = choose(header.vertex.properties)
+            return names, _read_rows(file, header, names, path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: dict[str, str]  # name -> numpy scalar code without byte order
+    has_list: bool = False
+
+    @property
+    def stride(self) -> int:
+        """Bytes of one row in a binary file."""
+        return sum(int(code[1]) for code in self.properties.values())
+
+
+@dataclass(frozen=True)
+class _Header:
+    byte_order: str | None  # "<", ">" or None for ascii
+    before: list[_Element]  # elements whose data precede the vertices
+    vertex: _Element
+
+
+def _read_header(file: BinaryIO, path: Path) -> _Header:
+    """Parse up to and including end_header; the file is then at the first byte of the data."""
+    lines = _header_lines(file, path)
+    if lines[0] != "ply":
+        raise InputError(f"{path}: expected a .ply file, but it does not begin with a line 'ply'")
+    byte_order: str | None = None
+    format_seen = False
+    elements: list[_Element] = []
+    for number, line in enumerate(lines[1:], start=2):
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS and not format_seen:
+                byte_order, format_seen = _BYTE_ORDERS[name], True
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
+                elements.append(_Element(name, int(count), {}))
+            case ["property", "list", size, item, _] if elements and {size, item} <= _SCALARS.keys():
+                elements[-1].has_list = True
+            case ["property", scalar, name] if (
+                elements and scalar in _SCALARS and name not in elements[-1].properties
+            ):
+                elements[-1].properties[name] = _SCALARS[scalar]
+            case _:
+                raise InputError(f"{path}: line {number} of the PLY header makes no sense: {line[:80]!r}")
+    positions = [i for i, element in enumerate(elements) if element.name == "vertex"]
+    if not format_seen or len(positions) != 1:
+        raise InputError(
+            f"{path}: expected one 'format' line and one 'element vertex' in the PLY header, "
+            f"got {int(format_seen)} and {len(positions)}"
+        )
+    before, vertex = elements[: positions[0]], elements[positions[0]]
+    for element in [*before, vertex]:
+        if element.has_list:
+            raise InputError(
+                f"{path}: element {element.name!r} has a list property, which cannot be read here"
+            )
+    return _Header(byte_order, before, vertex)
+
+
+def _header_lines(file: BinaryIO, path: Path) -> list[str]:
+    """The header's lines without their ends, end_header left out."""
+    lines: list[str] = []
+    left = _MAX_HEADER_BYTES
+    while left > 0 and len(lines) < _MAX_HEADER_LINES:
+        raw = file.readline(left)
+        left -= len(raw)
+        if not raw.endswith(b"\n") and left > 0:
+            raise InputError(f"{path}: not a whole .ply file: it ends inside the header")
+        line = raw.rstrip(b"\r\n").decode("latin-1")
+        if line == "end_header" and lines:
+            return lines
+        lines.append(line)
+        if lines[0] != "ply":
+            return lines
+    raise InputError(
+        f"{path}: the PLY header is longer than {_MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines"
+    )
+
+
+def _read_rows(file: BinaryIO, header: _Header, names: list[str], path: Path) -> npt.NDArray[np.float32]:
+    """[N, len(names)] values of the vertices. Raises InputError when the file is too short for them."""
+    vertex = header.vertex
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    if header.byte_order is None:
+        # Every value takes a digit and a separator; the file's last separator may be missing.
+        skipped = sum(element.count * len(element.properties) for element in header.before)
+        needed = 2 * (skipped + vertex.count * len(vertex.properties)) - 1
+    else:
+        skipped = sum(element.count * element.stride for element in header.before)
+        needed = skipped + vertex.count * vertex.stride
+    if needed > left:
+        raise InputError(
+            f"{path}: not a whole .ply file: the header announces {vertex.count:,} vertices, which take at "
+            f"least {needed:,} bytes, but only {left:,} follow it"
+        )
+    if header.byte_order is None:
+        return _read_ascii(file, skipped, vertex, names, path)
+    file.seek(skipped, os.SEEK_CUR)
+    return _read_binary(file, header.byte_order, vertex, names, path)
+
+
+def _read_binary(
+    file: BinaryIO, byte_order: str, vertex: _Element, names: list[str], path: Path
+) -> npt.NDArray[np.float32]:
+    offsets: dict[str, int] = {}
+    stride = 0
+    for name, code in vertex.properties.items():
+        offsets[name] = stride
+        stride += int(code[1])
+    dtype = np.dtype(
+        {
+            "names": names,
+            "formats": [byte_order + vertex.properties[name] for name in names],
+            "offsets": [offsets[name] for name in names],
+            "itemsize": stride,
+        }
+    )
+    rows = np.empty((vertex.count, len(names)), dtype=np.float32)
+    step = max(1, _CHUNK_BYTES // stride)
+    for start in range(0, vertex.count, step):
+        part = rows[start : start + step]
+        data = file.read(len(part) * stride)
+        if len(data) != len(part) * stride:
+            raise InputError(f"{path}: not a whole .ply file: it ends inside the data")
+        chunk = np.frombuffer(data, dtype=dtype)
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is reported as infinite
+            for column, name in enumerate(names):
+                part[:, column] = chunk[name]
+    return rows
+
+
+def _read_ascii(
+    file: BinaryIO, skipped: int, vertex: _Element, names: list[str], path: Path
+) -> npt.NDArray[np.float32]:
+    """The same from text, after `skipped` values. Only the order of the values matters, not the lines."""
+    width = len(vertex.properties)
+    tokens = (token for line in file for token in line.split())
+    try:
+        for _ in range(skipped):
+            next(tokens)
+        values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=vertex.count * width)
+    except (StopIteration, ValueError) as error:
+        raise InputError(f"{path}: the ascii data are cut short or hold something not a number") from error
+    order = {name: column for column, name in enumerate(vertex.properties)}
+    with np.errstate(over="ignore"):
+        return values.reshape(vertex.count, width)[:, [order[name] for name in names]].astype(np.float32)
