@@ -259,7 +259,7 @@ def test_damaged_plys_are_refused_or_read(tmp_path: Path, kind: str) -> None:
     whole = len(data) if "binary" in kind else len(data.rstrip()) - len(b" 9")
     for length in range(whole):
         path.write_bytes(data[:length])
-        with pytest.raises(InputError, match=r"a\.ply: expected"):
+        with pytest.raises(InputError, match=r"a\.ply: "):
             read_point_cloud(path)
     outcomes = set()
     for broken in mutations(data, 300):
@@ -275,15 +275,15 @@ def test_damaged_plys_are_refused_or_read(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("vertex 3", "vertex 99999999999999999999999", "expected 9+ vertices"),
-        ("vertex 3", "vertex -3", "the vertices as first element"),
-        ("element vertex 3", "element face 1\nelement vertex 3", "the vertices as first element"),
-        ("ascii", "utf-8", "a format and the vertices"),
+        ("vertex 3", "vertex 99999999999999999999999", "line 4 of the PLY header"),
+        ("vertex 3", "vertex -3", "line 4 of the PLY header"),
+        ("vertex 3", "vertex 300000000000", "header announces 300,000,000,000 vertices"),
+        ("ascii", "utf-8", "line 2 of the PLY header"),
         ("property float z", "property float w", "expected vertices with x, y and z"),
-        ("property float z", "property float x", "a format and the vertices"),
-        ("property float z", "property list uchar float z", "scalar vertex properties"),
+        ("property float z", "property float x", "line 7 of the PLY header"),
+        ("property float z", "property list uchar float z", "has a list property"),
         ("property uchar red", "property float red", "red, green and blue of type uchar"),
-        ("end_header", "end", "with a header"),
+        ("end_header", "end", "ends inside the header"),
     ],
 )
 def test_what_is_wrong_with_a_ply_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
