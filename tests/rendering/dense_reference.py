@@ -61,8 +61,10 @@ def dense_rasterization(
     near_plane: float = 0.01,
     eps2d: float = 0.3,
     shifts: Tensor | None = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image [H, W, 3], alpha [H, W], and a mask [H, W] of the pixels where no decision was a close call.
+    """Image [H, W, D], alpha [H, W], and a mask [H, W] of the pixels where no decision was a close call.
 
     All inputs float64; a colour is SH coefficients where sh_degree is given. `shifts` [N, H * W, 2] moves
     each projected centre as each pixel sees it: its gradient is that of means2d, pixel by pixel.
@@ -85,8 +87,21 @@ def dense_rasterization(
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
     half = jacobian @ rotation @ rotation_matrices(quats[order]) @ torch.diag_embed(scales[order])
-    covariance = half @ half.mT + eps2d * torch.eye(2, dtype=means.dtype)
+    sharp = half @ half.mT
+    covariance = sharp + eps2d * torch.eye(2, dtype=means.dtype)
     conic = torch.linalg.inv(covariance)
+    opacities = opacities[order]
+    if rasterize_mode == "antialiased":
+        opacities = opacities * (torch.linalg.det(sharp) / torch.linalg.det(covariance)).sqrt()
+    depth = in_camera[order, 2:]
+    colors, background = {
+        "RGB": lambda: (colors[order], background),
+        "D": lambda: (depth, background.new_zeros(1)),
+        "RGB+D": lambda: (
+            torch.cat([colors[order], depth], -1),
+            torch.cat([background, background.new_zeros(1)]),
+        ),
+    }[render_mode.replace("ED", "D")]()
 
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([columns, rows], -1).to(means).reshape(-1, 2)
@@ -95,7 +110,7 @@ def dense_rasterization(
     if shifts is not None:
         offsets = offsets - shifts[order]
     sigma = 0.5 * torch.einsum("npi,nij,npj->np", offsets, conic, offsets)
-    footprint = opacities[order, None] * torch.exp(-sigma)
+    footprint = opacities[:, None] * torch.exp(-sigma)
     alpha = torch.where(footprint >= ALPHA_MIN, footprint.clamp_max(ALPHA_MAX), 0.0)
     after = torch.cumprod(1 - alpha, 0)
     drawn = after > TRANSMITTANCE_MIN
@@ -103,7 +118,9 @@ def dense_rasterization(
     after = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
     last = torch.cat([torch.ones_like(before[:1]), after])[-1] if len(after) else pixels.new_ones(len(pixels))
-    image = (alpha * before).mT @ colors[order] + last[:, None] * background
+    image = (alpha * before).mT @ colors + last[:, None] * background
+    if render_mode.endswith("ED"):
+        image = torch.cat([image[:, :-1], image[:, -1:] / (1 - last[:, None]).clamp_min(1e-10)], -1)
 
     def near(values: Tensor, threshold: float) -> Tensor:
         return ((values / threshold - 1).abs() < 3e-4).any(0)
@@ -111,4 +128,4 @@ def dense_rasterization(
     unstopped = torch.cumprod(1 - torch.where(footprint >= ALPHA_MIN, footprint.clamp_max(ALPHA_MAX), 0.0), 0)
     close_call = near(footprint, ALPHA_MIN) | near(footprint, ALPHA_MAX) | near(unstopped, TRANSMITTANCE_MIN)
     shape = (height, width)
-    return image.reshape(*shape, 3), (1 - last).reshape(shape), ~close_call.reshape(shape)
+    return image.reshape(*shape, -1), (1 - last).reshape(shape), ~close_call.reshape(shape)

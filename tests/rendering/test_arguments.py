@@ -51,6 +51,9 @@ def good_arguments() -> dict[str, Any]:
         ("eps2d", 0.1),
         ("eps2d", float("nan")),
         ("sh_degree", 4),
+        ("render_mode", "RGB+DEPTH"),
+        ("rasterize_mode", "sharp"),
+        ("backgrounds", torch.zeros(1, 4)),
     ],
 )
 def test_wrong_shapes_and_values(name: str, value: object) -> None:
@@ -68,9 +71,8 @@ def test_sh_degree_needs_its_coefficients() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("render_mode", "RGB+ED"),
-        ("rasterize_mode", "antialiased"),
-        ("colors", torch.ones(2, 8)),
+        ("colors", torch.ones(2, 33)),
+        ("colors", torch.ones(2, 0)),
     ],
 )
 def test_what_is_not_supported_is_named(name: str, value: object) -> None:

@@ -36,12 +36,15 @@ def test_backends_agree(name: str, cuda: torch.device) -> None:
             sh_degree=scene.sh_degree,
             backgrounds=inputs[6][None],
             absgrad=True,
+            render_mode=scene.render_mode,
+            rasterize_mode=scene.rasterize_mode,
         )
         meta["means2d"].retain_grad()
         generator = torch.Generator().manual_seed(0)
         weights = torch.randn(images.shape, generator=generator).to(device)
         ((images * weights).sum() + (alphas * weights[..., :1]).sum()).backward()
-        gradients = [leaf.grad for leaf in leaves]
+        # The colours have none where only depths are drawn.
+        gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
         means2d = meta["means2d"]
         seen = (meta["radii"] > 0).all(-1, keepdim=True)
         gradients += [means2d.grad * seen, means2d.absgrad * seen]
@@ -49,7 +52,7 @@ def test_backends_agree(name: str, cuda: torch.device) -> None:
     ours, theirs = results
     # A contribution of 1/255 may come or go by rounding, at few pixels.
     for mine, other in zip(ours[:2], theirs[:2], strict=True):
-        different = (mine - other).abs().amax(-1) > 1e-4
+        different = (mine - other).abs().amax(-1) > 1e-4 * max(1.0, float(other.abs().max()))
         assert different.float().mean() <= 0.01
     assert ((ours[2] > 0) == (theirs[2] > 0)).float().mean() > 0.99
     for input_name, mine, other in zip(

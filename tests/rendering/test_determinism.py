@@ -33,8 +33,10 @@ def forward_and_backward(scene: ToyScene) -> list[Tensor]:
         scene.width,
         scene.height,
         sh_degree=scene.sh_degree,
-        backgrounds=inputs[6].expand(2, 3),
+        backgrounds=inputs[6].expand(2, -1),
         absgrad=True,
+        render_mode=scene.render_mode,
+        rasterize_mode=scene.rasterize_mode,
     )
     generator = torch.Generator().manual_seed(1)
     weights = torch.randn(images.shape, generator=generator)
@@ -48,8 +50,16 @@ def same(first: list[Tensor], second: list[Tensor]) -> bool:
     return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_results_do_not_depend_on_the_run_or_the_number_of_threads() -> None:
-    scene = toy_scene(count=7000, width=150, height=130, size=0.05)
+@pytest.mark.parametrize(
+    "scene",
+    [
+        toy_scene(count=7000, width=150, height=130, size=0.05),
+        toy_scene(count=7000, width=150, height=130, size=0.05, sh_degree=None, channels=7),
+        toy_scene(3000, 150, 130, size=0.05, render_mode="RGB+ED", rasterize_mode="antialiased"),
+    ],
+    ids=["colour", "features", "antialiased colour and depth"],
+)
+def test_results_do_not_depend_on_the_run_or_the_number_of_threads(scene: ToyScene) -> None:
     torch.set_num_threads(1)
     expected = forward_and_backward(scene)
     assert all(tensor.isfinite().all() for tensor in expected)

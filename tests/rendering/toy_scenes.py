@@ -18,13 +18,15 @@ class ToyScene:
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-    colors: Tensor  # [N, 16, 3], or [N, 3] where sh_degree is None
+    colors: Tensor  # [N, 16, 3], or [N, D] where sh_degree is None
     viewmat: Tensor
     K: Tensor
     width: int
     height: int
     background: Tensor
     sh_degree: int | None
+    render_mode: str = "RGB"
+    rasterize_mode: str = "classic"
 
     def tensors(self, dtype: torch.dtype) -> list[Tensor]:
         """Fresh leaves of the seven differentiable inputs."""
@@ -43,6 +45,9 @@ def toy_scene(
     height: int = 40,
     *,
     sh_degree: int | None = 3,
+    channels: int = 3,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
     distance: float = 4.0,
     spread: float = 1.0,
     size: float = 0.1,
@@ -70,13 +75,15 @@ def toy_scene(
         quats=normal(count, 4),
         scales=size * (0.3 * normal(count, 3)).exp(),
         opacities=0.05 + 0.9 * uniform(count),
-        colors=uniform(count, 3) if sh_degree is None else 0.3 * normal(count, 16, 3),
+        colors=uniform(count, channels) if sh_degree is None else 0.3 * normal(count, 16, 3),
         viewmat=viewmat,
         K=K,
         width=width,
         height=height,
-        background=uniform(3),
+        background=uniform(channels),
         sh_degree=sh_degree,
+        render_mode=render_mode,
+        rasterize_mode=rasterize_mode,
     )
     # The nearest float32 numbers, so that both precisions see the same scene.
     for name in (*INPUT_NAMES, "K"):
@@ -106,9 +113,34 @@ def specks() -> ToyScene:
     return toy_scene(count=200, size=1e-4, seed=3)
 
 
-def around_the_camera() -> ToyScene:
+def around_the_camera(*, render_mode: str = "RGB", rasterize_mode: str = "classic") -> ToyScene:
     """Behind, across and just before the near plane, and far outside the image."""
-    return toy_scene(count=150, distance=0.2, spread=1.5, size=0.15, seed=4)
+    return toy_scene(
+        count=150,
+        distance=0.2,
+        spread=1.5,
+        size=0.15,
+        seed=4,
+        render_mode=render_mode,
+        rasterize_mode=rasterize_mode,
+    )
+
+
+def antialiased_needles() -> ToyScene:
+    """So thin that most are too faint to be drawn, and the gradient of the compensation is steep."""
+    scene = needles()
+    scene.rasterize_mode = "antialiased"
+    scene.scales = (scene.scales * torch.tensor([1.0, 10.0, 10.0])).float().double()
+    return scene
+
+
+def opaque_wall_of_features() -> ToyScene:
+    """Pixels that stop early, and alphas at the clamp, with many channels and the depth."""
+    wall = opaque_wall()
+    features = toy_scene(count=80, sh_degree=None, channels=5, render_mode="RGB+D")
+    wall.colors, wall.background = features.colors, features.background
+    wall.sh_degree, wall.render_mode = None, "RGB+D"
+    return wall
 
 
 SCENES: dict[str, Callable[[], ToyScene]] = {
@@ -124,4 +156,17 @@ SCENES: dict[str, Callable[[], ToyScene]] = {
     "degree 1": lambda: toy_scene(sh_degree=1, seed=9),
     "degree 2": lambda: toy_scene(sh_degree=2, seed=10),
     "rgb": lambda: toy_scene(sh_degree=None, seed=11),
+    "one channel": lambda: toy_scene(sh_degree=None, channels=1, seed=12),
+    "two channels and slim": lambda: toy_scene(width=7, height=101, sh_degree=None, channels=2, seed=13),
+    "32 channels": lambda: toy_scene(sh_degree=None, channels=32, seed=14),
+    "features and depth": opaque_wall_of_features,
+    "depth": lambda: around_the_camera(render_mode="D"),
+    "expected depth": lambda: toy_scene(render_mode="ED", seed=15),
+    "colour and depth": lambda: toy_scene(render_mode="RGB+D", seed=16),
+    "colour and expected depth": lambda: toy_scene(sh_degree=1, render_mode="RGB+ED", seed=17),
+    "antialiased": lambda: toy_scene(size=0.03, rasterize_mode="antialiased", seed=18),
+    "antialiased needles": antialiased_needles,
+    "antialiased around the camera": lambda: around_the_camera(
+        render_mode="RGB+ED", rasterize_mode="antialiased"
+    ),
 }

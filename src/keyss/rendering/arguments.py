@@ -8,6 +8,9 @@ from keyss.core import UsageError
 from keyss.rendering.cpu.layout import EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
+MAX_CHANNELS = 32
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
 
 
 def check_arguments(
@@ -29,10 +32,12 @@ def check_arguments(
     rasterize_mode: str,
 ) -> None:
     """Raise ValueError for a wrong shape or value, UsageError for what is not supported."""
-    if render_mode != "RGB":
-        raise UsageError(f"render_mode: only 'RGB' is supported, got {render_mode!r}")
-    if rasterize_mode != "classic":
-        raise UsageError(f"rasterize_mode: only 'classic' is supported, got {rasterize_mode!r}")
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode: expected one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
+    if rasterize_mode not in RASTERIZE_MODES:
+        raise ValueError(
+            f"rasterize_mode: expected one of {', '.join(RASTERIZE_MODES)}, got {rasterize_mode!r}"
+        )
     if means.dim() != 2 or viewmats.dim() != 3:
         raise ValueError(
             f"expected means [N, 3] and viewmats [C, 4, 4] without batch dimensions, "
@@ -45,12 +50,12 @@ def check_arguments(
     _check_shape("opacities", opacities, count)
     _check_shape("viewmats", viewmats, cameras, 4, 4)
     _check_shape("Ks", Ks, cameras, 3, 3)
-    if backgrounds is not None:
-        _check_shape("backgrounds", backgrounds, cameras, 3)
     if sh_degree is None:
-        if colors.dim() == 2 and colors.shape[0] == count and colors.shape[1] != 3:
-            raise UsageError(f"colors: only 3 channels are supported, got {list(colors.shape)}")
-        _check_shape("colors", colors, count, 3)
+        if colors.dim() != 2:
+            raise ValueError(f"colors: expected shape [{count}, D], got {list(colors.shape)}")
+        _check_shape("colors", colors, count, colors.shape[1])
+        if not 1 <= colors.shape[1] <= MAX_CHANNELS:
+            raise UsageError(f"colors: 1 to {MAX_CHANNELS} channels are supported, got {list(colors.shape)}")
     else:
         if sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree: expected 0, 1, 2, 3 or None, got {sh_degree!r}")
@@ -62,6 +67,8 @@ def check_arguments(
                 f"colors: sh_degree {sh_degree} needs at least {(sh_degree + 1) ** 2} coefficients, "
                 f"got {list(colors.shape)}"
             )
+    if backgrounds is not None:
+        _check_shape("backgrounds", backgrounds, cameras, colors.shape[-1])
     for name, tensor in (
         ("means", means),
         ("quats", quats),

@@ -20,7 +20,7 @@ def rasterization(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, K, 3] or [N, 3]
+    colors: Tensor,  # [N, K, 3] or [N, D]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     width: int,
@@ -31,7 +31,7 @@ def rasterization(
     radius_clip: float = 0.0,
     eps2d: float = EPS2D_MIN,
     sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,  # [C, 3]
+    backgrounds: Tensor | None = None,  # [C, D]
     absgrad: bool = False,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
@@ -46,7 +46,7 @@ def rasterization(
         scales: standard deviations, positive.
         opacities: in [0, 1].
         colors: SH coefficients where `sh_degree` is given, with colour = max(0.5 + basis . colors, 0);
-            else RGB.
+            else 1 to 32 channels of anything, drawn as they are.
         viewmats: world to camera, rigid motions, OpenCV axes.
         Ks: pinhole intrinsics in pixels, without skew; pixel centres lie at half-integers.
         width: pixels.
@@ -58,14 +58,18 @@ def rasterization(
         sh_degree: degree up to which to use the SH coefficients, 0 to 3, with K >= (sh_degree + 1)^2.
         backgrounds: colour behind everything; black when None.
         absgrad: also sum absolute gradients into `meta["means2d"].absgrad` (AbsGS).
-        render_mode: "RGB".
-        rasterize_mode: "classic".
+        render_mode: what the channels of the image are: "RGB", the colours; "D", the depths along the
+            camera's axis, accumulated like a colour; "ED", the expected depth: that divided by alpha; or
+            "RGB+D" and "RGB+ED", the colours and then the depth. Behind everything the depth is 0.
+        rasterize_mode: "classic"; or "antialiased", where opacities are multiplied by
+            sqrt(det(S) / det(S + eps2d I)) with the covariance S of the footprint in the image, so that
+            small Gaussians do not grow brighter by being widened (Mip-Splatting, Yu et al. 2024).
 
     Returns:
-        Images [C, H, W, 3], not clamped above; alphas [C, H, W, 1] in [0, 1]; and a dictionary with what
-        gsplat's strategies read: means2d [C, N, 2] in pixels (after backward its `.grad` holds
-        dL/d(means2d)), radii [C, N, 2] int32 in pixels (0 where not drawn), depths [C, N], width, height,
-        n_cameras, gaussian_ids (None: nothing is packed).
+        Images [C, H, W, D], with D as `render_mode` says, not clamped above; alphas [C, H, W, 1] in [0, 1];
+        and a dictionary with what gsplat's strategies read: means2d [C, N, 2] in pixels (after backward its
+        `.grad` holds dL/d(means2d)), radii [C, N, 2] int32 in pixels (0 where not drawn), depths [C, N],
+        width, height, n_cameras, gaussian_ids (None: nothing is packed).
 
     On the CPU there are gradients to all tensors but Ks, everything is computed in float32 and is
     bit-identical from run to run and for any number of threads, Gaussians that are not finite are not
@@ -73,7 +77,7 @@ def rasterization(
 
     Raises:
         ValueError: a shape, dtype or number is not as above.
-        UsageError: a render mode, number of channels or device that is not supported.
+        UsageError: a number of channels or a device that is not supported.
         BackendError: gsplat's CUDA kernels are missing, or memory for the lists of tiles is out of reach.
     """
     check_arguments(
@@ -98,9 +102,16 @@ def rasterization(
             sh_degree=sh_degree,
             backgrounds=backgrounds,
             absgrad=absgrad,
+            render_mode=render_mode,
+            rasterize_mode=rasterize_mode,
         )
     if means.device.type != "cpu":
         raise UsageError(f"means: only tensors on 'cpu' or 'cuda' can be drawn, got {means.device}")
+    with_colors, with_depth = render_mode.startswith("RGB"), render_mode.endswith("D")
+    if sh_degree is None:
+        colors = colors[:, None]
+    if not with_colors:
+        colors, sh_degree = colors.new_empty(len(means), 1, 0), None
     settings = Settings(
         width=int(width),
         height=int(height),
@@ -109,19 +120,25 @@ def rasterization(
         radius_clip=radius_clip,
         eps2d=eps2d,
         sh_count=0 if sh_degree is None else (sh_degree + 1) ** 2,
+        color_channels=colors.shape[2],
+        with_depth=with_depth,
+        antialiased=rasterize_mode == "antialiased",
         absgrad=absgrad,
     )
-    if backgrounds is None:
-        backgrounds = torch.zeros(len(viewmats), 3)
+    if backgrounds is None or not with_colors:
+        backgrounds = torch.zeros(len(viewmats), settings.channels)
+    elif with_depth:
+        backgrounds = torch.nn.functional.pad(backgrounds, (0, 1))
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = (
         tensor.float().contiguous() for tensor in tensors
     )
-    if sh_degree is None:
-        colors = colors[:, None]
     images, alphas, meta = rasterize_on_cpu(
         means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, settings
     )
+    if render_mode.endswith("ED"):
+        depths = images[..., -1:] / alphas.clamp_min(1e-10)
+        images = torch.cat([images[..., :-1], depths], dim=-1)
     meta.update(
         width=settings.width,
         height=settings.height,

@@ -82,6 +82,37 @@ SCALED_TRANSMITTANCE_MIN = TRANSMITTANCE_MIN * INVERSE
 
 
 @finite_kernel
+def footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity):
+    """The footprint, times 2^64, `dy` rows below the centre, and its ratio to that one row further down."""
+    footprint = exp_times_2_64(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
+    return footprint, exp(exponent_1 + yy * (dy + dy + ONE))
+
+
+@finite_kernel
+def blend_row(planes, k, footprint):
+    """Let a row of a footprint dim the transmittance at planes[k:k + 8].
+
+    Returns alpha (times 2^64) and alpha times the transmittance before, both 0 where nothing is drawn.
+    """
+    alpha = select_ge(footprint, SCALED_ALPHA_MIN, minimum(footprint, SCALED_ALPHA_MAX), ZERO)
+    before = load8(planes, k)
+    weight = alpha * maximum(before, ZERO)
+    after = multiply_add(weight, -INVERSE, before)
+    store8(planes, k, select_gt(after, SCALED_TRANSMITTANCE_MIN, after, negative_abs(before)))
+    alpha = select_gt(after, SCALED_TRANSMITTANCE_MIN, alpha, ZERO)
+    return alpha, select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
+
+
+@finite_kernel
+def has_stopped(planes):
+    """Whether no pixel of the tile lets anything more through."""
+    most = load8(planes, 0)
+    for k in range(8, TILE_PIXELS, 8):
+        most = maximum(most, load8(planes, k))
+    return not any_gt(most, SCALED_TRANSMITTANCE_MIN)
+
+
+@finite_kernel
 def _blend_tile(packed, ranks, start, end, left, top, height, planes):
     """Blend entries start..end of the list into planes = [transmittance | red | green | blue].
 
@@ -114,17 +145,11 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
             exponent_1 = dx * at(packed, g + XY)
             for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
                 dy = f32(anchor) - y
-                footprint = exp_times_2_64(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
-                ratio = exp(exponent_1 + yy * (dy + dy + ONE))
+                footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
                 for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
-                    alpha = select_ge(footprint, SCALED_ALPHA_MIN, minimum(footprint, SCALED_ALPHA_MAX), ZERO)
+                    _, weight = blend_row(planes, k, footprint)
                     footprint = footprint * ratio
                     ratio = ratio * decay
-                    before = load8(planes, k)
-                    weight = alpha * maximum(before, ZERO)
-                    after = multiply_add(weight, -INVERSE, before)
-                    store8(planes, k, select_gt(after, SCALED_TRANSMITTANCE_MIN, after, negative_abs(before)))
-                    weight = select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
                     p = k + TILE_PIXELS
                     store8(planes, p, multiply_add(weight, red, load8(planes, p)))
                     p = k + 2 * TILE_PIXELS
@@ -132,10 +157,7 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
                     p = k + 3 * TILE_PIXELS
                     store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
         entry = check
-        most = load8(planes, 0)
-        for k in range(8, TILE_PIXELS, 8):
-            most = maximum(most, load8(planes, k))
-        if not any_gt(most, SCALED_TRANSMITTANCE_MIN):
+        if has_stopped(planes):
             break
     return entry
 
@@ -144,6 +166,7 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
 def blend(
     counter,
     packed,
+    _,
     tile_ranks,
     tile_starts,
     tile_columns,
@@ -221,17 +244,10 @@ def _blend_tile_backward(
         sum_abs_y = zero
         for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
             dy = f32(anchor) - y
-            footprint = exp_times_2_64(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
-            ratio = exp(exponent_1 + yy * (dy + dy + ONE))
+            footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
             row_dy = splat(dy)
             for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
-                alpha = select_ge(footprint, SCALED_ALPHA_MIN, minimum(footprint, SCALED_ALPHA_MAX), ZERO)
-                before = load8(planes, k)
-                weight = alpha * maximum(before, ZERO)
-                after = multiply_add(weight, -INVERSE, before)
-                store8(planes, k, select_gt(after, SCALED_TRANSMITTANCE_MIN, after, negative_abs(before)))
-                alpha = select_gt(after, SCALED_TRANSMITTANCE_MIN, alpha, ZERO)
-                weight = select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
+                alpha, weight = blend_row(planes, k, footprint)
                 gradient_red = load8(planes, k + 2 * TILE_PIXELS)
                 gradient_green = load8(planes, k + 3 * TILE_PIXELS)
                 gradient_blue = load8(planes, k + 4 * TILE_PIXELS)
@@ -275,6 +291,7 @@ def _blend_tile_backward(
 def blend_backward(
     counter,
     packed,
+    _,
     tile_ranks,
     tile_slots,
     tile_starts,

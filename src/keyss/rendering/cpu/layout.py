@@ -36,8 +36,9 @@ EXTENT_Y = 11
 DECAY = 12  # exp(2 YY), the ratio of successive ratios down a column
 
 # The record of sums over one (Gaussian, tile) pair that the backward pass leaves: with s = dL/d(-sigma),
-# sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient, one vector; then blue,
-# and for absgrad the sums of |dL/dx| and |dL/dy|.
+# sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient, one vector. Then come the
+# extras: the sum of the blue gradient (where features are drawn: of each channel's, and those for red and
+# green stay 0), and for absgrad the sums of |dL/dx| and |dL/dy|.
 MOMENTS = 8
 
 # The camera array: rotation (row-major, 0 to 8), translation, then these and the position in the world.

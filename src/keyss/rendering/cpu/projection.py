@@ -106,6 +106,7 @@ def project(
     far,
     eps2d,
     radius_clip,
+    antialiased,
     footprints,
     means2d,
     depths,
@@ -113,7 +114,9 @@ def project(
 ):
     """Fill one row per Gaussian of `footprints` (packed layout without colour), means2d, depths and radii.
 
-    A Gaussian that cannot be seen gets depth 0 and radii 0; its footprint is left as it is.
+    A Gaussian that cannot be seen gets depth 0 and radii 0; its footprint is left as it is. With
+    `antialiased` the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that widening a
+    footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
     """
     count = means.shape[0]
     image_width = f32(width)
@@ -177,9 +180,14 @@ def project(
             n0 = u1 * v2 - u2 * v1
             n1 = u2 * v0 - u0 * v2
             n2 = u0 * v1 - u1 * v0
-            det = n0 * n0 + n1 * n1 + n2 * n2 + eps2d * (cov_xx + cov_yy + eps2d)
+            sharp_det = n0 * n0 + n1 * n1 + n2 * n2
+            det = sharp_det + eps2d * (cov_xx + cov_yy + eps2d)
             if not det < HUGE:
                 continue
+            if antialiased:
+                opacity *= math.sqrt(sharp_det / det)
+                if not opacity >= ALPHA_MIN:
+                    continue
             cov_xx += eps2d
             cov_yy += eps2d
             level = max(TWO * math.log(f32(255.0) * opacity), ZERO)
@@ -227,18 +235,23 @@ def pack(
     camera,
     tile_columns,
     tile_rows,
+    depths,
     rank,
     radii,
     packed,
+    features,
     tile_bounds,
 ):
     """Copy the footprints of visible Gaussians into depth order, with their colours as seen from the camera.
 
     sh_count is the number of SH coefficients to use, or 0 where colors[:, 0] is the colour itself.
-    tile_bounds[r] becomes a number of tiles that Gaussian r of the depth order meets at most. A Gaussian
-    without a finite colour is hidden: its rank becomes -1, its radii and extents are made empty.
+    Where `features` has columns, it gets the channels to draw: the colour, of any number of channels, and
+    in one column more the depth. tile_bounds[r] becomes a number of tiles that Gaussian r of the depth
+    order meets at most. A Gaussian without a finite colour is hidden: its rank becomes -1, its radii and
+    extents are made empty.
     """
     count = rank.shape[0]
+    channels = features.shape[1]
     basis = np.empty(16, np.float32)
     while True:
         start = fetch_add(counter, 0, 1) * CHUNK
@@ -251,7 +264,15 @@ def pack(
                 continue
             for k in range(DECAY + 1):
                 packed[r, k] = footprints[i, k]
-            if sh_count == 0:
+            finite = True
+            red = ZERO
+            green = ZERO
+            blue = ZERO
+            if sh_count == 0 and channels > 0:
+                for channel in range(colors.shape[2]):
+                    finite = finite and abs(colors[i, 0, channel]) < HUGE
+                    features[r, channel] = colors[i, 0, channel]
+            elif sh_count == 0:
                 red = colors[i, 0, 0]
                 green = colors[i, 0, 1]
                 blue = colors[i, 0, 2]
@@ -268,7 +289,7 @@ def pack(
                     red += basis[k] * colors[i, k, 0]
                     green += basis[k] * colors[i, k, 1]
                     blue += basis[k] * colors[i, k, 2]
-            if not (abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE):
+            if not (finite and abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE):
                 rank[i] = -1
                 radii[i, 0] = 0
                 radii[i, 1] = 0
@@ -280,6 +301,12 @@ def pack(
                 red = max(red, ZERO)
                 green = max(green, ZERO)
                 blue = max(blue, ZERO)
+                if channels > 0:
+                    features[r, 0] = red
+                    features[r, 1] = green
+                    features[r, 2] = blue
+            if channels > colors.shape[2]:
+                features[r, channels - 1] = depths[i]
             packed[r, RED] = red
             packed[r, GREEN] = green
             packed[r, BLUE] = blue

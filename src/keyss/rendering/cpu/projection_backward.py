@@ -49,6 +49,8 @@ def project_backward(
     camera,
     width,
     height,
+    antialiased,
+    channels,
     rank,
     packed,
     first_slots,
@@ -72,7 +74,9 @@ def project_backward(
 
     means2d_gradient and means2d_absgrad are of this camera only. camera_gradient has one row per piece of
     work: the sums over its Gaussians for rotation (9), translation (3) and position (3). With need_colors
-    or need_camera false, colors_gradient or camera_gradient is not touched.
+    or need_camera false, colors_gradient or camera_gradient is not touched. `channels` is 0 after `blend`,
+    and the number of channels after `blend_features`: those of the colours, and one for the depth where
+    there is one more.
     """
     count = means.shape[0]
     x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
@@ -81,6 +85,9 @@ def project_backward(
     basis = np.empty(16, np.float32)
     basis_gradient = np.empty(16, np.float32)
     camera_sums = np.empty(15, np.float64)
+    channel_sums = np.empty(channels, np.float32)
+    with_depth = channels > colors.shape[2]
+    abs_x = extra_width - 2
     while True:
         piece = fetch_add(counter, 0, 1)
         if piece * CHUNK >= count:
@@ -101,9 +108,13 @@ def project_backward(
                     quats_gradient[i, k] = ZERO
                 opacities_gradient[i] = ZERO
                 if need_colors:
-                    for k in range(sh_count if seen else 0, colors.shape[1]):
-                        for channel in range(3):
-                            colors_gradient[i, k, channel] = ZERO
+                    if channels > 0 and sh_count == 0:
+                        for channel in range(colors.shape[2]):
+                            colors_gradient[i, 0, channel] = ZERO
+                    else:
+                        for k in range(sh_count if seen else 0, colors.shape[1]):
+                            for channel in range(3):
+                                colors_gradient[i, k, channel] = ZERO
             means2d_gradient[i, 0] = ZERO
             means2d_gradient[i, 1] = ZERO
             if absgrad:
@@ -118,8 +129,8 @@ def project_backward(
                 sums = sums + load8(moments, slot * MOMENTS)
                 blue += at(extras, slot * extra_width)
                 if absgrad:
-                    means2d_absgrad[i, 0] += at(extras, slot * extra_width + 1)
-                    means2d_absgrad[i, 1] += at(extras, slot * extra_width + 2)
+                    means2d_absgrad[i, 0] += at(extras, slot * extra_width + abs_x)
+                    means2d_absgrad[i, 1] += at(extras, slot * extra_width + abs_x + 1)
             s_1 = lane(sums, 0)
             s_x = lane(sums, 1)
             s_y = lane(sums, 2)
@@ -128,6 +139,16 @@ def project_backward(
             s_yy = lane(sums, 5)
             red = lane(sums, 6)
             green = lane(sums, 7)
+            if channels > 0:
+                for channel in range(channels):
+                    total = ZERO
+                    for slot in range(first_slots[i], first_slots[i + 1]):
+                        total += at(extras, slot * extra_width + channel)
+                    channel_sums[channel] = total
+                if sh_count > 0:
+                    red = channel_sums[0]
+                    green = channel_sums[1]
+                    blue = channel_sums[2]
             opacities_gradient[i] += s_1 / opacities[i]
             conic_xx = -TWO * packed[r, XX]
             conic_xy = -packed[r, XY]
@@ -182,6 +203,20 @@ def project_backward(
             q0 = b0 * r00 + b1 * r10 + b2 * r20
             q1 = b0 * r01 + b1 * r11 + b2 * r21
             q2 = b0 * r02 + b1 * r12 + b2 * r22
+
+            if antialiased:
+                # The opacity drawn is opacity sqrt(det(V V^T) / det(covariance)), and s_1 the gradient of
+                # its logarithm; d(log det M) = M^-1. Nothing with a vanishing determinant was drawn.
+                sharp_xx = p0 * p0 * s0 * s0 + p1 * p1 * s1 * s1 + p2 * p2 * s2 * s2
+                sharp_xy = p0 * q0 * s0 * s0 + p1 * q1 * s1 * s1 + p2 * q2 * s2 * s2
+                sharp_yy = q0 * q0 * s0 * s0 + q1 * q1 * s1 * s1 + q2 * q2 * s2 * s2
+                n0 = (p1 * q2 - p2 * q1) * s1 * s2
+                n1 = (p2 * q0 - p0 * q2) * s2 * s0
+                n2 = (p0 * q1 - p1 * q0) * s0 * s1
+                inverse = ONE / max(n0 * n0 + n1 * n1 + n2 * n2, NORM_MIN)
+                cov_xx += HALF * s_1 * (sharp_yy * inverse - conic_xx)
+                cov_xy -= HALF * s_1 * (sharp_xy * inverse + conic_xy)
+                cov_yy += HALF * s_1 * (sharp_xx * inverse - conic_yy)
 
             # dL/dV = 2 dL/d(covariance) V, then scales, rotation and the rows of J W.
             du0 = TWO * (cov_xx * p0 + cov_xy * q0) * s0
@@ -249,6 +284,8 @@ def project_backward(
                 tz += TWO * djyz * jyy * slope_y * rz
             else:
                 tz += djyz * jyy * clamped_y * rz
+            if with_depth:
+                tz += channel_sums[channels - 1]
             gx = camera[0] * tx + camera[3] * ty + camera[6] * tz
             gy = camera[1] * tx + camera[4] * ty + camera[7] * tz
             gz = camera[2] * tx + camera[5] * ty + camera[8] * tz
@@ -266,7 +303,11 @@ def project_backward(
                 camera_sums[10] += ty
                 camera_sums[11] += tz
 
-            if sh_count == 0:
+            if sh_count == 0 and channels > 0:
+                if need_colors:
+                    for channel in range(colors.shape[2]):
+                        colors_gradient[i, 0, channel] += channel_sums[channel]
+            elif sh_count == 0:
                 if need_colors:
                     colors_gradient[i, 0, 0] += red
                     colors_gradient[i, 0, 1] += green

@@ -11,7 +11,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from keyss.core import BackendError
-from keyss.rendering.cpu import binning, blending, memory, projection, projection_backward
+from keyss.rendering.cpu import (
+    binning,
+    blending,
+    blending_features,
+    memory,
+    projection,
+    projection_backward,
+)
 from keyss.rendering.cpu.jit import announce_compilation
 from keyss.rendering.cpu.layout import (
     CAMERA,
@@ -41,13 +48,26 @@ class Settings:
     far_plane: float
     radius_clip: float
     eps2d: float
-    sh_count: int  # SH coefficients to use; 0 where colours are RGB
+    sh_count: int  # SH coefficients to use; 0 where colours are channels
+    color_channels: int
+    with_depth: bool  # draw the depth as one more channel
+    antialiased: bool
     absgrad: bool
+
+    @property
+    def channels(self) -> int:
+        """How many channels the image has."""
+        return self.color_channels + self.with_depth
+
+    @property
+    def feature_channels(self) -> int:
+        """Channels that are drawn by `blending_features`; 0 where `blending` does it, for RGB alone."""
+        return self.channels if self.with_depth or self.color_channels != 3 else 0
 
     @property
     def extra_width(self) -> int:
         """Floats per (Gaussian, tile) pair beside the `layout.MOMENTS`."""
-        return 3 if self.absgrad else 1
+        return (self.feature_channels or 1) + (2 if self.absgrad else 0)
 
 
 @dataclass(frozen=True)
@@ -56,6 +76,7 @@ class Drawing:
 
     camera: Array  # [CAMERA]
     packed: Array  # [V, PACKED] visible Gaussians by depth
+    features: Array  # [V, feature_channels] their channels
     rank: Array  # [N] place of each Gaussian in `packed`, -1 where it is not seen
     first_slots: Array  # [N + 1] first slot of each Gaussian's pairs
     tile_starts: Array  # [tiles + 1] first list entry of each tile
@@ -69,13 +90,13 @@ def rasterize(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, K, 3] SH coefficients; [N, 1, 3] RGB where settings.sh_count is 0
+    colors: Tensor,  # [N, K, 3] SH coefficients; [N, 1, color_channels] where settings.sh_count is 0
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
-    backgrounds: Tensor,  # [C, 3]
+    backgrounds: Tensor,  # [C, D] with D = settings.channels
     settings: Settings,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Draw float32 contiguous CPU tensors. Returns images [C, H, W, 3], alphas [C, H, W, 1] and meta."""
+    """Draw float32 contiguous CPU tensors. Returns images [C, H, W, D], alphas [C, H, W, 1] and meta."""
     cameras, count = len(viewmats), len(means)
     means2d = torch.empty(cameras, count, 2)
     # The gradient with respect to the projected centres is handed out through an input of its own: the
@@ -111,7 +132,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         announce_compilation()
         shape = (len(viewmats), settings.height, settings.width)
-        images = torch.empty(*shape, 3)
+        images = torch.empty(*shape, settings.channels)
         alphas = torch.empty(*shape, 1)
         transmittances = torch.empty(shape)  # 1 - alphas, without the rounding where alpha is nearly 1
         gaussians = tuple(tensor.detach().numpy() for tensor in (means, quats, scales, opacities, colors))
@@ -155,7 +176,9 @@ class _Rasterize(torch.autograd.Function):
 
         gaussians = (means, quats, scales, opacities, colors)
         gradients = [torch.empty_like(tensor) for tensor in gaussians[:4]]
-        gradients.append(torch.empty_like(colors) if need_colors else torch.empty(0, 1, 3))
+        gradients.append(
+            torch.empty_like(colors) if need_colors else torch.empty(0, 1, settings.color_channels)
+        )
         means2d_gradient = torch.empty_like(ctx.means2d)
         absgrad = torch.empty_like(ctx.means2d if settings.absgrad else means2d_gradient[:, :0])
         pieces = -(-len(means) // CHUNK)
@@ -177,6 +200,8 @@ class _Rasterize(torch.autograd.Function):
                 drawing.camera,
                 settings.width,
                 settings.height,
+                settings.antialiased,
+                settings.feature_channels,
                 drawing.rank,
                 drawing.packed,
                 drawing.first_slots,
@@ -240,6 +265,7 @@ def _draw(
         np.float32(settings.far_plane),
         np.float32(settings.eps2d),
         np.float32(settings.radius_clip),
+        settings.antialiased,
         footprints,
         means2d,
         depths,
@@ -250,6 +276,7 @@ def _draw(
     keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
     visible = binning.sort_by_depth(depths, rank, order, spare_order, keys, spare_keys)
     packed = memory.empty((visible, PACKED), np.float32)
+    features = memory.empty((visible, settings.feature_channels), np.float32)
     tile_bounds = memory.empty((visible,), np.int32)
     run(
         projection.pack,
@@ -260,9 +287,11 @@ def _draw(
         camera,
         columns,
         rows,
+        depths,
         rank,
         radii,
         packed,
+        features,
         tile_bounds,
     )
 
@@ -295,9 +324,11 @@ def _draw(
         tile_slots,
     )
     ends = memory.empty((columns * rows,), np.int64)
+    blend = blending_features.blend_features if settings.feature_channels else blending.blend
     run(
-        blending.blend,
+        blend,
         packed,
+        features,
         tile_ranks,
         tile_starts,
         columns,
@@ -309,7 +340,7 @@ def _draw(
         transmittance,
         ends,
     )
-    return Drawing(camera, packed, rank, first_slots, tile_starts, tile_ranks, tile_slots, ends)
+    return Drawing(camera, packed, features, rank, first_slots, tile_starts, tile_ranks, tile_slots, ends)
 
 
 def _blend_backward(
@@ -324,9 +355,12 @@ def _blend_backward(
     pairs = len(drawing.tile_ranks)
     moments = memory.empty((pairs * MOMENTS,), np.float32)
     extras = memory.empty((pairs * settings.extra_width,), np.float32)
+    features = settings.feature_channels > 0
+    blend_backward = blending_features.blend_features_backward if features else blending.blend_backward
     run(
-        blending.blend_backward,
+        blend_backward,
         drawing.packed,
+        drawing.features,
         drawing.tile_ranks,
         drawing.tile_slots,
         drawing.tile_starts,
