@@ -1,0 +1,54 @@
+"""How much there is to blend: (Gaussian, pixel) pairs, counted one by one without the kernels' shortcuts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from keyss.rendering.cpu.layout import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    OPACITY,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TRANSMITTANCE_MIN,
+    XX,
+    XY,
+    YY,
+    X,
+    Y,
+)
+from keyss.rendering.cpu.rasterization import Drawing
+
+
+def blended_pairs(drawing: Drawing, width: int, height: int) -> int:
+    """The pairs that add to a pixel: alpha of 1/255 or more, before the pixel has stopped."""
+    return int(_count(drawing.packed, drawing.tile_starts, drawing.tile_ranks, drawing.ends, width, height))
+
+
+@numba.njit(error_model="numpy")  # type: ignore[misc]
+def _count(packed: Any, starts: Any, ranks: Any, ends: Any, width: int, height: int) -> int:
+    columns = -(-width // TILE_WIDTH)
+    total = 0
+    rest = np.empty((TILE_HEIGHT, TILE_WIDTH), np.float32)
+    for tile in range(ends.shape[0]):
+        left = tile % columns * TILE_WIDTH
+        top = tile // columns * TILE_HEIGHT
+        rest[:] = 1.0
+        for entry in range(starts[tile], ends[tile]):
+            g = packed[ranks[entry]]
+            for y in range(min(TILE_HEIGHT, height - top)):
+                dy = np.float32(top + y) + np.float32(0.5) - g[Y]
+                for x in range(min(TILE_WIDTH, width - left)):
+                    dx = np.float32(left + x) + np.float32(0.5) - g[X]
+                    alpha = g[OPACITY] * np.exp(g[XX] * dx * dx + g[XY] * dx * dy + g[YY] * dy * dy)
+                    if alpha >= ALPHA_MIN and rest[y, x] > 0:
+                        after = rest[y, x] * (1 - min(alpha, ALPHA_MAX))
+                        if after > TRANSMITTANCE_MIN:
+                            rest[y, x] = after
+                            total += 1
+                        else:
+                            rest[y, x] = 0
+    return total

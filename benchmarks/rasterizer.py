@@ -1,0 +1,337 @@
+"""How fast the CPU rasterizer is: `make benchmark-rasterizer`, or `python benchmarks/rasterizer.py --help`.
+
+Each case runs in a process of its own, so that its peak memory can be told. Times are wall time of
+repeats that follow a warm-up; the smallest says what the code needs, the median what this machine gave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from keyss.core import Camera, Gaussians
+from keyss.files import read_ply
+from keyss.files.atomic import write_bytes
+from keyss.fitting.config import FitConfig
+from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
+from keyss.rendering import rasterization, render
+from pair_count import blended_pairs
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from rendering.dense_reference import dense_rasterization  # noqa: E402
+
+START, END = "<!-- measured by `make benchmark-rasterizer` -->", "<!-- end of what was measured -->"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """What is drawn: made-up Gaussians, or those of a file."""
+
+    name: str
+    width: int
+    height: int
+    count: int = 0
+    file: Path | None = None
+
+    def scene(self) -> tuple[Gaussians, Camera]:
+        if self.file is not None:
+            gaussians = read_ply(self.file)
+            return gaussians, _camera_before(gaussians.means, self.width, self.height)
+        gaussians = made_up(self.count)
+        return gaussians, _camera_before(gaussians.means, self.width, self.height)
+
+
+CASES = (
+    Case(name="50k made up", width=400, height=266, count=50_000),
+    Case(name="200k made up", width=780, height=520, count=200_000),
+)
+LARGE = Case(name="1M made up", width=1600, height=1066, count=1_000_000)
+
+
+def made_up(count: int) -> Gaussians:
+    """A cloud of Gaussians of SH degree 3 whose sizes shrink with their number, as in fitted scenes."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        means=normal(count, 3) * torch.tensor([1.2, 0.8, 1.0]),
+        quats=normal(count, 4),
+        log_scales=math.log(0.42 * count ** (-1 / 3)) + 0.5 * normal(count, 3),
+        opacity_logits=1.5 * normal(count),
+        sh=0.2 * normal(count, 16, 3),
+    )
+
+
+def _camera_before(means: Tensor, width: int, height: int) -> Camera:
+    """A camera that sees most of the Gaussians: four spreads before their middle."""
+    middle = means.median(0).values
+    spread = (means - middle).abs().median(0).values.max() / 0.6745
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = -middle
+    viewmat[2, 3] += 3.3 * spread
+    K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
+    return Camera(viewmat=viewmat, K=K, width=width, height=height, name="benchmark")
+
+
+def load_kernels() -> None:
+    """Draw a few Gaussians, forward and backward."""
+    gaussians = made_up(10).map(lambda tensor: tensor.requires_grad_())
+    render(gaussians, _camera_before(gaussians.means.detach(), 8, 8)).sum().backward()
+
+
+class Times:
+    """Milliseconds of one part, over the repeats."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+
+    def measure(self, part: Callable[[], object]) -> object:
+        start = time.perf_counter()
+        result = part()
+        self.values.append(1e3 * (time.perf_counter() - start))
+        return result
+
+    @property
+    def best(self) -> float:
+        return min(self.values)
+
+    def __str__(self) -> str:
+        return f"{self.best:.1f} ({statistics.median(self.values):.1f})"
+
+
+def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
+    """One row of the first table."""
+    torch.set_num_threads(threads)
+    load_kernels()  # takes memory that is not counted
+    gaussians, camera = case.scene()
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    leaves = [tensor.detach().requires_grad_() for tensor in tensors]
+    weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+
+    def draw() -> Tensor:
+        images, _, _ = rasterization(
+            *leaves, camera.viewmat[None], camera.K[None], camera.width, camera.height,
+            sh_degree=gaussians.sh_degree,
+        )  # fmt: skip
+        return images[0]
+
+    only, forward, backward = Times(), Times(), Times()
+    before = _memory()
+    for repeat in range(repeats + 1):
+        if repeat == 1:
+            only, forward, backward = Times(), Times(), Times()
+        with torch.no_grad():
+            only.measure(draw)
+        image = forward.measure(draw)
+        assert isinstance(image, Tensor)
+        backward.measure(lambda image=image: image.backward(weights))
+        del image
+        for leaf in leaves:
+            leaf.grad = None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+    graph = draw().grad_fn
+    assert graph is not None
+    (drawing,) = graph.next_functions[0][0].drawings  # type: ignore[union-attr]
+    pairs = blended_pairs(drawing, camera.width, camera.height)
+    return [
+        f"{case.name}, {case.width}x{case.height}",
+        str(threads),
+        str(only),
+        str(forward),
+        str(backward),
+        f"{pairs / 1e6:.1f}",
+        f"{pairs / only.best / 1e6:.2f}",
+        f"{pairs / (forward.best + backward.best) / 1e6:.2f}",
+        f"{peak / 2**20:.0f}",
+    ]
+
+
+def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
+    """One row of the second table: what a training step costs beside the rasterizer."""
+    torch.set_num_threads(threads)
+    gaussians, camera = case.scene()
+    config = FitConfig()
+    with torch.no_grad():
+        target = Target.of(render(gaussians, camera).clamp(0, 1).flip(1))
+    parameters = to_parameters(gaussians, torch.device("cpu"))
+    optimizers = make_optimizers(parameters, config, 1.0)
+    weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+
+    def update() -> None:
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+    names = ("rasterizer forward", "rasterizer backward", "render", "loss", "backward", "optimiser")
+    times = {name: Times() for name in names}
+    for repeat in range(repeats + 1):
+        if repeat == 1:
+            times = {name: Times() for name in names}
+        g = to_gaussians(parameters)
+        leaves = [t.detach().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
+        images, _, _ = times["rasterizer forward"].measure(
+            lambda leaves=leaves, g=g: rasterization(
+                *leaves, camera.viewmat[None], camera.K[None], camera.width, camera.height,
+                sh_degree=g.sh_degree,
+            )
+        )  # type: ignore[misc]  # fmt: skip
+        times["rasterizer backward"].measure(lambda images=images: images[0].backward(weights))
+        del leaves, g, images
+        image = times["render"].measure(lambda: render(to_gaussians(parameters), camera))
+        loss = times["loss"].measure(lambda image=image: photometric_loss(image, target, config.ssim_weight))
+        times["backward"].measure(loss.backward)  # type: ignore[attr-defined]
+        times["optimiser"].measure(update)
+    rasterizer = times["rasterizer forward"].best + times["rasterizer backward"].best
+    parts = [times[name].best for name in names[2:]]
+    return [
+        f"{case.name}, {case.width}x{case.height}",
+        str(threads),
+        f"{rasterizer:.1f}",
+        *(f"{part:.1f}" for part in parts),
+        f"{sum(parts):.1f}",
+        f"{sum(parts) / rasterizer:.2f}",
+    ]
+
+
+def measure_against_torch(threads: int, repeats: int) -> list[str]:
+    """One row of the third table: plain torch, every Gaussian at every pixel, on a scene it can hold."""
+    torch.set_num_threads(threads)
+    count, width, height = 1000, 64, 48
+    gaussians = made_up(count)
+    camera = _camera_before(gaussians.means, width, height)
+    weights = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(1))
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    leaves = [tensor.detach().requires_grad_() for tensor in tensors]
+
+    def ours() -> Tensor:
+        size = (camera.width, camera.height)
+        return rasterization(*leaves, camera.viewmat[None], camera.K[None], *size, sh_degree=3)[0][0]
+
+    def dense() -> Tensor:
+        view = (camera.viewmat, camera.K, camera.width, camera.height)
+        return dense_rasterization(*leaves, *view, torch.zeros(3), 3)[0]
+
+    rows = []
+    for draw in (dense, ours):
+        forward, backward = Times(), Times()
+        for repeat in range(repeats + 1):
+            if repeat == 1:
+                forward, backward = Times(), Times()
+            image = forward.measure(draw)
+            backward.measure(lambda image=image: image.backward(weights))  # type: ignore[attr-defined]
+        rows.append((forward.best, backward.best))
+    (dense_forward, dense_backward), (forward_ms, backward_ms) = rows
+    return [
+        f"{count} made up, {width}x{height}",
+        str(threads),
+        f"{dense_forward:.1f}",
+        f"{dense_backward:.1f}",
+        f"{forward_ms:.2f}",
+        f"{backward_ms:.2f}",
+        f"{dense_forward / forward_ms:.0f}",
+        f"{dense_backward / backward_ms:.0f}",
+    ]
+
+
+def _memory() -> int:
+    """Bytes of memory in use by this process now; the peak so far where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return pages * os.sysconf("SC_PAGESIZE")
+
+
+def table(titles: list[str], rows: list[list[str]]) -> str:
+    """As Markdown, in columns that line up."""
+    cells = [titles, *rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(titles))]
+    lines = [f"| {' | '.join(c.ljust(w) for c, w in zip(row, widths, strict=True))} |" for row in cells]
+    lines.insert(1, f"| {' | '.join('-' * w for w in widths)} |")
+    return "\n".join(lines)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--large", action="store_true", help="1M Gaussians at 1600x1066 too")
+    parser.add_argument("--models", type=Path, help="folder with 3DGS .ply files to draw too")
+    parser.add_argument("--repeats", type=int, default=15, help="repeats of each measurement")
+    parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}))
+    parser.add_argument("--write", type=Path, help="put the tables into this Markdown file")
+    options = parser.parse_args()
+
+    cases = [*CASES, *([LARGE] if options.large else [])]
+    if options.models is not None:
+        files = sorted(options.models.rglob("*.ply"))
+        if not files:
+            parser.error(f"--models: no .ply file in {options.models}")
+        cases += [Case(name=file.stem, width=780, height=520, file=file) for file in files]
+    load_kernels()  # compiles them, for the processes below to load
+
+    context = multiprocessing.get_context("spawn")
+
+    def alone(measurement: Callable[..., list[str]], *arguments: object) -> list[str]:
+        with context.Pool(1) as pool:
+            return pool.apply(measurement, arguments)
+
+    n = options.repeats
+    pairs = [(case, threads) for case in cases for threads in options.threads]
+    parts = [
+        f"{_processor()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
+        f"{torch.__version__}. Milliseconds of wall time: the smallest of {n} repeats, and in brackets the "
+        "median.",
+        table(
+            ["scene, SH 3", "threads", "forward only", "forward", "backward", "M pairs blended",
+             "G pairs/s forward only", "G pairs/s both", "peak MiB"],
+            [alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
+        ),
+        table(
+            ["training step", "threads", "rasterizer alone", "render", "loss", "backward", "optimiser",
+             "step", "step / rasterizer"],
+            [alone(measure_step, case, threads, n) for case, threads in pairs],
+        ),
+        table(
+            ["plain torch", "threads", "its forward", "its backward", "our forward", "our backward",
+             "forward, times faster", "backward, times faster"],
+            [alone(measure_against_torch, threads, n) for threads in options.threads],
+        ),
+    ]  # fmt: skip
+    text = "\n\n".join(parts)
+    print(text)
+    if options.write is not None:
+        page = options.write.read_text()
+        if START not in page or END not in page:
+            parser.error(f"--write: {options.write} lacks the lines {START} and {END}")
+        head, rest = page.split(START, 1)
+        _, tail = rest.split(END, 1)
+        write_bytes(options.write, f"{head}{START}\n{text}\n{END}{tail}".encode())
+
+
+if __name__ == "__main__":
+    main()
