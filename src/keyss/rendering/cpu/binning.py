@@ -19,13 +19,14 @@ from keyss.rendering.cpu.layout import (
     EXTENT_X,
     EXTENT_Y,
     HALF,
+    LAST_ROW_SHIFT,
     LEVEL,
+    ONE,
     PACKED,
     TILE_HEIGHT,
     TILE_HEIGHT_LOG2,
     TILE_WIDTH,
     TILE_WIDTH_LOG2,
-    TWO,
     XX,
     XY,
     YY,
@@ -84,34 +85,6 @@ def sort_by_depth(depths, rank, order, spare_order, keys, spare_keys):
 
 
 @kernel
-def _tiles_in_row(top, bottom, x, extent_x, extent_y, shear, level, curvature, right_y, tile_columns):
-    """First and last tile (1, 0 where none) that an ellipse meets in the strip from `top` to `bottom`.
-
-    `top` and `bottom` are rows of pixel centres relative to the ellipse's centre. At height y the ellipse
-    spans -shear y -+ sqrt(level - curvature y^2), and its rightmost point lies at height right_y.
-    """
-    top = max(top, -extent_y)
-    bottom = min(bottom, extent_y)
-    if bottom < top:
-        return 1, 0
-    if right_y >= top and right_y <= bottom:
-        right = extent_x
-    else:
-        y = top if right_y < top else bottom
-        right = min(extent_x, -shear * y + math.sqrt(max(level - curvature * y * y, ZERO)) + f32(1e-3))
-    if -right_y >= top and -right_y <= bottom:
-        left = -extent_x
-    else:
-        y = top if -right_y < top else bottom
-        left = max(-extent_x, -shear * y - math.sqrt(max(level - curvature * y * y, ZERO)) - f32(1e-3))
-    first = max(ceil(x + left - HALF), 0)
-    last = min(floor(x + right - HALF), tile_columns * TILE_WIDTH - 1)
-    if last < first:
-        return 1, 0
-    return first >> TILE_WIDTH_LOG2, last >> TILE_WIDTH_LOG2
-
-
-@kernel
 def tile_box(x, y, extent_x, extent_y, tile_columns, tile_rows):
     """First and last column and row of tiles that may hold pixel centres within the extents."""
     return (
@@ -123,43 +96,56 @@ def tile_box(x, y, extent_x, extent_y, tile_columns, tile_rows):
 
 
 @kernel
-def _list_tiles(packed, r, tile_columns, tile_rows, tiles, place, counts):
+def _list_tiles(packed, r, tile_columns, tile_rows, height, tiles, rows, place, counts):
     """Append the tiles that Gaussian r meets to `tiles` from `place` on, and count them in `counts`.
 
-    Returns the place after the last.
+    `rows` gets the rows of each tile that the ellipse alpha >= 1/255 meets, see `layout.LAST_ROW_SHIFT`.
+    Goes through the ellipse from left to right, one column of tiles after the other: at x from its centre
+    it spans -shear x -+ sqrt(level - curvature x^2), its lowest point lies at x = lowest_x and its highest
+    at -lowest_x. Returns the place after the last.
     """
     g = r * PACKED
     x = at(packed, g + X)
     y = at(packed, g + Y)
     extent_x = at(packed, g + EXTENT_X)
     extent_y = at(packed, g + EXTENT_Y)
-    first_column, last_column, first_row, last_row = tile_box(
-        x, y, extent_x, extent_y, tile_columns, tile_rows
-    )
-    # Corners of the box can only be spared where it has more than one row and more than one column.
-    exact = last_row > first_row and last_column > first_column
-    shear = ZERO
-    level = ZERO
-    curvature = ZERO
-    right_y = ZERO
-    if exact:
-        a = -TWO * at(packed, g + XX)
-        b = -at(packed, g + XY)
-        shear = b / a
-        level = at(packed, g + LEVEL) * f32(1.001) / a
-        curvature = level / (extent_y * extent_y)
-        right_y = b / (TWO * at(packed, g + YY)) * extent_x
-    for row in range(first_row, last_row + 1):
-        if exact:
-            top = f32(row * TILE_HEIGHT) + HALF - y
-            first_column, last_column = _tiles_in_row(
-                top, top + f32(TILE_HEIGHT - 1), x, extent_x, extent_y,
-                shear, level, curvature, right_y, tile_columns,
-            )  # fmt: skip
-        for tile in range(row * tile_columns + first_column, row * tile_columns + last_column + 1):
-            counts[tile] += 1
-            tiles[place] = tile
-            place += 1
+    first_column, last_column, _, _ = tile_box(x, y, extent_x, extent_y, tile_columns, tile_rows)
+    slope = HALF * at(packed, g + XY)
+    inverse = ONE / at(packed, g + YY)
+    shear = slope * inverse
+    lowest_x = -slope / at(packed, g + XX) * extent_y
+    level = f32(-0.5005) * at(packed, g + LEVEL) * inverse
+    curvature = level / (extent_x * extent_x)
+    left = max(f32(first_column * TILE_WIDTH) + HALF - x, -extent_x)
+    half = math.sqrt(max(level - curvature * left * left, ZERO)) + f32(1e-3)
+    left_top = -shear * left - half
+    left_bottom = -shear * left + half
+    for column in range(first_column, last_column + 1):
+        # A pixel more than the column's 8, so that the next one can begin with what is known here.
+        right = min(f32((column + 1) * TILE_WIDTH) + HALF - x, extent_x)
+        half = math.sqrt(max(level - curvature * right * right, ZERO)) + f32(1e-3)
+        right_top = -shear * right - half
+        right_bottom = -shear * right + half
+        top = -extent_y
+        if not (left <= -lowest_x and -lowest_x <= right):
+            top = max(top, min(left_top, right_top))
+        bottom = extent_y
+        if not (left <= lowest_x and lowest_x <= right):
+            bottom = min(bottom, max(left_bottom, right_bottom))
+        first = max(ceil(y + top - HALF), 0)
+        last = min(floor(y + bottom - HALF), height - 1)
+        if first <= last:
+            for row in range(first >> TILE_HEIGHT_LOG2, (last >> TILE_HEIGHT_LOG2) + 1):
+                tile = row * tile_columns + column
+                counts[tile] += 1
+                tiles[place] = tile
+                first_row = max(first - row * TILE_HEIGHT, 0)
+                last_row = min(last - row * TILE_HEIGHT, TILE_HEIGHT - 1)
+                rows[place] = first_row | last_row << LAST_ROW_SHIFT
+                place += 1
+        left = right
+        left_top = right_top
+        left_bottom = right_bottom
     return place
 
 
@@ -177,8 +163,10 @@ def share_bounds(tile_bounds, starts):
 
 
 @kernel
-def list_pairs(counter, packed, tile_columns, tile_rows, starts, tiles, tiles_per_gaussian, cursors):
-    """List the tiles of each Gaussian, share by share, that of share w from starts[w] on.
+def list_pairs(
+    counter, packed, tile_columns, tile_rows, height, starts, tiles, rows, tiles_per_gaussian, cursors
+):
+    """List the tiles of each Gaussian and its rows there, share by share, that of share w from starts[w] on.
 
     cursors[w, t] becomes the number of Gaussians in share w that meet tile t.
     """
@@ -194,7 +182,7 @@ def list_pairs(counter, packed, tile_columns, tile_rows, starts, tiles, tiles_pe
         place = starts[share]
         for r in range(share * count // shares, (share + 1) * count // shares):
             before = place
-            place = _list_tiles(packed, r, tile_columns, tile_rows, tiles, place, counts)
+            place = _list_tiles(packed, r, tile_columns, tile_rows, height, tiles, rows, place, counts)
             tiles_per_gaussian[r] = place - before
 
 
@@ -220,11 +208,25 @@ def offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_sl
 
 @kernel
 def sort_pairs(
-    counter, order, starts, tiles, tiles_per_gaussian, cursors, first_slots, tile_ranks, tile_slots
+    counter,
+    order,
+    starts,
+    tiles,
+    rows,
+    tiles_per_gaussian,
+    cursors,
+    first_slots,
+    tile_ranks,
+    tile_rows,
+    tile_slots,
 ):
-    """Sort the pairs of `list_pairs` into tiles, from the cursors that `offsets_from_counts` left."""
+    """Sort the pairs of `list_pairs` into tiles, from the cursors that `offsets_from_counts` left.
+
+    tile_slots may be empty: then it stays so.
+    """
     shares = cursors.shape[0]
     count = order.shape[0]
+    keep_slots = tile_slots.shape[0] > 0
     while True:
         share = fetch_add(counter, 0, 1)
         if share >= shares:
@@ -238,6 +240,8 @@ def sort_pairs(
                 place = cursor[tile]
                 cursor[tile] = place + 1
                 tile_ranks[place] = r
-                tile_slots[place] = slot
+                tile_rows[place] = rows[pair]
+                if keep_slots:
+                    tile_slots[place] = slot
                 pair += 1
                 slot += 1

@@ -11,7 +11,7 @@ curvature in y is at most 1/0.3, so 7 rows above a pixel with alpha >= 1/255 it 
 footprints and alphas are kept multiplied by 2^64, and transmittances divided by it, which is exact.
 """
 
-# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
+# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator"
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     BLUE,
     DECAY,
-    EXTENT_Y,
     GREEN,
     HALF,
+    LAST_ROW_SHIFT,
     MOMENTS,
     ONE,
     OPACITY,
@@ -47,12 +47,10 @@ from keyss.rendering.cpu.layout import (
 from keyss.rendering.cpu.simd8 import (
     any_gt,
     at,
-    ceil,
     divide,
     exp,
     exp_times_2_64,
     fetch_add,
-    floor,
     load8,
     maximum,
     minimum,
@@ -113,7 +111,7 @@ def has_stopped(planes):
 
 
 @finite_kernel
-def _blend_tile(packed, ranks, start, end, left, top, height, planes):
+def _blend_tile(packed, ranks, rows, start, end, left, top, planes):
     """Blend entries start..end of the list into planes = [transmittance | red | green | blue].
 
     Returns the entry before which the whole tile had stopped.
@@ -131,9 +129,9 @@ def _blend_tile(packed, ranks, start, end, left, top, height, planes):
             prefetch_read(packed, np.int64(at(ranks, min(e + PREFETCH, end - 1))) * PACKED)
             g = np.int64(at(ranks, e)) * PACKED
             y = at(packed, g + Y) - centre_y
-            extent_y = at(packed, g + EXTENT_Y)
-            first_row = max(ceil(y - extent_y), 0)
-            last_row = min(floor(y + extent_y), height - 1)
+            both_rows = np.int64(at(rows, e))
+            first_row = both_rows & (TILE_HEIGHT - 1)
+            last_row = both_rows >> LAST_ROW_SHIFT
             yy = at(packed, g + YY)
             opacity = at(packed, g + OPACITY)
             decay = at(packed, g + DECAY)
@@ -168,6 +166,7 @@ def blend(
     packed,
     _,
     tile_ranks,
+    tile_rows,
     tile_starts,
     tile_columns,
     width,
@@ -188,7 +187,7 @@ def blend(
         top = (tile // tile_columns) * TILE_HEIGHT
         rows = min(TILE_HEIGHT, height - top)
         ends[tile] = _blend_tile(
-            packed, tile_ranks, tile_starts[tile], tile_starts[tile + 1], left, top, rows, planes
+            packed, tile_ranks, tile_rows, tile_starts[tile], tile_starts[tile + 1], left, top, planes
         )
         for y in range(rows):
             for x in range(min(TILE_WIDTH, width - left)):
@@ -203,7 +202,7 @@ def blend(
 
 @finite_kernel
 def _blend_tile_backward(
-    packed, ranks, slots, start, end, left, top, height, planes, moments, extras, extra_width, absgrad
+    packed, ranks, rows, slots, start, end, left, top, planes, moments, extras, extra_width, absgrad
 ):
     """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
 
@@ -220,9 +219,9 @@ def _blend_tile_backward(
         prefetch_write(moments, np.int64(at(slots, ahead)) * MOMENTS)
         g = np.int64(at(ranks, e)) * PACKED
         y = at(packed, g + Y) - centre_y
-        extent_y = at(packed, g + EXTENT_Y)
-        first_row = max(ceil(y - extent_y), 0)
-        last_row = min(floor(y + extent_y), height - 1)
+        both_rows = np.int64(at(rows, e))
+        first_row = both_rows & (TILE_HEIGHT - 1)
+        last_row = both_rows >> LAST_ROW_SHIFT
         xx = at(packed, g + XX)
         xy = at(packed, g + XY)
         yy = at(packed, g + YY)
@@ -293,6 +292,7 @@ def blend_backward(
     packed,
     _,
     tile_ranks,
+    tile_rows,
     tile_slots,
     tile_starts,
     ends,
@@ -351,12 +351,12 @@ def blend_backward(
         _blend_tile_backward(
             packed,
             tile_ranks,
+            tile_rows,
             tile_slots,
             tile_starts[tile],
             ends[tile],
             left,
             top,
-            rows,
             planes,
             moments,
             extras,

@@ -5,7 +5,7 @@ first the weights of its pixels, kept in a buffer, then one pass per channel. Wh
 it stops is computed by the same steps as in `blending`.
 """
 
-# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
+# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator"
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from keyss.rendering.cpu.blending import (
 from keyss.rendering.cpu.jit import finite_kernel
 from keyss.rendering.cpu.layout import (
     DECAY,
-    EXTENT_Y,
     HALF,
+    LAST_ROW_SHIFT,
     MOMENTS,
     ONE,
     OPACITY,
@@ -45,10 +45,8 @@ from keyss.rendering.cpu.layout import (
 )
 from keyss.rendering.cpu.simd8 import (
     at,
-    ceil,
     divide,
     fetch_add,
-    floor,
     load8,
     multiply_add,
     negative_abs,
@@ -64,7 +62,7 @@ from keyss.rendering.cpu.simd8 import (
 
 
 @finite_kernel
-def _blend_tile(packed, features, channels, ranks, start, end, left, top, height, planes, weights):
+def _blend_tile(packed, features, channels, ranks, rows, start, end, left, top, planes, weights):
     """Blend entries start..end of the list into planes = [transmittance | one per channel].
 
     Returns the entry before which the whole tile had stopped.
@@ -85,9 +83,9 @@ def _blend_tile(packed, features, channels, ranks, start, end, left, top, height
             rank = np.int64(at(ranks, e))
             g = rank * PACKED
             y = at(packed, g + Y) - centre_y
-            extent_y = at(packed, g + EXTENT_Y)
-            first_row = max(ceil(y - extent_y), 0)
-            last_row = min(floor(y + extent_y), height - 1)
+            both_rows = np.int64(at(rows, e))
+            first_row = both_rows & (TILE_HEIGHT - 1)
+            last_row = both_rows >> LAST_ROW_SHIFT
             yy = at(packed, g + YY)
             opacity = at(packed, g + OPACITY)
             decay = at(packed, g + DECAY)
@@ -120,6 +118,7 @@ def blend_features(
     packed,
     features,
     tile_ranks,
+    tile_rows,
     tile_starts,
     tile_columns,
     width,
@@ -142,8 +141,8 @@ def blend_features(
         top = (tile // tile_columns) * TILE_HEIGHT
         rows = min(TILE_HEIGHT, height - top)
         ends[tile] = _blend_tile(
-            packed, features, channels, tile_ranks, tile_starts[tile], tile_starts[tile + 1],
-            left, top, rows, planes, weights,
+            packed, features, channels, tile_ranks, tile_rows, tile_starts[tile], tile_starts[tile + 1],
+            left, top, planes, weights,
         )  # fmt: skip
         for y in range(rows):
             for x in range(min(TILE_WIDTH, width - left)):
@@ -162,12 +161,12 @@ def _blend_tile_backward(
     features,
     channels,
     ranks,
+    rows,
     slots,
     start,
     end,
     left,
     top,
-    height,
     planes,
     weights,
     products,
@@ -196,9 +195,9 @@ def _blend_tile_backward(
         slot = np.int64(at(slots, e))
         g = rank * PACKED
         y = at(packed, g + Y) - centre_y
-        extent_y = at(packed, g + EXTENT_Y)
-        first_row = max(ceil(y - extent_y), 0)
-        last_row = min(floor(y + extent_y), height - 1)
+        both_rows = np.int64(at(rows, e))
+        first_row = both_rows & (TILE_HEIGHT - 1)
+        last_row = both_rows >> LAST_ROW_SHIFT
         xx = at(packed, g + XX)
         xy = at(packed, g + XY)
         yy = at(packed, g + YY)
@@ -267,6 +266,7 @@ def blend_features_backward(
     packed,
     features,
     tile_ranks,
+    tile_rows,
     tile_slots,
     tile_starts,
     ends,
@@ -319,6 +319,6 @@ def blend_features_backward(
                     planes[k + (2 + channel) * TILE_PIXELS] = gradient
                 planes[k + TILE_PIXELS] = behind
         _blend_tile_backward(
-            packed, features, channels, tile_ranks, tile_slots, tile_starts[tile], ends[tile],
-            left, top, rows, planes, weights, products, moments, extras, extra_width, absgrad,
+            packed, features, channels, tile_ranks, tile_rows, tile_slots, tile_starts[tile], ends[tile],
+            left, top, planes, weights, products, moments, extras, extra_width, absgrad,
         )  # fmt: skip

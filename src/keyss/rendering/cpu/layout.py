@@ -18,6 +18,7 @@ TILE_HEIGHT = 32
 TILE_WIDTH_LOG2 = 3
 TILE_HEIGHT_LOG2 = 5
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+LAST_ROW_SHIFT = 5  # the rows that a Gaussian meets in a tile are kept as first | last << this
 
 # The packed record of a visible Gaussian: one cache line.
 PACKED = 16

@@ -81,7 +81,8 @@ class Drawing:
     first_slots: Array  # [N + 1] first slot of each Gaussian's pairs
     tile_starts: Array  # [tiles + 1] first list entry of each tile
     tile_ranks: Array  # [pairs] the Gaussian of each list entry, as a rank
-    tile_slots: Array  # [pairs] the slot of each list entry
+    tile_rows: Array  # [pairs] its rows there, see `layout.LAST_ROW_SHIFT`
+    tile_slots: Array  # [pairs] the slot of each list entry; empty where no gradients are needed
     ends: Array  # [tiles] first list entry that the tile did not come to
 
 
@@ -143,6 +144,7 @@ class _Rasterize(torch.autograd.Function):
                 _camera_array(viewmats[c], Ks[c]),
                 backgrounds[c].detach().numpy(),
                 settings,
+                any(ctx.needs_input_grad),
                 means2d.detach()[c].numpy(),
                 meta["depths"][c].numpy(),
                 meta["radii"][c].numpy(),
@@ -175,11 +177,10 @@ class _Rasterize(torch.autograd.Function):
         need_colors, need_camera, need_background = ctx.needs_input_grad[4:7]
 
         gaussians = (means, quats, scales, opacities, colors)
-        gradients = [torch.empty_like(tensor) for tensor in gaussians[:4]]
-        gradients.append(
-            torch.empty_like(colors) if need_colors else torch.empty(0, 1, settings.color_channels)
-        )
-        means2d_gradient = torch.empty_like(ctx.means2d)
+        shapes = [tuple(tensor.shape) for tensor in (*gaussians, ctx.means2d)]
+        if not need_colors:
+            shapes[4] = (0, 1, settings.color_channels)
+        *gradients, means2d_gradient = (torch.from_numpy(memory.empty(s, np.float32)) for s in shapes)
         absgrad = torch.empty_like(ctx.means2d if settings.absgrad else means2d_gradient[:, :0])
         pieces = -(-len(means) // CHUNK)
         camera_gradient = np.zeros((pieces if need_camera else 0, 15))
@@ -238,6 +239,7 @@ def _draw(
     camera: Array,
     background: Array,
     settings: Settings,
+    for_backward: bool,
     means2d: Array,
     depths: Array,
     radii: Array,
@@ -306,21 +308,36 @@ def _draw(
     tiles = memory.empty((int(starts[-1]),), np.int32)
     tiles_per_gaussian = memory.empty((visible,), np.int32)
     cursors = memory.empty((shares, columns * rows), np.int64)
-    run(binning.list_pairs, packed, columns, rows, starts, tiles, tiles_per_gaussian, cursors)
+    rows_of_pairs = memory.empty((int(starts[-1]),), np.int16)
+    run(
+        binning.list_pairs,
+        packed,
+        columns,
+        rows,
+        height,
+        starts,
+        tiles,
+        rows_of_pairs,
+        tiles_per_gaussian,
+        cursors,
+    )
     tile_starts = memory.empty((columns * rows + 1,), np.int64)
     first_slots = memory.empty((count + 1,), np.int64)
     pairs = binning.offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_slots)
     tile_ranks = memory.empty((pairs,), np.int32)
-    tile_slots = memory.empty((pairs,), np.int32)
+    tile_rows = memory.empty((pairs,), np.int16)
+    tile_slots = memory.empty((pairs if for_backward else 0,), np.int32)
     run(
         binning.sort_pairs,
         order[:visible],
         starts,
         tiles,
+        rows_of_pairs,
         tiles_per_gaussian,
         cursors,
         first_slots,
         tile_ranks,
+        tile_rows,
         tile_slots,
     )
     ends = memory.empty((columns * rows,), np.int64)
@@ -330,6 +347,7 @@ def _draw(
         packed,
         features,
         tile_ranks,
+        tile_rows,
         tile_starts,
         columns,
         width,
@@ -340,7 +358,9 @@ def _draw(
         transmittance,
         ends,
     )
-    return Drawing(camera, packed, features, rank, first_slots, tile_starts, tile_ranks, tile_slots, ends)
+    return Drawing(
+        camera, packed, features, rank, first_slots, tile_starts, tile_ranks, tile_rows, tile_slots, ends
+    )
 
 
 def _blend_backward(
@@ -362,6 +382,7 @@ def _blend_backward(
         drawing.packed,
         drawing.features,
         drawing.tile_ranks,
+        drawing.tile_rows,
         drawing.tile_slots,
         drawing.tile_starts,
         drawing.ends,
