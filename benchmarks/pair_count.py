@@ -10,6 +10,7 @@ import numpy as np
 from keyss.rendering.cpu.layout import (
     ALPHA_MAX,
     ALPHA_MIN,
+    ENTRY_GAUSSIAN,
     OPACITY,
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -25,11 +26,11 @@ from keyss.rendering.cpu.rasterization import Drawing
 
 def blended_pairs(drawing: Drawing, width: int, height: int) -> int:
     """The pairs that add to a pixel: alpha of 1/255 or more, before the pixel has stopped."""
-    return int(_count(drawing.packed, drawing.tile_starts, drawing.tile_ranks, drawing.ends, width, height))
+    return int(_count(drawing.footprints, drawing.tile_starts, drawing.entries, drawing.ends, width, height))
 
 
 @numba.njit(error_model="numpy")  # type: ignore[misc]
-def _count(packed: Any, starts: Any, ranks: Any, ends: Any, width: int, height: int) -> int:
+def _count(footprints: Any, starts: Any, entries: Any, ends: Any, width: int, height: int) -> int:
     columns = -(-width // TILE_WIDTH)
     total = 0
     rest = np.empty((TILE_HEIGHT, TILE_WIDTH), np.float32)
@@ -38,7 +39,7 @@ def _count(packed: Any, starts: Any, ranks: Any, ends: Any, width: int, height: 
         top = tile // columns * TILE_HEIGHT
         rest[:] = 1.0
         for entry in range(starts[tile], ends[tile]):
-            g = packed[ranks[entry]]
+            g = footprints[entries[entry] & ENTRY_GAUSSIAN]
             for y in range(min(TILE_HEIGHT, height - top)):
                 dy = np.float32(top + y) + np.float32(0.5) - g[Y]
                 for x in range(min(TILE_WIDTH, width - left)):

@@ -10,12 +10,11 @@ them up in an order that never changes.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.layout import (
+    ENTRY_ROWS_SHIFT,
     EXTENT_X,
     EXTENT_Y,
     HALF,
@@ -35,15 +34,32 @@ from keyss.rendering.cpu.layout import (
     Y,
     f32,
 )
-from keyss.rendering.cpu.simd8 import at, ceil, fetch_add, floor
+from keyss.rendering.cpu.simd8 import (
+    at,
+    ceil,
+    ceil8,
+    fetch_add,
+    floor,
+    floor8,
+    maximum,
+    minimum,
+    prefetch_read,
+    ramp,
+    select_ge,
+    select_le,
+    square_root,
+    store8,
+)
+
+BATCH = 16  # Gaussians that are measured before any of them is listed
 
 
 @kernel
-def sort_by_depth(depths, rank, order, spare_order, keys, spare_keys):
+def sort_by_depth(depths, order, spare_order, keys, spare_keys):
     """Sort by depth those Gaussians whose depth is not 0; returns how many those are.
 
-    order[j] becomes the j-th Gaussian, and rank[i] the place of Gaussian i or -1. A stable radix sort
-    with three digits of 11 bits: positive floats sort like their bit patterns.
+    order[j] becomes the j-th Gaussian. A stable radix sort with three digits of 11 bits: positive floats
+    sort like their bit patterns.
     """
     bits = depths.view(np.uint32)
     mask = np.uint32(2047)
@@ -53,7 +69,6 @@ def sort_by_depth(depths, rank, order, spare_order, keys, spare_keys):
     source_keys, target_keys = spare_keys, keys
     count = 0
     for i in range(depths.shape[0]):
-        rank[i] = -1
         key = bits[i]
         if key != 0:
             source[count] = i
@@ -79,99 +94,68 @@ def sort_by_depth(depths, rank, order, spare_order, keys, spare_keys):
             target_keys[place] = key
         source, target = target, source
         source_keys, target_keys = target_keys, source_keys
-    for j in range(count):
-        rank[order[j]] = j
     return count
 
 
 @kernel
-def tile_box(x, y, extent_x, extent_y, tile_columns, tile_rows):
-    """First and last column and row of tiles that may hold pixel centres within the extents."""
-    return (
-        max(ceil(x - extent_x - HALF), 0) >> TILE_WIDTH_LOG2,
-        min(floor(x + extent_x - HALF), tile_columns * TILE_WIDTH - 1) >> TILE_WIDTH_LOG2,
-        max(ceil(y - extent_y - HALF), 0) >> TILE_HEIGHT_LOG2,
-        min(floor(y + extent_y - HALF), tile_rows * TILE_HEIGHT - 1) >> TILE_HEIGHT_LOG2,
-    )
-
-
-@kernel
-def _list_tiles(packed, r, tile_columns, tile_rows, height, tiles, rows, place, counts):
-    """Append the tiles that Gaussian r meets to `tiles` from `place` on, and count them in `counts`.
-
-    `rows` gets the rows of each tile that the ellipse alpha >= 1/255 meets, see `layout.LAST_ROW_SHIFT`.
-    Goes through the ellipse from left to right, one column of tiles after the other: at x from its centre
-    it spans -shear x -+ sqrt(level - curvature x^2), its lowest point lies at x = lowest_x and its highest
-    at -lowest_x. Returns the place after the last.
-    """
-    g = r * PACKED
-    x = at(packed, g + X)
-    y = at(packed, g + Y)
-    extent_x = at(packed, g + EXTENT_X)
-    extent_y = at(packed, g + EXTENT_Y)
-    first_column, last_column, _, _ = tile_box(x, y, extent_x, extent_y, tile_columns, tile_rows)
-    slope = HALF * at(packed, g + XY)
-    inverse = ONE / at(packed, g + YY)
-    shear = slope * inverse
-    lowest_x = -slope / at(packed, g + XX) * extent_y
-    level = f32(-0.5005) * at(packed, g + LEVEL) * inverse
-    curvature = level / (extent_x * extent_x)
-    left = max(f32(first_column * TILE_WIDTH) + HALF - x, -extent_x)
-    half = math.sqrt(max(level - curvature * left * left, ZERO)) + f32(1e-3)
-    left_top = -shear * left - half
-    left_bottom = -shear * left + half
-    for column in range(first_column, last_column + 1):
-        # A pixel more than the column's 8, so that the next one can begin with what is known here.
-        right = min(f32((column + 1) * TILE_WIDTH) + HALF - x, extent_x)
-        half = math.sqrt(max(level - curvature * right * right, ZERO)) + f32(1e-3)
-        right_top = -shear * right - half
-        right_bottom = -shear * right + half
-        top = -extent_y
-        if not (left <= -lowest_x and -lowest_x <= right):
-            top = max(top, min(left_top, right_top))
-        bottom = extent_y
-        if not (left <= lowest_x and lowest_x <= right):
-            bottom = min(bottom, max(left_bottom, right_bottom))
-        first = max(ceil(y + top - HALF), 0)
-        last = min(floor(y + bottom - HALF), height - 1)
-        if first <= last:
-            for row in range(first >> TILE_HEIGHT_LOG2, (last >> TILE_HEIGHT_LOG2) + 1):
-                tile = row * tile_columns + column
-                counts[tile] += 1
-                tiles[place] = tile
-                first_row = max(first - row * TILE_HEIGHT, 0)
-                last_row = min(last - row * TILE_HEIGHT, TILE_HEIGHT - 1)
-                rows[place] = first_row | last_row << LAST_ROW_SHIFT
-                place += 1
-        left = right
-        left_top = right_top
-        left_bottom = right_bottom
-    return place
-
-
-@kernel
-def share_bounds(tile_bounds, starts):
+def share_bounds(order, tile_bounds, starts):
     """starts[w] becomes the sum of tile_bounds over the shares before w; the last entry is the total."""
     shares = starts.shape[0] - 1
-    count = tile_bounds.shape[0]
+    count = order.shape[0]
     total = 0
     for share in range(shares):
         starts[share] = total
         for r in range(share * count // shares, (share + 1) * count // shares):
-            total += tile_bounds[r]
+            total += at(tile_bounds, at(order, r))
     starts[shares] = total
 
 
 @kernel
+def _measure_columns(footprints, g, tile_columns, height, first_column, spans, place):
+    """The rows of pixels that an ellipse alpha >= 1/255 meets, for 8 columns of tiles.
+
+    g is where its footprint starts. spans[place:] gets the first rows, spans[place + 8:] the last ones. At x
+    from its centre the ellipse spans shear x -+ sqrt(level - curvature x^2), its lowest point lies at
+    x = lowest_x and its highest at -lowest_x: within a column the extremes are at its edges or at those.
+    """
+    x = at(footprints, g + X)
+    y = at(footprints, g + Y) - HALF
+    extent_x = at(footprints, g + EXTENT_X)
+    extent_y = at(footprints, g + EXTENT_Y)
+    slope = -HALF * at(footprints, g + XY)
+    inverse = ONE / at(footprints, g + YY)
+    shear = slope * inverse
+    lowest_x = slope / at(footprints, g + XX) * extent_y
+    level = f32(-0.5005) * at(footprints, g + LEVEL) * inverse
+    curvature = level / (extent_x * extent_x)
+    left = ramp(f32(first_column)) * f32(TILE_WIDTH) + (HALF - x)
+    right = minimum(left + f32(TILE_WIDTH - 1), extent_x)
+    left = maximum(left, -extent_x)
+    left_half = square_root(maximum(level - left * left * curvature, ZERO)) + f32(1e-3)
+    right_half = square_root(maximum(level - right * right * curvature, ZERO)) + f32(1e-3)
+    top = minimum(left * shear - left_half, right * shear - right_half)
+    bottom = maximum(left * shear + left_half, right * shear + right_half)
+    top = select_ge(right, -lowest_x, select_le(left, -lowest_x, -extent_y, top), top)
+    bottom = select_ge(right, lowest_x, select_le(left, lowest_x, extent_y, bottom), bottom)
+    store8(spans, place, maximum(ceil8(maximum(top, -extent_y) + y), ZERO))
+    store8(spans, place + 8, minimum(floor8(minimum(bottom, extent_y) + y), f32(height - 1)))
+
+
+@kernel
 def list_pairs(
-    counter, packed, tile_columns, tile_rows, height, starts, tiles, rows, tiles_per_gaussian, cursors
+    counter, footprints, order, tile_columns, height, starts, tiles, rows, first_slots, slot_counts, cursors
 ):
     """List the tiles of each Gaussian and its rows there, share by share, that of share w from starts[w] on.
 
-    cursors[w, t] becomes the number of Gaussians in share w that meet tile t.
+    The place of a pair in this list is its slot: Gaussian i gets slot_counts[i] of them from
+    first_slots[i] on. cursors[w, t] becomes the number of Gaussians in share w that meet tile t. `tiles`
+    and `rows` have room for one more at the end.
     """
     shares = cursors.shape[0]
-    count = packed.shape[0]
+    count = order.shape[0]
+    spans = np.empty(16 * BATCH, np.float32)
+    first_columns = np.empty(BATCH, np.int64)
+    columns = np.empty(BATCH, np.int64)
     while True:
         share = fetch_add(counter, 0, 1)
         if share >= shares:
@@ -180,14 +164,47 @@ def list_pairs(
         for tile in range(counts.shape[0]):
             counts[tile] = 0
         place = starts[share]
-        for r in range(share * count // shares, (share + 1) * count // shares):
-            before = place
-            place = _list_tiles(packed, r, tile_columns, tile_rows, height, tiles, rows, place, counts)
-            tiles_per_gaussian[r] = place - before
+        end = (share + 1) * count // shares
+        for start in range(share * count // shares, end, BATCH):
+            size = min(BATCH, end - start)
+            # First what has long latencies, for the whole batch, then what branches on the results.
+            for k in range(size):
+                prefetch_read(footprints, np.int64(at(order, min(start + k + BATCH, end - 1))) * PACKED)
+                g = np.int64(at(order, start + k)) * PACKED
+                x = at(footprints, g + X) - HALF
+                extent_x = at(footprints, g + EXTENT_X)
+                first_column = max(ceil(x - extent_x), 0) >> TILE_WIDTH_LOG2
+                last_column = min(floor(x + extent_x), tile_columns * TILE_WIDTH - 1) >> TILE_WIDTH_LOG2
+                first_columns[k] = first_column
+                columns[k] = last_column + 1 - first_column
+                _measure_columns(footprints, g, tile_columns, height, first_column, spans, 16 * k)
+            for k in range(size):
+                i = np.int64(at(order, start + k))
+                first_slots[i] = place
+                before = place
+                for column in range(columns[k]):
+                    first_column = first_columns[k] + column
+                    if column > 0 and column % 8 == 0:
+                        _measure_columns(
+                            footprints, i * PACKED, tile_columns, height, first_column, spans, 16 * k
+                        )
+                    first = np.int64(at(spans, 16 * k + column % 8))
+                    last = np.int64(at(spans, 16 * k + 8 + column % 8))
+                    for row in range(first >> TILE_HEIGHT_LOG2, (last >> TILE_HEIGHT_LOG2) + 1):
+                        tile = row * tile_columns + first_column
+                        # Written in any case: to branch where a column is missed is slower.
+                        tiles[place] = tile
+                        first_row = max(first - row * TILE_HEIGHT, 0)
+                        last_row = min(last - row * TILE_HEIGHT, TILE_HEIGHT - 1)
+                        rows[place] = first_row | last_row << LAST_ROW_SHIFT
+                        met = np.int64(first_row <= last_row)
+                        counts[tile] += met
+                        place += met
+                slot_counts[i] = place - before
 
 
 @kernel
-def offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_slots):
+def offsets_from_counts(cursors, tile_starts):
     """Turn counts into starts, in place for the cursors. Returns the number of pairs."""
     total = 0
     for tile in range(cursors.shape[1]):
@@ -197,51 +214,32 @@ def offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_sl
             cursors[share, tile] = total
             total += here
     tile_starts[cursors.shape[1]] = total
-    slot = 0
-    for i in range(rank.shape[0]):
-        first_slots[i] = slot
-        if rank[i] >= 0:
-            slot += tiles_per_gaussian[rank[i]]
-    first_slots[rank.shape[0]] = slot
     return total
 
 
 @kernel
-def sort_pairs(
-    counter,
-    order,
-    starts,
-    tiles,
-    rows,
-    tiles_per_gaussian,
-    cursors,
-    first_slots,
-    tile_ranks,
-    tile_rows,
-    tile_slots,
-):
+def sort_pairs(counter, order, starts, tiles, rows, slot_counts, cursors, entries, entry_slots):
     """Sort the pairs of `list_pairs` into tiles, from the cursors that `offsets_from_counts` left.
 
-    tile_slots may be empty: then it stays so.
+    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots;
+    it may be empty: then it stays so.
     """
     shares = cursors.shape[0]
     count = order.shape[0]
-    keep_slots = tile_slots.shape[0] > 0
+    keep_slots = entry_slots.shape[0] > 0
     while True:
         share = fetch_add(counter, 0, 1)
         if share >= shares:
             break
         cursor = cursors[share]
-        pair = starts[share]
+        slot = starts[share]
         for r in range(share * count // shares, (share + 1) * count // shares):
-            slot = first_slots[order[r]]
-            for _ in range(tiles_per_gaussian[r]):
-                tile = tiles[pair]
+            i = np.int64(at(order, r))
+            for _ in range(at(slot_counts, i)):
+                tile = tiles[slot]
                 place = cursor[tile]
                 cursor[tile] = place + 1
-                tile_ranks[place] = r
-                tile_rows[place] = rows[pair]
+                entries[place] = i | np.int64(rows[slot]) << ENTRY_ROWS_SHIFT
                 if keep_slots:
-                    tile_slots[place] = slot
-                pair += 1
+                    entry_slots[place] = slot
                 slot += 1

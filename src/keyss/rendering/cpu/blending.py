@@ -23,6 +23,8 @@ from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     BLUE,
     DECAY,
+    ENTRY_GAUSSIAN,
+    ENTRY_ROWS_SHIFT,
     GREEN,
     HALF,
     LAST_ROW_SHIFT,
@@ -52,6 +54,7 @@ from keyss.rendering.cpu.simd8 import (
     exp_times_2_64,
     fetch_add,
     load8,
+    load_interleaved,
     maximum,
     minimum,
     multiply_add,
@@ -64,13 +67,14 @@ from keyss.rendering.cpu.simd8 import (
     select_le,
     splat,
     store8,
+    store_interleaved,
     sum_lanes,
     sum_lanes_of_8,
 )
 
 ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
 PREFETCH = 6  # how many list entries ahead to ask for memory
-STOP_CHECK = 16  # Gaussians between two tests whether the whole tile has stopped
+BATCH = 16  # Gaussians between two tests whether the whole tile has stopped
 
 SCALE = f32(2.0**64)
 INVERSE = f32(2.0**-64)
@@ -111,9 +115,12 @@ def has_stopped(planes):
 
 
 @finite_kernel
-def _blend_tile(packed, ranks, rows, start, end, left, top, planes):
+def _blend_tile(footprints, entries, start, end, left, top, planes, strips, strip_footprints):
     """Blend entries start..end of the list into planes = [transmittance | red | green | blue].
 
+    Takes BATCH entries at a time: first all exponentials, which do not wait for one another, then the
+    rows. In between a Gaussian is a few strips of up to ANCHOR_ROWS rows: `strips` holds where its record
+    starts and the first and last place in a plane, `strip_footprints` what `footprint_and_ratio` gives.
     Returns the entry before which the whole tile had stopped.
     """
     for k in range(0, TILE_PIXELS, 8):
@@ -124,36 +131,46 @@ def _blend_tile(packed, ranks, rows, start, end, left, top, planes):
     centre_y = f32(top) + HALF
     entry = start
     while entry < end:
-        check = min(entry + STOP_CHECK, end)
+        check = min(entry + BATCH, end)
+        count = 0
         for e in range(entry, check):
-            prefetch_read(packed, np.int64(at(ranks, min(e + PREFETCH, end - 1))) * PACKED)
-            g = np.int64(at(ranks, e)) * PACKED
-            y = at(packed, g + Y) - centre_y
-            both_rows = np.int64(at(rows, e))
-            first_row = both_rows & (TILE_HEIGHT - 1)
-            last_row = both_rows >> LAST_ROW_SHIFT
-            yy = at(packed, g + YY)
-            opacity = at(packed, g + OPACITY)
-            decay = at(packed, g + DECAY)
-            red = at(packed, g + RED)
-            green = at(packed, g + GREEN)
-            blue = at(packed, g + BLUE)
-            dx = ramp(-(at(packed, g + X) - centre_x))
-            exponent_0 = dx * dx * at(packed, g + XX)
-            exponent_1 = dx * at(packed, g + XY)
-            for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
+            prefetch_read(footprints, (at(entries, min(e + BATCH, end - 1)) & ENTRY_GAUSSIAN) * PACKED)
+            g = (at(entries, e) & ENTRY_GAUSSIAN) * PACKED
+            rows = at(entries, e) >> ENTRY_ROWS_SHIFT
+            after_rows = (rows >> LAST_ROW_SHIFT) + 1
+            y = at(footprints, g + Y) - centre_y
+            yy = at(footprints, g + YY)
+            opacity = at(footprints, g + OPACITY)
+            dx = ramp(-(at(footprints, g + X) - centre_x))
+            exponent_0 = dx * dx * at(footprints, g + XX)
+            exponent_1 = dx * at(footprints, g + XY)
+            for anchor in range(rows & (TILE_HEIGHT - 1), after_rows, ANCHOR_ROWS):
                 dy = f32(anchor) - y
                 footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
-                for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
-                    _, weight = blend_row(planes, k, footprint)
-                    footprint = footprint * ratio
-                    ratio = ratio * decay
-                    p = k + TILE_PIXELS
-                    store8(planes, p, multiply_add(weight, red, load8(planes, p)))
-                    p = k + 2 * TILE_PIXELS
-                    store8(planes, p, multiply_add(weight, green, load8(planes, p)))
-                    p = k + 3 * TILE_PIXELS
-                    store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
+                store8(strip_footprints, 16 * count, footprint)
+                store8(strip_footprints, 16 * count + 8, ratio)
+                strips[3 * count] = g
+                strips[3 * count + 1] = 8 * anchor
+                strips[3 * count + 2] = 8 * min(anchor + ANCHOR_ROWS, after_rows)
+                count += 1
+        for strip in range(count):
+            g = at(strips, 3 * strip)
+            decay = at(footprints, g + DECAY)
+            red = at(footprints, g + RED)
+            green = at(footprints, g + GREEN)
+            blue = at(footprints, g + BLUE)
+            footprint = load8(strip_footprints, 16 * strip)
+            ratio = load8(strip_footprints, 16 * strip + 8)
+            for k in range(at(strips, 3 * strip + 1), at(strips, 3 * strip + 2), 8):
+                _, weight = blend_row(planes, k, footprint)
+                footprint = footprint * ratio
+                ratio = ratio * decay
+                p = k + TILE_PIXELS
+                store8(planes, p, multiply_add(weight, red, load8(planes, p)))
+                p = k + 2 * TILE_PIXELS
+                store8(planes, p, multiply_add(weight, green, load8(planes, p)))
+                p = k + 3 * TILE_PIXELS
+                store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
         entry = check
         if has_stopped(planes):
             break
@@ -163,10 +180,9 @@ def _blend_tile(packed, ranks, rows, start, end, left, top, planes):
 @finite_kernel
 def blend(
     counter,
-    packed,
+    footprints,
     _,
-    tile_ranks,
-    tile_rows,
+    entries,
     tile_starts,
     tile_columns,
     width,
@@ -178,31 +194,47 @@ def blend(
     ends,
 ):
     """Draw all tiles; ends[t] is the first list entry of tile t that was not looked at."""
-    planes = np.empty(4 * TILE_PIXELS + 16, np.float32)
+    planes = np.empty(4 * TILE_PIXELS, np.float32)
+    strips = np.empty(3 * BATCH * (TILE_HEIGHT // ANCHOR_ROWS), np.int64)
+    strip_footprints = np.empty(16 * BATCH * (TILE_HEIGHT // ANCHOR_ROWS), np.float32)
     while True:
         tile = fetch_add(counter, 0, 1)
         if tile >= ends.shape[0]:
             break
         left = (tile % tile_columns) * TILE_WIDTH
         top = (tile // tile_columns) * TILE_HEIGHT
-        rows = min(TILE_HEIGHT, height - top)
         ends[tile] = _blend_tile(
-            packed, tile_ranks, tile_rows, tile_starts[tile], tile_starts[tile + 1], left, top, planes
-        )
-        for y in range(rows):
-            for x in range(min(TILE_WIDTH, width - left)):
-                k = y * 8 + x
-                rest = abs(planes[k]) * SCALE
-                image[top + y, left + x, 0] = planes[k + TILE_PIXELS] + rest * background[0]
-                image[top + y, left + x, 1] = planes[k + 2 * TILE_PIXELS] + rest * background[1]
-                image[top + y, left + x, 2] = planes[k + 3 * TILE_PIXELS] + rest * background[2]
-                transmittance[top + y, left + x] = rest
-                alpha[top + y, left + x] = ONE - rest
+            footprints, entries, tile_starts[tile], tile_starts[tile + 1], left, top,
+            planes, strips, strip_footprints,
+        )  # fmt: skip
+        columns = min(TILE_WIDTH, width - left)
+        for y in range(min(TILE_HEIGHT, height - top)):
+            k = 8 * y
+            pixel = (top + y) * width + left
+            if columns == TILE_WIDTH:
+                rest = (ZERO - negative_abs(load8(planes, k))) * SCALE
+                store8(transmittance, pixel, rest)
+                store8(alpha, pixel, ONE - rest)
+                store_interleaved(
+                    image,
+                    3 * pixel,
+                    multiply_add(rest, background[0], load8(planes, k + TILE_PIXELS)),
+                    multiply_add(rest, background[1], load8(planes, k + 2 * TILE_PIXELS)),
+                    multiply_add(rest, background[2], load8(planes, k + 3 * TILE_PIXELS)),
+                )
+                continue
+            for x in range(columns):
+                light = abs(planes[k + x]) * SCALE
+                transmittance[top + y, left + x] = light
+                alpha[top + y, left + x] = ONE - light
+                for channel in range(3):
+                    drawn = planes[k + x + (1 + channel) * TILE_PIXELS]
+                    image[top + y, left + x, channel] = drawn + light * background[channel]
 
 
 @finite_kernel
 def _blend_tile_backward(
-    packed, ranks, rows, slots, start, end, left, top, planes, moments, extras, extra_width, absgrad
+    footprints, entries, slots, start, end, left, top, planes, moments, extras, extra_width, absgrad
 ):
     """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
 
@@ -215,22 +247,21 @@ def _blend_tile_backward(
     zero = splat(ZERO)
     for e in range(start, end):
         ahead = min(e + PREFETCH, end - 1)
-        prefetch_read(packed, np.int64(at(ranks, ahead)) * PACKED)
+        prefetch_read(footprints, (at(entries, ahead) & ENTRY_GAUSSIAN) * PACKED)
         prefetch_write(moments, np.int64(at(slots, ahead)) * MOMENTS)
-        g = np.int64(at(ranks, e)) * PACKED
-        y = at(packed, g + Y) - centre_y
-        both_rows = np.int64(at(rows, e))
-        first_row = both_rows & (TILE_HEIGHT - 1)
-        last_row = both_rows >> LAST_ROW_SHIFT
-        xx = at(packed, g + XX)
-        xy = at(packed, g + XY)
-        yy = at(packed, g + YY)
-        opacity = at(packed, g + OPACITY)
-        decay = at(packed, g + DECAY)
-        red = at(packed, g + RED)
-        green = at(packed, g + GREEN)
-        blue = at(packed, g + BLUE)
-        dx = ramp(-(at(packed, g + X) - centre_x))
+        g = (at(entries, e) & ENTRY_GAUSSIAN) * PACKED
+        rows = at(entries, e) >> ENTRY_ROWS_SHIFT
+        after_rows = (rows >> LAST_ROW_SHIFT) + 1
+        y = at(footprints, g + Y) - centre_y
+        xx = at(footprints, g + XX)
+        xy = at(footprints, g + XY)
+        yy = at(footprints, g + YY)
+        opacity = at(footprints, g + OPACITY)
+        decay = at(footprints, g + DECAY)
+        red = at(footprints, g + RED)
+        green = at(footprints, g + GREEN)
+        blue = at(footprints, g + BLUE)
+        dx = ramp(-(at(footprints, g + X) - centre_x))
         exponent_0 = dx * dx * xx
         exponent_1 = dx * xy
         sum_1 = zero
@@ -241,11 +272,11 @@ def _blend_tile_backward(
         sum_blue = zero
         sum_abs_x = zero
         sum_abs_y = zero
-        for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
+        for anchor in range(rows & (TILE_HEIGHT - 1), after_rows, ANCHOR_ROWS):
             dy = f32(anchor) - y
             footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
             row_dy = splat(dy)
-            for k in range(anchor * 8, min(anchor + ANCHOR_ROWS, last_row + 1) * 8, 8):
+            for k in range(8 * anchor, 8 * min(anchor + ANCHOR_ROWS, after_rows), 8):
                 alpha, weight = blend_row(planes, k, footprint)
                 gradient_red = load8(planes, k + 2 * TILE_PIXELS)
                 gradient_green = load8(planes, k + 3 * TILE_PIXELS)
@@ -289,11 +320,10 @@ def _blend_tile_backward(
 @finite_kernel
 def blend_backward(
     counter,
-    packed,
+    footprints,
     _,
-    tile_ranks,
-    tile_rows,
-    tile_slots,
+    entries,
+    entry_slots,
     tile_starts,
     ends,
     tile_columns,
@@ -319,40 +349,42 @@ def blend_backward(
         rows = min(TILE_HEIGHT, height - top)
         columns = min(TILE_WIDTH, width - left)
         for e in range(ends[tile], tile_starts[tile + 1]):
-            slot = np.int64(at(tile_slots, e))
+            slot = np.int64(at(entry_slots, e))
             store8(moments, slot * MOMENTS, splat(ZERO))
             for k in range(slot * extra_width, (slot + 1) * extra_width):
                 extras[k] = ZERO
         if tile_starts[tile] == ends[tile]:
             continue
         for y in range(rows):
+            k = 8 * y
+            pixel = (top + y) * width + left
+            if columns == TILE_WIDTH:
+                red, green, blue = load_interleaved(image_gradient, 3 * pixel)
+                drawn_red, drawn_green, drawn_blue = load_interleaved(image, 3 * pixel)
+                behind = red * drawn_red + green * drawn_green + blue * drawn_blue
+                behind = behind - load8(alpha_gradient, pixel) * load8(transmittance, pixel)
+                store8(planes, k, splat(INVERSE))
+                store8(planes, k + TILE_PIXELS, behind)
+                store8(planes, k + 2 * TILE_PIXELS, red)
+                store8(planes, k + 3 * TILE_PIXELS, green)
+                store8(planes, k + 4 * TILE_PIXELS, blue)
+                continue
             for x in range(TILE_WIDTH):
-                k = y * 8 + x
-                if x < columns:
-                    red = image_gradient[top + y, left + x, 0]
-                    green = image_gradient[top + y, left + x, 1]
-                    blue = image_gradient[top + y, left + x, 2]
-                    planes[k] = INVERSE
-                    planes[k + TILE_PIXELS] = (
-                        red * image[top + y, left + x, 0]
-                        + green * image[top + y, left + x, 1]
-                        + blue * image[top + y, left + x, 2]
-                        - alpha_gradient[top + y, left + x] * transmittance[top + y, left + x]
-                    )
-                    planes[k + 2 * TILE_PIXELS] = red
-                    planes[k + 3 * TILE_PIXELS] = green
-                    planes[k + 4 * TILE_PIXELS] = blue
-                else:
-                    planes[k] = -INVERSE
-                    planes[k + TILE_PIXELS] = ZERO
-                    planes[k + 2 * TILE_PIXELS] = ZERO
-                    planes[k + 3 * TILE_PIXELS] = ZERO
-                    planes[k + 4 * TILE_PIXELS] = ZERO
+                inside = x < columns
+                planes[k + x] = INVERSE if inside else -INVERSE
+                light_behind = ZERO
+                if inside:
+                    light_behind = -alpha_gradient[top + y, left + x] * transmittance[top + y, left + x]
+                for channel in range(3):
+                    gradient = image_gradient[top + y, left + x, channel] if inside else ZERO
+                    planes[k + x + (2 + channel) * TILE_PIXELS] = gradient
+                    if inside:
+                        light_behind += gradient * image[top + y, left + x, channel]
+                planes[k + x + TILE_PIXELS] = light_behind
         _blend_tile_backward(
-            packed,
-            tile_ranks,
-            tile_rows,
-            tile_slots,
+            footprints,
+            entries,
+            entry_slots,
             tile_starts[tile],
             ends[tile],
             left,

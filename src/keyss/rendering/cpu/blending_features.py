@@ -13,11 +13,11 @@ import numpy as np
 
 from keyss.rendering.cpu.blending import (
     ANCHOR_ROWS,
+    BATCH,
     INVERSE,
     PREFETCH,
     SCALE,
     SCALED_ALPHA_MAX,
-    STOP_CHECK,
     blend_row,
     footprint_and_ratio,
     has_stopped,
@@ -25,6 +25,8 @@ from keyss.rendering.cpu.blending import (
 from keyss.rendering.cpu.jit import finite_kernel
 from keyss.rendering.cpu.layout import (
     DECAY,
+    ENTRY_GAUSSIAN,
+    ENTRY_ROWS_SHIFT,
     HALF,
     LAST_ROW_SHIFT,
     MOMENTS,
@@ -62,7 +64,7 @@ from keyss.rendering.cpu.simd8 import (
 
 
 @finite_kernel
-def _blend_tile(packed, features, channels, ranks, rows, start, end, left, top, planes, weights):
+def _blend_tile(footprints, features, channels, entries, start, end, left, top, planes, weights):
     """Blend entries start..end of the list into planes = [transmittance | one per channel].
 
     Returns the entry before which the whole tile had stopped.
@@ -75,23 +77,23 @@ def _blend_tile(packed, features, channels, ranks, rows, start, end, left, top, 
     centre_y = f32(top) + HALF
     entry = start
     while entry < end:
-        check = min(entry + STOP_CHECK, end)
+        check = min(entry + BATCH, end)
         for e in range(entry, check):
-            ahead = np.int64(at(ranks, min(e + PREFETCH, end - 1)))
-            prefetch_read(packed, ahead * PACKED)
+            ahead = at(entries, min(e + PREFETCH, end - 1)) & ENTRY_GAUSSIAN
+            prefetch_read(footprints, ahead * PACKED)
             prefetch_read(features, ahead * channels)
-            rank = np.int64(at(ranks, e))
-            g = rank * PACKED
-            y = at(packed, g + Y) - centre_y
-            both_rows = np.int64(at(rows, e))
-            first_row = both_rows & (TILE_HEIGHT - 1)
-            last_row = both_rows >> LAST_ROW_SHIFT
-            yy = at(packed, g + YY)
-            opacity = at(packed, g + OPACITY)
-            decay = at(packed, g + DECAY)
-            dx = ramp(-(at(packed, g + X) - centre_x))
-            exponent_0 = dx * dx * at(packed, g + XX)
-            exponent_1 = dx * at(packed, g + XY)
+            i = at(entries, e) & ENTRY_GAUSSIAN
+            g = i * PACKED
+            rows = at(entries, e) >> ENTRY_ROWS_SHIFT
+            first_row = rows & (TILE_HEIGHT - 1)
+            last_row = rows >> LAST_ROW_SHIFT
+            y = at(footprints, g + Y) - centre_y
+            yy = at(footprints, g + YY)
+            opacity = at(footprints, g + OPACITY)
+            decay = at(footprints, g + DECAY)
+            dx = ramp(-(at(footprints, g + X) - centre_x))
+            exponent_0 = dx * dx * at(footprints, g + XX)
+            exponent_1 = dx * at(footprints, g + XY)
             for anchor in range(first_row, last_row + 1, ANCHOR_ROWS):
                 dy = f32(anchor) - y
                 footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
@@ -101,7 +103,7 @@ def _blend_tile(packed, features, channels, ranks, rows, start, end, left, top, 
                     footprint = footprint * ratio
                     ratio = ratio * decay
             for channel in range(channels):
-                value = at(features, rank * channels + channel)
+                value = at(features, i * channels + channel)
                 plane = (1 + channel) * TILE_PIXELS
                 for k in range(first_row * 8, (last_row + 1) * 8, 8):
                     p = plane + k
@@ -115,10 +117,9 @@ def _blend_tile(packed, features, channels, ranks, rows, start, end, left, top, 
 @finite_kernel
 def blend_features(
     counter,
-    packed,
+    footprints,
     features,
-    tile_ranks,
-    tile_rows,
+    entries,
     tile_starts,
     tile_columns,
     width,
@@ -141,7 +142,7 @@ def blend_features(
         top = (tile // tile_columns) * TILE_HEIGHT
         rows = min(TILE_HEIGHT, height - top)
         ends[tile] = _blend_tile(
-            packed, features, channels, tile_ranks, tile_rows, tile_starts[tile], tile_starts[tile + 1],
+            footprints, features, channels, entries, tile_starts[tile], tile_starts[tile + 1],
             left, top, planes, weights,
         )  # fmt: skip
         for y in range(rows):
@@ -157,11 +158,10 @@ def blend_features(
 
 @finite_kernel
 def _blend_tile_backward(
-    packed,
+    footprints,
     features,
     channels,
-    ranks,
-    rows,
+    entries,
     slots,
     start,
     end,
@@ -185,31 +185,31 @@ def _blend_tile_backward(
     zero = splat(ZERO)
     for e in range(start, end):
         ahead = min(e + PREFETCH, end - 1)
-        rank_ahead = np.int64(at(ranks, ahead))
+        gaussian_ahead = at(entries, ahead) & ENTRY_GAUSSIAN
         slot_ahead = np.int64(at(slots, ahead))
-        prefetch_read(packed, rank_ahead * PACKED)
-        prefetch_read(features, rank_ahead * channels)
+        prefetch_read(footprints, gaussian_ahead * PACKED)
+        prefetch_read(features, gaussian_ahead * channels)
         prefetch_write(moments, slot_ahead * MOMENTS)
         prefetch_write(extras, slot_ahead * extra_width)
-        rank = np.int64(at(ranks, e))
+        i = at(entries, e) & ENTRY_GAUSSIAN
         slot = np.int64(at(slots, e))
-        g = rank * PACKED
-        y = at(packed, g + Y) - centre_y
-        both_rows = np.int64(at(rows, e))
-        first_row = both_rows & (TILE_HEIGHT - 1)
-        last_row = both_rows >> LAST_ROW_SHIFT
-        xx = at(packed, g + XX)
-        xy = at(packed, g + XY)
-        yy = at(packed, g + YY)
-        opacity = at(packed, g + OPACITY)
-        decay = at(packed, g + DECAY)
-        dx = ramp(-(at(packed, g + X) - centre_x))
+        g = i * PACKED
+        rows = at(entries, e) >> ENTRY_ROWS_SHIFT
+        first_row = rows & (TILE_HEIGHT - 1)
+        last_row = rows >> LAST_ROW_SHIFT
+        y = at(footprints, g + Y) - centre_y
+        xx = at(footprints, g + XX)
+        xy = at(footprints, g + XY)
+        yy = at(footprints, g + YY)
+        opacity = at(footprints, g + OPACITY)
+        decay = at(footprints, g + DECAY)
+        dx = ramp(-(at(footprints, g + X) - centre_x))
         exponent_0 = dx * dx * xx
         exponent_1 = dx * xy
         for k in range(first_row * 8, (last_row + 1) * 8, 8):
             store8(products, k, zero)
         for channel in range(channels):
-            value = at(features, rank * channels + channel)
+            value = at(features, i * channels + channel)
             plane = (2 + channel) * TILE_PIXELS
             for k in range(first_row * 8, (last_row + 1) * 8, 8):
                 store8(products, k, multiply_add(load8(planes, plane + k), value, load8(products, k)))
@@ -263,11 +263,10 @@ def _blend_tile_backward(
 @finite_kernel
 def blend_features_backward(
     counter,
-    packed,
+    footprints,
     features,
-    tile_ranks,
-    tile_rows,
-    tile_slots,
+    entries,
+    entry_slots,
     tile_starts,
     ends,
     tile_columns,
@@ -296,7 +295,7 @@ def blend_features_backward(
         rows = min(TILE_HEIGHT, height - top)
         columns = min(TILE_WIDTH, width - left)
         for e in range(ends[tile], tile_starts[tile + 1]):
-            slot = np.int64(at(tile_slots, e))
+            slot = np.int64(at(entry_slots, e))
             store8(moments, slot * MOMENTS, splat(ZERO))
             for k in range(slot * extra_width, (slot + 1) * extra_width):
                 extras[k] = ZERO
@@ -319,6 +318,6 @@ def blend_features_backward(
                     planes[k + (2 + channel) * TILE_PIXELS] = gradient
                 planes[k + TILE_PIXELS] = behind
         _blend_tile_backward(
-            packed, features, channels, tile_ranks, tile_rows, tile_slots, tile_starts[tile], ends[tile],
+            footprints, features, channels, entries, entry_slots, tile_starts[tile], ends[tile],
             left, top, planes, weights, products, moments, extras, extra_width, absgrad,
         )  # fmt: skip

@@ -19,8 +19,10 @@ TILE_WIDTH_LOG2 = 3
 TILE_HEIGHT_LOG2 = 5
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 LAST_ROW_SHIFT = 5  # the rows that a Gaussian meets in a tile are kept as first | last << this
+ENTRY_ROWS_SHIFT = 32  # an entry in a tile's list is Gaussian | rows << this
+ENTRY_GAUSSIAN = 2**ENTRY_ROWS_SHIFT - 1  # mask
 
-# The packed record of a visible Gaussian: one cache line.
+# The packed record of a Gaussian's footprint: one cache line.
 PACKED = 16
 X = 0  # centre in pixels
 Y = 1

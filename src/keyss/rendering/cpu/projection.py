@@ -3,17 +3,16 @@
 The covariance in the image is V V^T + eps2d I with the 2x3 matrix V = J W R S: the Jacobian of the
 perspective, the camera rotation, the Gaussian's rotation and scales. V itself is kept rather than the
 product, because its determinant is then a sum of squares and cannot cancel.
+
+Gaussians are taken 8 at a time, one in each lane of the vectors.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from keyss.rendering.cpu.binning import tile_box
 from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
@@ -21,60 +20,100 @@ from keyss.rendering.cpu.layout import (
     CHUNK,
     CX,
     CY,
-    DECAY,
-    EXTENT_X,
-    EXTENT_Y,
     FOV_MARGIN,
     FX,
     FY,
     GREEN,
     HALF,
     HUGE,
-    LEVEL,
     NORM_MIN,
     ONE,
-    OPACITY,
     PACKED,
     POSITION,
     RADIUS_SIGMAS,
     RED,
+    TILE_HEIGHT,
+    TILE_WIDTH,
     TWO,
     TX,
     TY,
     TZ,
-    XX,
-    XY,
-    YY,
     ZERO,
-    X,
-    Y,
     f32,
 )
 from keyss.rendering.cpu.sh import sh_basis
-from keyss.rendering.cpu.simd8 import ceil, fetch_add, prefetch_write
+from keyss.rendering.cpu.simd8 import (
+    at,
+    ceil8,
+    divide,
+    exp,
+    fetch_add,
+    floor8,
+    gather8,
+    load3,
+    load4,
+    load8,
+    log,
+    maximum,
+    minimum,
+    multiply_add,
+    select_ge,
+    select_gt,
+    splat,
+    square_root,
+    store8,
+    transpose,
+)
 
-PREFETCH = 12  # how many Gaussians ahead to ask for memory
+RADIUS_MAX = f32(2**30)
+COLUMN = f32(1 / TILE_WIDTH)
+ROW = f32(1 / TILE_HEIGHT)
+
+
+@kernel
+def gather3(array, ids, start):
+    """Columns of the rows ids[start:start + 8] of an array [N, 3], as 3 vectors."""
+    x, y, z, _, _, _, _, _ = transpose(
+        load3(array, 3 * at(ids, start)), load3(array, 3 * at(ids, start + 1)),
+        load3(array, 3 * at(ids, start + 2)), load3(array, 3 * at(ids, start + 3)),
+        load3(array, 3 * at(ids, start + 4)), load3(array, 3 * at(ids, start + 5)),
+        load3(array, 3 * at(ids, start + 6)), load3(array, 3 * at(ids, start + 7)),
+    )  # fmt: skip
+    return x, y, z
+
+
+@kernel
+def gather4(array, ids, start):
+    """Columns of the rows ids[start:start + 8] of an array [N, 4], as 4 vectors."""
+    w, x, y, z, _, _, _, _ = transpose(
+        load4(array, 4 * at(ids, start)), load4(array, 4 * at(ids, start + 1)),
+        load4(array, 4 * at(ids, start + 2)), load4(array, 4 * at(ids, start + 3)),
+        load4(array, 4 * at(ids, start + 4)), load4(array, 4 * at(ids, start + 5)),
+        load4(array, 4 * at(ids, start + 6)), load4(array, 4 * at(ids, start + 7)),
+    )  # fmt: skip
+    return w, x, y, z
 
 
 @kernel
 def rotation_matrix(w, x, y, z):
-    """The 9 entries, row-major, of the rotation by the quaternion; a zero quaternion is the identity."""
-    scale = ONE / math.sqrt(max(w * w + x * x + y * y + z * z, NORM_MIN))
-    w *= scale
-    x *= scale
-    y *= scale
-    z *= scale
+    """The 9 entries, row-major, of the rotations by unit quaternions."""
     return (
-        ONE - TWO * (y * y + z * z),
-        TWO * (x * y - w * z),
-        TWO * (x * z + w * y),
-        TWO * (x * y + w * z),
-        ONE - TWO * (x * x + z * z),
-        TWO * (y * z - w * x),
-        TWO * (x * z - w * y),
-        TWO * (y * z + w * x),
-        ONE - TWO * (x * x + y * y),
+        ONE - (y * y + z * z) * TWO,
+        (x * y - w * z) * TWO,
+        (x * z + w * y) * TWO,
+        (x * y + w * z) * TWO,
+        ONE - (x * x + z * z) * TWO,
+        (y * z - w * x) * TWO,
+        (x * z - w * y) * TWO,
+        (y * z + w * x) * TWO,
+        ONE - (x * x + y * y) * TWO,
     )
+
+
+@kernel
+def inverse_length(square):
+    """1 / sqrt(square), for squares of no length a finite number."""
+    return divide(ONE, square_root(maximum(square, NORM_MIN)))
 
 
 @kernel
@@ -93,12 +132,37 @@ def slope_limits(camera, width, height):
 
 
 @kernel
+def camera_coordinates(camera, px, py, pz):
+    """x, y and depth in the camera's frame of points of the world."""
+    return (
+        px * camera[0] + py * camera[1] + pz * camera[2] + camera[TX],
+        px * camera[3] + py * camera[4] + pz * camera[5] + camera[TY],
+        px * camera[6] + py * camera[7] + pz * camera[8] + camera[TZ],
+    )
+
+
+@kernel
+def jacobian_rows(camera, jxx, jxz, jyy, jyz):
+    """The 6 entries of J W."""
+    return (
+        jxx * camera[0] + jxz * camera[6],
+        jxx * camera[1] + jxz * camera[7],
+        jxx * camera[2] + jxz * camera[8],
+        jyy * camera[3] + jyz * camera[6],
+        jyy * camera[4] + jyz * camera[7],
+        jyy * camera[5] + jyz * camera[8],
+    )
+
+
+@kernel
 def project(
     counter,
     means,
     quats,
     scales,
     opacities,
+    colors,
+    sh_count,
     camera,
     width,
     height,
@@ -108,214 +172,279 @@ def project(
     radius_clip,
     antialiased,
     footprints,
+    features,
     means2d,
     depths,
     radii,
+    tile_bounds,
 ):
-    """Fill one row per Gaussian of `footprints` (packed layout without colour), means2d, depths and radii.
+    """Fill one row per Gaussian of `footprints` (packed layout), means2d, depths, radii and tile_bounds.
 
-    A Gaussian that cannot be seen gets depth 0 and radii 0; its footprint is left as it is. With
-    `antialiased` the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that widening a
-    footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
+    tile_bounds[i] is a number of tiles that the Gaussian meets at most. What cannot be seen, or has no
+    finite colour, gets depth 0, radii 0 and no tiles; its footprint means nothing. sh_count is the number
+    of SH coefficients to use, or 0 where colors[:, 0] is the colour itself. Where `features` has columns,
+    it gets the channels to draw: the colour, of any number of channels, and in one column more the depth.
+
+    With `antialiased` the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that
+    widening a footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
     """
     count = means.shape[0]
-    image_width = f32(width)
-    image_height = f32(height)
-    x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
+    ids = np.empty(CHUNK + 8, np.int64)
+    seen = np.empty(CHUNK + 8, np.int64)
+    results = np.empty(64, np.float32)
+    rgb = np.empty(24, np.float32)
+    basis = np.empty(16 * 8, np.float32)
+    coefficients = np.empty(48 * 8, np.float32)
     while True:
         start = fetch_add(counter, 0, 1) * CHUNK
         if start >= count:
             break
-        for i in range(start, min(start + CHUNK, count)):
-            depths[i] = ZERO
-            means2d[i, 0] = ZERO
-            means2d[i, 1] = ZERO
-            radii[i, 0] = 0
-            radii[i, 1] = 0
-            # Every test below is written so that a NaN fails it.
-            opacity = opacities[i]
-            if not (opacity >= ALPHA_MIN and opacity < HUGE):
-                continue
-            px = means[i, 0]
-            py = means[i, 1]
-            pz = means[i, 2]
-            z = camera[6] * px + camera[7] * py + camera[8] * pz + camera[TZ]
-            if not (z >= near and z <= far):
-                continue
-            x = camera[0] * px + camera[1] * py + camera[2] * pz + camera[TX]
-            y = camera[3] * px + camera[4] * py + camera[5] * pz + camera[TY]
-            rz = ONE / z
-            u = x * rz
-            v = y * rz
-            mean_x = camera[FX] * u + camera[CX]
-            mean_y = camera[FY] * v + camera[CY]
-            u = min(max(u, x_low), x_high)
-            v = min(max(v, y_low), y_high)
-            jxx = camera[FX] * rz
-            jxz = -jxx * u
-            jyy = camera[FY] * rz
-            jyz = -jyy * v
-            a0 = jxx * camera[0] + jxz * camera[6]
-            a1 = jxx * camera[1] + jxz * camera[7]
-            a2 = jxx * camera[2] + jxz * camera[8]
-            b0 = jyy * camera[3] + jyz * camera[6]
-            b1 = jyy * camera[4] + jyz * camera[7]
-            b2 = jyy * camera[5] + jyz * camera[8]
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(
-                quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-            )
-            s0 = scales[i, 0]
-            s1 = scales[i, 1]
-            s2 = scales[i, 2]
-            u0 = (a0 * r00 + a1 * r10 + a2 * r20) * s0
-            u1 = (a0 * r01 + a1 * r11 + a2 * r21) * s1
-            u2 = (a0 * r02 + a1 * r12 + a2 * r22) * s2
-            v0 = (b0 * r00 + b1 * r10 + b2 * r20) * s0
-            v1 = (b0 * r01 + b1 * r11 + b2 * r21) * s1
-            v2 = (b0 * r02 + b1 * r12 + b2 * r22) * s2
-            cov_xx = u0 * u0 + u1 * u1 + u2 * u2
-            cov_xy = u0 * v0 + u1 * v1 + u2 * v2
-            cov_yy = v0 * v0 + v1 * v1 + v2 * v2
-            # |u x v|^2 is det(V V^T) by Cauchy-Binet.
-            n0 = u1 * v2 - u2 * v1
-            n1 = u2 * v0 - u0 * v2
-            n2 = u0 * v1 - u1 * v0
-            sharp_det = n0 * n0 + n1 * n1 + n2 * n2
-            det = sharp_det + eps2d * (cov_xx + cov_yy + eps2d)
-            if not det < HUGE:
-                continue
-            if antialiased:
-                opacity *= math.sqrt(sharp_det / det)
-                if not opacity >= ALPHA_MIN:
-                    continue
-            cov_xx += eps2d
-            cov_yy += eps2d
-            level = max(TWO * math.log(f32(255.0) * opacity), ZERO)
-            sigmas = math.sqrt(level)
-            sigma_x = math.sqrt(cov_xx)
-            sigma_y = math.sqrt(cov_yy)
-            reach = sigmas if sigmas < RADIUS_SIGMAS else RADIUS_SIGMAS
-            radius_x = ceil(reach * sigma_x)
-            radius_y = ceil(reach * sigma_y)
-            if f32(max(radius_x, radius_y)) <= radius_clip:
-                continue
-            if not (
-                mean_x + f32(radius_x) > ZERO
-                and mean_x - f32(radius_x) < image_width
-                and mean_y + f32(radius_y) > ZERO
-                and mean_y - f32(radius_y) < image_height
-            ):
-                continue
-            inverse = ONE / det
-            means2d[i, 0] = mean_x
-            means2d[i, 1] = mean_y
-            depths[i] = z
-            radii[i, 0] = min(radius_x, 2**30)
-            radii[i, 1] = min(radius_y, 2**30)
-            footprints[i, X] = mean_x
-            footprints[i, Y] = mean_y
-            footprints[i, XX] = -HALF * cov_yy * inverse
-            footprints[i, XY] = cov_xy * inverse
-            footprints[i, YY] = -HALF * cov_xx * inverse
-            footprints[i, LEVEL] = level
-            footprints[i, OPACITY] = opacity
-            # A little wider than exact, so that rounding never cuts off a pixel that counts.
-            footprints[i, EXTENT_X] = sigmas * sigma_x * f32(1.0005) + f32(1e-3)
-            footprints[i, EXTENT_Y] = sigmas * sigma_y * f32(1.0005) + f32(1e-3)
-            footprints[i, DECAY] = math.exp(-cov_xx * inverse)
+        size = min(CHUNK, count - start)
+        for k in range(CHUNK + 8):
+            ids[k] = start + min(k, size - 1)
+        visible = 0
+        for k in range(0, size, 8):
+            _project(
+                means, quats, scales, opacities, camera, width, height, near, far, eps2d, radius_clip,
+                antialiased, footprints, ids, k, results,
+            )  # fmt: skip
+            for lane in range(min(8, size - k)):
+                i = start + k + lane
+                means2d[i, 0] = results[lane]
+                means2d[i, 1] = results[8 + lane]
+                depths[i] = results[16 + lane]
+                radii[i, 0] = np.int32(results[24 + lane])
+                radii[i, 1] = np.int32(results[32 + lane])
+                tile_bounds[i] = np.int32(results[40 + lane])
+                seen[visible] = i
+                visible += results[16 + lane] > ZERO
+        for k in range(visible, min(visible + 8, CHUNK + 8)):
+            seen[k] = seen[max(visible - 1, 0)]
+        if sh_count > 0:
+            for k in range(0, visible, 8):
+                _shade(means, colors, sh_count, camera, seen, k, basis, coefficients, rgb)
+                for lane in range(min(8, visible - k)):
+                    i = seen[k + lane]
+                    for channel in range(3):
+                        value = rgb[8 * channel + lane]
+                        footprints[i, RED + channel] = max(value, ZERO)
+                        # Every test is written so that a NaN fails it.
+                        if not abs(value) < HUGE:
+                            _hide(i, depths, radii, tile_bounds)
+        else:
+            _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds)
+        if features.shape[1] > 0:
+            _copy_features(sh_count, colors.shape[2], seen, visible, footprints, depths, features)
 
 
 @kernel
-def pack(
-    counter,
-    footprints,
-    means,
-    colors,
-    sh_count,
-    camera,
-    tile_columns,
-    tile_rows,
-    depths,
-    rank,
-    radii,
-    packed,
-    features,
-    tile_bounds,
-):
-    """Copy the footprints of visible Gaussians into depth order, with their colours as seen from the camera.
+def _project(
+    means, quats, scales, opacities, camera, width, height, near, far, eps2d, radius_clip, antialiased,
+    footprints, ids, start, results,
+):  # fmt: skip
+    """Footprints without colour; results = [mean x | mean y | depth | radius x | radius y | tiles]."""
+    x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
+    fx = camera[FX]
+    fy = camera[FY]
+    opacity = gather8(opacities, ids, start)
+    px, py, pz = gather3(means, ids, start)
+    x, y, z = camera_coordinates(camera, px, py, pz)
+    # `seen` is 1 or 0. Every test is written so that a NaN fails it.
+    seen = select_ge(opacity, ALPHA_MIN, ONE, ZERO)
+    seen = select_gt(HUGE, opacity, seen, ZERO)
+    seen = select_ge(z, near, seen, ZERO)
+    seen = select_ge(far, z, seen, ZERO)
+    rz = divide(ONE, z)
+    u = x * rz
+    v = y * rz
+    mean_x = multiply_add(u, fx, splat(camera[CX]))
+    mean_y = multiply_add(v, fy, splat(camera[CY]))
+    u = minimum(maximum(u, x_low), x_high)
+    v = minimum(maximum(v, y_low), y_high)
+    jxx = rz * fx
+    jyy = rz * fy
+    a0, a1, a2, b0, b1, b2 = jacobian_rows(camera, jxx, ZERO - jxx * u, jyy, ZERO - jyy * v)
+    w, i, j, k = gather4(quats, ids, start)
+    norm = inverse_length(w * w + i * i + j * j + k * k)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(w * norm, i * norm, j * norm, k * norm)
+    s0, s1, s2 = gather3(scales, ids, start)
+    u0 = (a0 * r00 + a1 * r10 + a2 * r20) * s0
+    u1 = (a0 * r01 + a1 * r11 + a2 * r21) * s1
+    u2 = (a0 * r02 + a1 * r12 + a2 * r22) * s2
+    v0 = (b0 * r00 + b1 * r10 + b2 * r20) * s0
+    v1 = (b0 * r01 + b1 * r11 + b2 * r21) * s1
+    v2 = (b0 * r02 + b1 * r12 + b2 * r22) * s2
+    cov_xx = u0 * u0 + u1 * u1 + u2 * u2
+    cov_xy = u0 * v0 + u1 * v1 + u2 * v2
+    cov_yy = v0 * v0 + v1 * v1 + v2 * v2
+    # |u x v|^2 is det(V V^T) by Cauchy-Binet.
+    n0 = u1 * v2 - u2 * v1
+    n1 = u2 * v0 - u0 * v2
+    n2 = u0 * v1 - u1 * v0
+    sharp_det = n0 * n0 + n1 * n1 + n2 * n2
+    det = sharp_det + (cov_xx + cov_yy + eps2d) * eps2d
+    seen = select_gt(HUGE, det, seen, ZERO)
+    inverse = divide(ONE, det)
+    if antialiased:
+        opacity = opacity * square_root(sharp_det * inverse)
+        seen = select_ge(opacity, ALPHA_MIN, seen, ZERO)
+    cov_xx = cov_xx + eps2d
+    cov_yy = cov_yy + eps2d
+    level = maximum(log(maximum(opacity * f32(255.0), ONE)) * TWO, ZERO)
+    sigmas = square_root(level)
+    sigma_x = square_root(cov_xx)
+    sigma_y = square_root(cov_yy)
+    reach = minimum(sigmas, RADIUS_SIGMAS)
+    radius_x = ceil8(reach * sigma_x)
+    radius_y = ceil8(reach * sigma_y)
+    seen = select_gt(maximum(radius_x, radius_y), radius_clip, seen, ZERO)
+    seen = select_gt(mean_x + radius_x, ZERO, seen, ZERO)
+    seen = select_gt(f32(width), mean_x - radius_x, seen, ZERO)
+    seen = select_gt(mean_y + radius_y, ZERO, seen, ZERO)
+    seen = select_gt(f32(height), mean_y - radius_y, seen, ZERO)
+    # A little wider than exact, so that rounding never cuts off a pixel that counts.
+    extent_x = sigmas * sigma_x * f32(1.0005) + f32(1e-3)
+    extent_y = sigmas * sigma_y * f32(1.0005) + f32(1e-3)
+    columns = _tiles(mean_x, extent_x, width, COLUMN)
+    rows = _tiles(mean_y, extent_y, height, ROW)
+    store8(results, 0, select_gt(seen, HALF, mean_x, ZERO))
+    store8(results, 8, select_gt(seen, HALF, mean_y, ZERO))
+    store8(results, 16, select_gt(seen, HALF, z, ZERO))
+    store8(results, 24, select_gt(seen, HALF, minimum(radius_x, RADIUS_MAX), ZERO))
+    store8(results, 32, select_gt(seen, HALF, minimum(radius_y, RADIUS_MAX), ZERO))
+    store8(results, 40, select_gt(seen, HALF, columns * rows, ZERO))
 
-    sh_count is the number of SH coefficients to use, or 0 where colors[:, 0] is the colour itself.
-    Where `features` has columns, it gets the channels to draw: the colour, of any number of channels, and
-    in one column more the depth. tile_bounds[r] becomes a number of tiles that Gaussian r of the depth
-    order meets at most. A Gaussian without a finite colour is hidden: its rank becomes -1, its radii and
-    extents are made empty.
-    """
-    count = rank.shape[0]
-    channels = features.shape[1]
-    basis = np.empty(16, np.float32)
-    while True:
-        start = fetch_add(counter, 0, 1) * CHUNK
-        if start >= count:
-            break
-        for i in range(start, min(start + CHUNK, count)):
-            prefetch_write(packed, np.int64(rank[min(i + PREFETCH, count - 1)]) * PACKED)
-            r = rank[i]
-            if r < 0:
-                continue
-            for k in range(DECAY + 1):
-                packed[r, k] = footprints[i, k]
-            finite = True
-            red = ZERO
-            green = ZERO
-            blue = ZERO
-            if sh_count == 0 and channels > 0:
-                for channel in range(colors.shape[2]):
-                    finite = finite and abs(colors[i, 0, channel]) < HUGE
-                    features[r, channel] = colors[i, 0, channel]
-            elif sh_count == 0:
-                red = colors[i, 0, 0]
-                green = colors[i, 0, 1]
-                blue = colors[i, 0, 2]
+    zero = splat(ZERO)
+    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(
+        mean_x, mean_y, cov_yy * inverse * -HALF, cov_xy * inverse, cov_xx * inverse * -HALF,
+        level, opacity, zero,
+    )  # fmt: skip
+    store8(footprints, at(ids, start) * PACKED, h0)
+    store8(footprints, at(ids, start + 1) * PACKED, h1)
+    store8(footprints, at(ids, start + 2) * PACKED, h2)
+    store8(footprints, at(ids, start + 3) * PACKED, h3)
+    store8(footprints, at(ids, start + 4) * PACKED, h4)
+    store8(footprints, at(ids, start + 5) * PACKED, h5)
+    store8(footprints, at(ids, start + 6) * PACKED, h6)
+    store8(footprints, at(ids, start + 7) * PACKED, h7)
+    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(
+        zero, zero, extent_x, extent_y, exp(ZERO - cov_xx * inverse), zero, zero, zero
+    )
+    store8(footprints, at(ids, start) * PACKED + 8, h0)
+    store8(footprints, at(ids, start + 1) * PACKED + 8, h1)
+    store8(footprints, at(ids, start + 2) * PACKED + 8, h2)
+    store8(footprints, at(ids, start + 3) * PACKED + 8, h3)
+    store8(footprints, at(ids, start + 4) * PACKED + 8, h4)
+    store8(footprints, at(ids, start + 5) * PACKED + 8, h5)
+    store8(footprints, at(ids, start + 6) * PACKED + 8, h6)
+    store8(footprints, at(ids, start + 7) * PACKED + 8, h7)
+
+
+@kernel
+def _tiles(centre, extent, size, per_pixel):
+    """How many tiles, along one axis, hold pixel centres within the extents."""
+    first = floor8(maximum(ceil8(centre - extent - HALF), ZERO) * per_pixel)
+    last = floor8(minimum(floor8(centre + extent - HALF), f32(size - 1)) * per_pixel)
+    return maximum(last - first + ONE, ZERO)
+
+
+@kernel
+def view_directions(camera, px, py, pz):
+    """Unit vectors from the camera to points of the world, and the inverse of the distances."""
+    x = px - camera[POSITION]
+    y = py - camera[POSITION + 1]
+    z = pz - camera[POSITION + 2]
+    inverse = inverse_length(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel
+def load_coefficients(colors, sh_count, ids, start, coefficients):
+    """SH coefficients of the 8 Gaussians ids[start:]: number k of channel c as the vector at 8 (3 k + c)."""
+    stride = colors.shape[1] * 3
+    used = sh_count * 3
+    if used < 8:
+        for lane in range(8):
+            for k in range(used):
+                coefficients[8 * k + lane] = at(colors, at(ids, start + lane) * stride + k)
+        return
+    g0 = at(ids, start) * stride
+    g1 = at(ids, start + 1) * stride
+    g2 = at(ids, start + 2) * stride
+    g3 = at(ids, start + 3) * stride
+    g4 = at(ids, start + 4) * stride
+    g5 = at(ids, start + 5) * stride
+    g6 = at(ids, start + 6) * stride
+    g7 = at(ids, start + 7) * stride
+    for block in range(0, used, 8):
+        k = min(block, used - 8)
+        v0, v1, v2, v3, v4, v5, v6, v7 = transpose(
+            load8(colors, g0 + k), load8(colors, g1 + k), load8(colors, g2 + k), load8(colors, g3 + k),
+            load8(colors, g4 + k), load8(colors, g5 + k), load8(colors, g6 + k), load8(colors, g7 + k),
+        )  # fmt: skip
+        store8(coefficients, 8 * k, v0)
+        store8(coefficients, 8 * k + 8, v1)
+        store8(coefficients, 8 * k + 16, v2)
+        store8(coefficients, 8 * k + 24, v3)
+        store8(coefficients, 8 * k + 32, v4)
+        store8(coefficients, 8 * k + 40, v5)
+        store8(coefficients, 8 * k + 48, v6)
+        store8(coefficients, 8 * k + 56, v7)
+
+
+@kernel
+def _shade(means, colors, sh_count, camera, ids, start, basis, coefficients, rgb):
+    """Colours, not clamped, of the 8 Gaussians ids[start:] as rgb = [red | green | blue]."""
+    px, py, pz = gather3(means, ids, start)
+    x, y, z, _ = view_directions(camera, px, py, pz)
+    sh_basis(basis, sh_count, x, y, z)
+    load_coefficients(colors, sh_count, ids, start, coefficients)
+    red = splat(HALF)
+    green = splat(HALF)
+    blue = splat(HALF)
+    for k in range(sh_count):
+        value = load8(basis, 8 * k)
+        red = multiply_add(value, load8(coefficients, 24 * k), red)
+        green = multiply_add(value, load8(coefficients, 24 * k + 8), green)
+        blue = multiply_add(value, load8(coefficients, 24 * k + 16), blue)
+    store8(rgb, 0, red)
+    store8(rgb, 8, green)
+    store8(rgb, 16, blue)
+
+
+@kernel
+def _hide(i, depths, radii, tile_bounds):
+    depths[i] = ZERO
+    radii[i, 0] = 0
+    radii[i, 1] = 0
+    tile_bounds[i] = 0
+
+
+@kernel
+def _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds):
+    """Colours that are no SH: into the footprints where they are drawn from there, else into `features`."""
+    channels = colors.shape[2]
+    to_features = features.shape[1] > 0
+    for k in range(visible):
+        i = seen[k]
+        for channel in range(channels):
+            value = colors[i, 0, channel]
+            if to_features:
+                features[i, channel] = value
             else:
-                x = means[i, 0] - camera[POSITION]
-                y = means[i, 1] - camera[POSITION + 1]
-                z = means[i, 2] - camera[POSITION + 2]
-                inverse = ONE / math.sqrt(max(x * x + y * y + z * z, NORM_MIN))
-                sh_basis(basis, sh_count, x * inverse, y * inverse, z * inverse)
-                red = HALF
-                green = HALF
-                blue = HALF
-                for k in range(sh_count):
-                    red += basis[k] * colors[i, k, 0]
-                    green += basis[k] * colors[i, k, 1]
-                    blue += basis[k] * colors[i, k, 2]
-            if not (finite and abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE):
-                rank[i] = -1
-                radii[i, 0] = 0
-                radii[i, 1] = 0
-                packed[r, EXTENT_X] = f32(-1e6)
-                packed[r, EXTENT_Y] = f32(-1e6)
-                tile_bounds[r] = 0
-                continue
-            if sh_count > 0:
-                red = max(red, ZERO)
-                green = max(green, ZERO)
-                blue = max(blue, ZERO)
-                if channels > 0:
-                    features[r, 0] = red
-                    features[r, 1] = green
-                    features[r, 2] = blue
-            if channels > colors.shape[2]:
-                features[r, channels - 1] = depths[i]
-            packed[r, RED] = red
-            packed[r, GREEN] = green
-            packed[r, BLUE] = blue
-            first_column, last_column, first_row, last_row = tile_box(
-                packed[r, X],
-                packed[r, Y],
-                packed[r, EXTENT_X],
-                packed[r, EXTENT_Y],
-                tile_columns,
-                tile_rows,
-            )
-            tile_bounds[r] = max(last_column - first_column + 1, 0) * max(last_row - first_row + 1, 0)
+                footprints[i, RED + channel] = value
+            if not abs(value) < HUGE:
+                _hide(i, depths, radii, tile_bounds)
+
+
+@kernel
+def _copy_features(sh_count, color_channels, seen, visible, footprints, depths, features):
+    """Colours computed from SH, and depths, into `features`."""
+    for k in range(visible):
+        i = seen[k]
+        if sh_count > 0:
+            features[i, 0] = footprints[i, RED]
+            features[i, 1] = footprints[i, GREEN]
+            features[i, 2] = footprints[i, BLUE]
+        if features.shape[1] > color_channels:
+            features[i, features.shape[1] - 1] = depths[i]

@@ -1,40 +1,71 @@
-"""Gradients of the Gaussians and of the camera from those of the 2D footprints: `projection` reversed."""
+"""Gradients of the Gaussians and of the camera from those of the 2D footprints: `projection` reversed.
+
+Only Gaussians that some tile drew have a gradient; they are taken 8 at a time, one in each lane of the
+vectors. Where fewer than 8 are left, the last of them fills the lanes that are free: it is computed and
+written several times, always the same.
+"""
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.layout import (
-    BLUE,
     CHUNK,
     FX,
     FY,
-    GREEN,
     HALF,
     MOMENTS,
     NORM_MIN,
     ONE,
-    POSITION,
-    RED,
+    PACKED,
     TWO,
-    TX,
-    TY,
-    TZ,
-    XX,
-    XY,
-    YY,
     ZERO,
+    f32,
 )
-from keyss.rendering.cpu.projection import rotation_matrix, slope_limits
+from keyss.rendering.cpu.projection import (
+    camera_coordinates,
+    gather3,
+    gather4,
+    inverse_length,
+    jacobian_rows,
+    load_coefficients,
+    rotation_matrix,
+    slope_limits,
+    view_directions,
+)
 from keyss.rendering.cpu.sh import sh_basis, sh_direction_gradient
-from keyss.rendering.cpu.simd8 import at, fetch_add, lane, load8, prefetch_read, splat
+from keyss.rendering.cpu.simd8 import (
+    at,
+    divide,
+    fetch_add,
+    gather8,
+    load8,
+    maximum,
+    minimum,
+    multiply_add,
+    prefetch_read,
+    put,
+    ramp,
+    select_ge,
+    select_gt,
+    splat,
+    store3,
+    store4,
+    store8,
+    sum_lanes,
+    transpose,
+)
 
-PREFETCH = 12  # how many Gaussians ahead to ask for memory
+# What `_sum_pairs` puts where in its buffer.
+SUMS = 0  # over all tiles: the first 6 of `layout.MOMENTS`, two more that are not read
+COLOR = 64  # gradients of red, green and blue
+DEPTH = 88  # gradient of the depth
+ALL_SUMS = 96
+
+PREFETCH = 16  # how many Gaussians ahead to ask for memory
 
 
 @kernel
@@ -51,9 +82,9 @@ def project_backward(
     height,
     antialiased,
     channels,
-    rank,
-    packed,
+    footprints,
     first_slots,
+    slot_counts,
     moments,
     extras,
     extra_width,
@@ -79,286 +110,443 @@ def project_backward(
     there is one more.
     """
     count = means.shape[0]
-    x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
-    fx = camera[FX]
-    fy = camera[FY]
-    basis = np.empty(16, np.float32)
-    basis_gradient = np.empty(16, np.float32)
-    camera_sums = np.empty(15, np.float64)
-    channel_sums = np.empty(channels, np.float32)
     with_depth = channels > colors.shape[2]
-    abs_x = extra_width - 2
+    ids = np.empty(CHUNK + 8, np.int64)
+    sums = np.empty(ALL_SUMS, np.float32)
+    basis = np.empty(16 * 8, np.float32)
+    coefficients = np.empty(48 * 8, np.float32)
+    results = np.empty(3 * 8, np.float32)
+    camera_sums = np.empty(15, np.float64)
     while True:
         piece = fetch_add(counter, 0, 1)
         if piece * CHUNK >= count:
             break
         for k in range(15):
             camera_sums[k] = 0.0
-        for i in range(piece * CHUNK, min((piece + 1) * CHUNK, count)):
-            ahead = rank[min(i + PREFETCH, count - 1)]
-            if ahead >= 0:
-                prefetch_read(packed, ahead * packed.shape[1])
-            r = np.int64(rank[i])
-            seen = r >= 0 and first_slots[i] < first_slots[i + 1]
-            if first_camera:
-                for k in range(3):
-                    means_gradient[i, k] = ZERO
-                    scales_gradient[i, k] = ZERO
-                for k in range(4):
-                    quats_gradient[i, k] = ZERO
-                opacities_gradient[i] = ZERO
-                if need_colors:
-                    if channels > 0 and sh_count == 0:
-                        for channel in range(colors.shape[2]):
-                            colors_gradient[i, 0, channel] = ZERO
-                    else:
-                        for k in range(sh_count if seen else 0, colors.shape[1]):
-                            for channel in range(3):
-                                colors_gradient[i, k, channel] = ZERO
-            means2d_gradient[i, 0] = ZERO
-            means2d_gradient[i, 1] = ZERO
-            if absgrad:
-                means2d_absgrad[i, 0] = ZERO
-                means2d_absgrad[i, 1] = ZERO
-            if not seen:
-                continue
-
-            sums = splat(ZERO)
-            blue = ZERO
-            for slot in range(first_slots[i], first_slots[i + 1]):
-                sums = sums + load8(moments, slot * MOMENTS)
-                blue += at(extras, slot * extra_width)
-                if absgrad:
-                    means2d_absgrad[i, 0] += at(extras, slot * extra_width + abs_x)
-                    means2d_absgrad[i, 1] += at(extras, slot * extra_width + abs_x + 1)
-            s_1 = lane(sums, 0)
-            s_x = lane(sums, 1)
-            s_y = lane(sums, 2)
-            s_xx = lane(sums, 3)
-            s_xy = lane(sums, 4)
-            s_yy = lane(sums, 5)
-            red = lane(sums, 6)
-            green = lane(sums, 7)
-            if channels > 0:
-                for channel in range(channels):
-                    total = ZERO
-                    for slot in range(first_slots[i], first_slots[i + 1]):
-                        total += at(extras, slot * extra_width + channel)
-                    channel_sums[channel] = total
-                if sh_count > 0:
-                    red = channel_sums[0]
-                    green = channel_sums[1]
-                    blue = channel_sums[2]
-            opacities_gradient[i] += s_1 / opacities[i]
-            conic_xx = -TWO * packed[r, XX]
-            conic_xy = -packed[r, XY]
-            conic_yy = -TWO * packed[r, YY]
-            mean_x = conic_xx * s_x + conic_xy * s_y
-            mean_y = conic_xy * s_x + conic_yy * s_y
-            means2d_gradient[i, 0] = mean_x
-            means2d_gradient[i, 1] = mean_y
-
-            # dL/d(covariance) = -conic dL/d(conic) conic, with dL/d(conic) = -1/2 [s_xx s_xy; s_xy s_yy].
-            t_00 = conic_xx * s_xx + conic_xy * s_xy
-            t_01 = conic_xx * s_xy + conic_xy * s_yy
-            t_10 = conic_xy * s_xx + conic_yy * s_xy
-            t_11 = conic_xy * s_xy + conic_yy * s_yy
-            cov_xx = HALF * (t_00 * conic_xx + t_01 * conic_xy)
-            cov_xy = HALF * (t_00 * conic_xy + t_01 * conic_yy)
-            cov_yy = HALF * (t_10 * conic_xy + t_11 * conic_yy)
-
-            # The forward projection again, up to V = J W R S.
-            px = means[i, 0]
-            py = means[i, 1]
-            pz = means[i, 2]
-            x = camera[0] * px + camera[1] * py + camera[2] * pz + camera[TX]
-            y = camera[3] * px + camera[4] * py + camera[5] * pz + camera[TY]
-            z = camera[6] * px + camera[7] * py + camera[8] * pz + camera[TZ]
-            rz = ONE / z
-            slope_x = x * rz
-            slope_y = y * rz
-            clamped_x = min(max(slope_x, x_low), x_high)
-            clamped_y = min(max(slope_y, y_low), y_high)
-            jxx = fx * rz
-            jxz = -jxx * clamped_x
-            jyy = fy * rz
-            jyz = -jyy * clamped_y
-            a0 = jxx * camera[0] + jxz * camera[6]
-            a1 = jxx * camera[1] + jxz * camera[7]
-            a2 = jxx * camera[2] + jxz * camera[8]
-            b0 = jyy * camera[3] + jyz * camera[6]
-            b1 = jyy * camera[4] + jyz * camera[7]
-            b2 = jyy * camera[5] + jyz * camera[8]
-            qw = quats[i, 0]
-            qx = quats[i, 1]
-            qy = quats[i, 2]
-            qz = quats[i, 3]
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qw, qx, qy, qz)
-            s0 = scales[i, 0]
-            s1 = scales[i, 1]
-            s2 = scales[i, 2]
-            p0 = a0 * r00 + a1 * r10 + a2 * r20
-            p1 = a0 * r01 + a1 * r11 + a2 * r21
-            p2 = a0 * r02 + a1 * r12 + a2 * r22
-            q0 = b0 * r00 + b1 * r10 + b2 * r20
-            q1 = b0 * r01 + b1 * r11 + b2 * r21
-            q2 = b0 * r02 + b1 * r12 + b2 * r22
-
-            if antialiased:
-                # The opacity drawn is opacity sqrt(det(V V^T) / det(covariance)), and s_1 the gradient of
-                # its logarithm; d(log det M) = M^-1. Nothing with a vanishing determinant was drawn.
-                sharp_xx = p0 * p0 * s0 * s0 + p1 * p1 * s1 * s1 + p2 * p2 * s2 * s2
-                sharp_xy = p0 * q0 * s0 * s0 + p1 * q1 * s1 * s1 + p2 * q2 * s2 * s2
-                sharp_yy = q0 * q0 * s0 * s0 + q1 * q1 * s1 * s1 + q2 * q2 * s2 * s2
-                n0 = (p1 * q2 - p2 * q1) * s1 * s2
-                n1 = (p2 * q0 - p0 * q2) * s2 * s0
-                n2 = (p0 * q1 - p1 * q0) * s0 * s1
-                inverse = ONE / max(n0 * n0 + n1 * n1 + n2 * n2, NORM_MIN)
-                cov_xx += HALF * s_1 * (sharp_yy * inverse - conic_xx)
-                cov_xy -= HALF * s_1 * (sharp_xy * inverse + conic_xy)
-                cov_yy += HALF * s_1 * (sharp_xx * inverse - conic_yy)
-
-            # dL/dV = 2 dL/d(covariance) V, then scales, rotation and the rows of J W.
-            du0 = TWO * (cov_xx * p0 + cov_xy * q0) * s0
-            du1 = TWO * (cov_xx * p1 + cov_xy * q1) * s1
-            du2 = TWO * (cov_xx * p2 + cov_xy * q2) * s2
-            dv0 = TWO * (cov_xy * p0 + cov_yy * q0) * s0
-            dv1 = TWO * (cov_xy * p1 + cov_yy * q1) * s1
-            dv2 = TWO * (cov_xy * p2 + cov_yy * q2) * s2
-            scales_gradient[i, 0] += du0 * p0 + dv0 * q0
-            scales_gradient[i, 1] += du1 * p1 + dv1 * q1
-            scales_gradient[i, 2] += du2 * p2 + dv2 * q2
-            du0 *= s0
-            du1 *= s1
-            du2 *= s2
-            dv0 *= s0
-            dv1 *= s1
-            dv2 *= s2
-            d00 = a0 * du0 + b0 * dv0
-            d01 = a0 * du1 + b0 * dv1
-            d02 = a0 * du2 + b0 * dv2
-            d10 = a1 * du0 + b1 * dv0
-            d11 = a1 * du1 + b1 * dv1
-            d12 = a1 * du2 + b1 * dv2
-            d20 = a2 * du0 + b2 * dv0
-            d21 = a2 * du1 + b2 * dv1
-            d22 = a2 * du2 + b2 * dv2
-            norm = qw * qw + qx * qx + qy * qy + qz * qz
-            if norm > NORM_MIN:
-                scale = ONE / math.sqrt(norm)
-                qw *= scale
-                qx *= scale
-                qy *= scale
-                qz *= scale
-                ew = TWO * (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01))
-                ex = TWO * (qy * (d10 + d01) + qz * (d20 + d02) + qw * (d21 - d12) - TWO * qx * (d11 + d22))
-                ey = TWO * (qx * (d10 + d01) + qz * (d21 + d12) + qw * (d02 - d20) - TWO * qy * (d00 + d22))
-                ez = TWO * (qx * (d20 + d02) + qy * (d21 + d12) + qw * (d10 - d01) - TWO * qz * (d00 + d11))
-                along = ew * qw + ex * qx + ey * qy + ez * qz
-                quats_gradient[i, 0] += (ew - along * qw) * scale
-                quats_gradient[i, 1] += (ex - along * qx) * scale
-                quats_gradient[i, 2] += (ey - along * qy) * scale
-                quats_gradient[i, 3] += (ez - along * qz) * scale
-            da0 = du0 * r00 + du1 * r01 + du2 * r02
-            da1 = du0 * r10 + du1 * r11 + du2 * r12
-            da2 = du0 * r20 + du1 * r21 + du2 * r22
-            db0 = dv0 * r00 + dv1 * r01 + dv2 * r02
-            db1 = dv0 * r10 + dv1 * r11 + dv2 * r12
-            db2 = dv0 * r20 + dv1 * r21 + dv2 * r22
-
-            # Through J and the projected centre to the mean in camera space (tx, ty, tz).
-            djxx = da0 * camera[0] + da1 * camera[1] + da2 * camera[2]
-            djxz = da0 * camera[6] + da1 * camera[7] + da2 * camera[8]
-            djyy = db0 * camera[3] + db1 * camera[4] + db2 * camera[5]
-            djyz = db0 * camera[6] + db1 * camera[7] + db2 * camera[8]
-            tx = mean_x * jxx
-            ty = mean_y * jyy
-            tz = -(mean_x * jxx * slope_x + mean_y * jyy * slope_y) - (djxx * jxx + djyy * jyy) * rz
-            if clamped_x == slope_x:
-                tx -= djxz * jxx * rz
-                tz += TWO * djxz * jxx * slope_x * rz
-            else:
-                tz += djxz * jxx * clamped_x * rz
-            if clamped_y == slope_y:
-                ty -= djyz * jyy * rz
-                tz += TWO * djyz * jyy * slope_y * rz
-            else:
-                tz += djyz * jyy * clamped_y * rz
-            if with_depth:
-                tz += channel_sums[channels - 1]
-            gx = camera[0] * tx + camera[3] * ty + camera[6] * tz
-            gy = camera[1] * tx + camera[4] * ty + camera[7] * tz
-            gz = camera[2] * tx + camera[5] * ty + camera[8] * tz
-            if need_camera:
-                camera_sums[0] += jxx * da0 + tx * px
-                camera_sums[1] += jxx * da1 + tx * py
-                camera_sums[2] += jxx * da2 + tx * pz
-                camera_sums[3] += jyy * db0 + ty * px
-                camera_sums[4] += jyy * db1 + ty * py
-                camera_sums[5] += jyy * db2 + ty * pz
-                camera_sums[6] += jxz * da0 + jyz * db0 + tz * px
-                camera_sums[7] += jxz * da1 + jyz * db1 + tz * py
-                camera_sums[8] += jxz * da2 + jyz * db2 + tz * pz
-                camera_sums[9] += tx
-                camera_sums[10] += ty
-                camera_sums[11] += tz
-
-            if sh_count == 0 and channels > 0:
-                if need_colors:
-                    for channel in range(colors.shape[2]):
-                        colors_gradient[i, 0, channel] += channel_sums[channel]
-            elif sh_count == 0:
-                if need_colors:
-                    colors_gradient[i, 0, 0] += red
-                    colors_gradient[i, 0, 1] += green
-                    colors_gradient[i, 0, 2] += blue
-            else:
-                # No gradient passes a colour that was clamped at 0.
-                if packed[r, RED] <= ZERO:
-                    red = ZERO
-                if packed[r, GREEN] <= ZERO:
-                    green = ZERO
-                if packed[r, BLUE] <= ZERO:
-                    blue = ZERO
-                x = px - camera[POSITION]
-                y = py - camera[POSITION + 1]
-                z = pz - camera[POSITION + 2]
-                scale = ONE / math.sqrt(max(x * x + y * y + z * z, NORM_MIN))
-                x *= scale
-                y *= scale
-                z *= scale
-                if need_colors:
-                    sh_basis(basis, sh_count, x, y, z)
-                    if first_camera:
-                        for k in range(sh_count):
-                            colors_gradient[i, k, 0] = basis[k] * red
-                            colors_gradient[i, k, 1] = basis[k] * green
-                            colors_gradient[i, k, 2] = basis[k] * blue
-                    else:
-                        for k in range(sh_count):
-                            colors_gradient[i, k, 0] += basis[k] * red
-                            colors_gradient[i, k, 1] += basis[k] * green
-                            colors_gradient[i, k, 2] += basis[k] * blue
-                if sh_count > 1:
-                    for k in range(sh_count):
-                        basis_gradient[k] = (
-                            colors[i, k, 0] * red + colors[i, k, 1] * green + colors[i, k, 2] * blue
-                        )
-                    dx, dy, dz = sh_direction_gradient(basis_gradient, sh_count, x, y, z)
-                    along = dx * x + dy * y + dz * z
-                    dx = (dx - along * x) * scale
-                    dy = (dy - along * y) * scale
-                    dz = (dz - along * z) * scale
-                    gx += dx
-                    gy += dy
-                    gz += dz
-                    if need_camera:
-                        camera_sums[12] -= dx
-                        camera_sums[13] -= dy
-                        camera_sums[14] -= dz
-            means_gradient[i, 0] += gx
-            means_gradient[i, 1] += gy
-            means_gradient[i, 2] += gz
+        drawn = _find_drawn(
+            piece * CHUNK, min((piece + 1) * CHUNK, count), sh_count, slot_counts, first_camera, need_colors,
+            absgrad, ids, means_gradient, quats_gradient, scales_gradient, opacities_gradient,
+            colors_gradient, means2d_gradient, means2d_absgrad,
+        )  # fmt: skip
+        for k in range(drawn, drawn + 8):
+            ids[k] = ids[max(drawn - 1, 0)]
+        for start in range(0, drawn, 8):
+            size = min(8, drawn - start)
+            for k in range(start + PREFETCH, min(start + PREFETCH + 8, drawn)):
+                slot = np.int64(at(first_slots, at(ids, k)))
+                prefetch_read(moments, slot * MOMENTS)
+                prefetch_read(moments, slot * MOMENTS + 16)
+                prefetch_read(extras, slot * extra_width)
+            _sum_pairs(
+                ids, start, size, first_slots, slot_counts, moments, extras, extra_width, channels,
+                with_depth, sh_count, first_camera, need_colors, absgrad, colors_gradient,
+                means2d_absgrad, sums,
+            )  # fmt: skip
+            dx = splat(ZERO)
+            dy = dx
+            dz = dx
+            if sh_count > 0:
+                dx, dy, dz = _color_gradients(
+                    means, colors, sh_count, camera, ids, start, first_camera, need_colors, footprints, sums,
+                    basis, coefficients, colors_gradient,
+                )  # fmt: skip
+            elif need_colors and channels == 0:
+                for lane in range(size):
+                    for channel in range(3):
+                        value = sums[COLOR + 8 * channel + lane]
+                        if not first_camera:
+                            value += colors_gradient[ids[start + lane], 0, channel]
+                        colors_gradient[ids[start + lane], 0, channel] = value
+            _gaussian_gradients(
+                means, quats, scales, opacities, footprints, ids, start, size, camera, width, height,
+                antialiased, with_depth, need_camera, first_camera, sums, dx, dy, dz, means_gradient,
+                quats_gradient, scales_gradient, opacities_gradient, means2d_gradient, camera_sums, results,
+            )  # fmt: skip
         if need_camera:
             for k in range(15):
                 camera_gradient[piece, k] = camera_sums[k]
+
+
+@kernel
+def _find_drawn(
+    start, end, sh_count, slot_counts, first_camera, need_colors, absgrad, ids, means_gradient,
+    quats_gradient, scales_gradient, opacities_gradient, colors_gradient, means2d_gradient, means2d_absgrad,
+):  # fmt: skip
+    """Fill `ids` with those Gaussians that have pairs; returns how many. Zeros all other gradients."""
+    channels = colors_gradient.shape[2]
+    stride = colors_gradient.shape[1] * channels
+    drawn = 0
+    for i in range(start, end):
+        used = 0  # colour gradients that are overwritten later
+        if at(slot_counts, i) > 0:
+            put(ids, drawn, i)
+            drawn += 1
+            used = max(sh_count, 1) * channels
+        else:
+            for k in range(2 * i, 2 * i + 2):
+                put(means2d_gradient, k, ZERO)
+                if absgrad:
+                    put(means2d_absgrad, k, ZERO)
+            if first_camera:
+                for k in range(3 * i, 3 * i + 3):
+                    put(means_gradient, k, ZERO)
+                    put(scales_gradient, k, ZERO)
+                for k in range(4 * i, 4 * i + 4):
+                    put(quats_gradient, k, ZERO)
+                put(opacities_gradient, i, ZERO)
+        if first_camera and need_colors:
+            for k in range(i * stride + used, (i + 1) * stride):
+                put(colors_gradient, k, ZERO)
+    return drawn
+
+
+@kernel
+def _sum_pairs(
+    ids, start, size, first_slots, slot_counts, moments, extras, extra_width, channels, with_depth, sh_count,
+    first_camera, need_colors, absgrad, colors_gradient, means2d_absgrad, sums,
+):  # fmt: skip
+    """The sums over all tiles of a Gaussian, for the 8 of ids[start:], into `sums`.
+
+    Gradients of channels that are no SH, and for absgrad, are handed out here.
+    """
+    store8(sums, DEPTH, splat(ZERO))
+    for lane in range(8):
+        i = at(ids, start + lane)
+        first = np.int64(at(first_slots, i))
+        after = first + at(slot_counts, i)
+        own = splat(ZERO)
+        for slot in range(first, after):
+            own = own + load8(moments, slot * MOMENTS)
+        store8(sums, SUMS + 8 * lane, own)
+        for extra in range(extra_width):
+            total = ZERO
+            for slot in range(first, after):
+                total += at(extras, slot * extra_width + extra)
+            if absgrad and extra >= extra_width - 2:
+                means2d_absgrad[i, extra + 2 - extra_width] = total
+            elif channels == 0:
+                put(sums, COLOR + 16 + lane, total)
+            elif with_depth and extra == channels - 1:
+                put(sums, DEPTH + lane, total)
+            elif sh_count > 0:
+                put(sums, COLOR + 8 * extra + lane, total)
+            elif need_colors and lane < size:
+                if not first_camera:
+                    total += colors_gradient[i, 0, extra]
+                colors_gradient[i, 0, extra] = total
+    m0, m1, m2, m3, m4, m5, red, green = transpose(
+        load8(sums, SUMS), load8(sums, SUMS + 8), load8(sums, SUMS + 16), load8(sums, SUMS + 24),
+        load8(sums, SUMS + 32), load8(sums, SUMS + 40), load8(sums, SUMS + 48), load8(sums, SUMS + 56),
+    )  # fmt: skip
+    store8(sums, SUMS, m0)
+    store8(sums, SUMS + 8, m1)
+    store8(sums, SUMS + 16, m2)
+    store8(sums, SUMS + 24, m3)
+    store8(sums, SUMS + 32, m4)
+    store8(sums, SUMS + 40, m5)
+    if channels == 0:
+        store8(sums, COLOR, red)
+        store8(sums, COLOR + 8, green)
+
+
+@kernel
+def _color_gradients(
+    means, colors, sh_count, camera, ids, start, first_camera, need_colors, footprints, sums, basis,
+    coefficients, colors_gradient,
+):  # fmt: skip
+    """Gradients of the SH coefficients, and dL/d(mean) through the directions, which is returned."""
+    _, _, _, _, _, _, _, red = _half_footprints(footprints, ids, start, 0)
+    green, blue, _, _, _, _, _, _ = _half_footprints(footprints, ids, start, 8)
+    # The maximum of 0.5 + basis . colors and 0 lets no gradient through where it is 0.
+    red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
+    green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
+    blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
+    px, py, pz = gather3(means, ids, start)
+    x, y, z, inverse = view_directions(camera, px, py, pz)
+    if need_colors:
+        sh_basis(basis, sh_count, x, y, z)
+        if not first_camera:
+            load_coefficients(colors_gradient, sh_count, ids, start, coefficients)
+        for k in range(sh_count):
+            value = load8(basis, 8 * k)
+            for_red = value * red
+            for_green = value * green
+            for_blue = value * blue
+            if not first_camera:
+                for_red = for_red + load8(coefficients, 24 * k)
+                for_green = for_green + load8(coefficients, 24 * k + 8)
+                for_blue = for_blue + load8(coefficients, 24 * k + 16)
+            store8(coefficients, 24 * k, for_red)
+            store8(coefficients, 24 * k + 8, for_green)
+            store8(coefficients, 24 * k + 16, for_blue)
+        _store_coefficients(colors_gradient, sh_count, ids, start, coefficients)
+    if sh_count == 1:
+        return splat(ZERO), splat(ZERO), splat(ZERO)
+    load_coefficients(colors, sh_count, ids, start, coefficients)
+    for k in range(sh_count):
+        product = load8(coefficients, 24 * k) * red
+        product = multiply_add(load8(coefficients, 24 * k + 8), green, product)
+        store8(basis, 8 * k, multiply_add(load8(coefficients, 24 * k + 16), blue, product))
+    dx, dy, dz = sh_direction_gradient(basis, sh_count, x, y, z)
+    along = dx * x + dy * y + dz * z
+    return (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
+
+
+@kernel
+def _half_footprints(footprints, ids, start, half):
+    """Columns half:half + 8 of the footprints of the 8 Gaussians ids[start:]."""
+    return transpose(
+        load8(footprints, at(ids, start) * PACKED + half),
+        load8(footprints, at(ids, start + 1) * PACKED + half),
+        load8(footprints, at(ids, start + 2) * PACKED + half),
+        load8(footprints, at(ids, start + 3) * PACKED + half),
+        load8(footprints, at(ids, start + 4) * PACKED + half),
+        load8(footprints, at(ids, start + 5) * PACKED + half),
+        load8(footprints, at(ids, start + 6) * PACKED + half),
+        load8(footprints, at(ids, start + 7) * PACKED + half),
+    )
+
+
+@kernel
+def _store_coefficients(colors_gradient, sh_count, ids, start, coefficients):
+    """`projection.load_coefficients` reversed."""
+    stride = colors_gradient.shape[1] * 3
+    used = sh_count * 3
+    if used < 8:
+        for lane in range(8):
+            for k in range(used):
+                put(colors_gradient, at(ids, start + lane) * stride + k, at(coefficients, 8 * k + lane))
+        return
+    for block in range(0, used, 8):
+        k = min(block, used - 8)
+        h0, h1, h2, h3, h4, h5, h6, h7 = transpose(
+            load8(coefficients, 8 * k), load8(coefficients, 8 * k + 8), load8(coefficients, 8 * k + 16),
+            load8(coefficients, 8 * k + 24), load8(coefficients, 8 * k + 32), load8(coefficients, 8 * k + 40),
+            load8(coefficients, 8 * k + 48), load8(coefficients, 8 * k + 56),
+        )  # fmt: skip
+        store8(colors_gradient, at(ids, start) * stride + k, h0)
+        store8(colors_gradient, at(ids, start + 1) * stride + k, h1)
+        store8(colors_gradient, at(ids, start + 2) * stride + k, h2)
+        store8(colors_gradient, at(ids, start + 3) * stride + k, h3)
+        store8(colors_gradient, at(ids, start + 4) * stride + k, h4)
+        store8(colors_gradient, at(ids, start + 5) * stride + k, h5)
+        store8(colors_gradient, at(ids, start + 6) * stride + k, h6)
+        store8(colors_gradient, at(ids, start + 7) * stride + k, h7)
+
+
+@kernel
+def _gaussian_gradients(
+    means, quats, scales, opacities, footprints, ids, start, size, camera, width, height, antialiased,
+    with_depth, need_camera, first_camera, sums, dx, dy, dz, means_gradient, quats_gradient, scales_gradient,
+    opacities_gradient, means2d_gradient, camera_sums, results,
+):  # fmt: skip
+    """Through the 2D footprints and the perspective; (dx, dy, dz) is the gradient through the colours."""
+    x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
+    s_1 = load8(sums, SUMS)
+    s_x = load8(sums, SUMS + 8)
+    s_y = load8(sums, SUMS + 16)
+    s_xx = load8(sums, SUMS + 24)
+    s_xy = load8(sums, SUMS + 32)
+    s_yy = load8(sums, SUMS + 40)
+    _, _, conic_xx, conic_xy, conic_yy, _, _, _ = _half_footprints(footprints, ids, start, 0)
+    conic_xx = conic_xx * -TWO
+    conic_xy = conic_xy * -ONE
+    conic_yy = conic_yy * -TWO
+    mean_x = conic_xx * s_x + conic_xy * s_y
+    mean_y = conic_xy * s_x + conic_yy * s_y
+    opacity_gradient = divide(s_1, gather8(opacities, ids, start))
+    if not first_camera:
+        opacity_gradient = opacity_gradient + gather8(opacities_gradient, ids, start)
+    store8(results, 0, opacity_gradient)
+    store8(results, 8, mean_x)
+    store8(results, 16, mean_y)
+    for lane in range(8):
+        i = at(ids, start + lane)
+        put(opacities_gradient, i, at(results, lane))
+        put(means2d_gradient, 2 * i, at(results, 8 + lane))
+        put(means2d_gradient, 2 * i + 1, at(results, 16 + lane))
+
+    # dL/d(covariance) = -conic dL/d(conic) conic, with dL/d(conic) = -1/2 [s_xx s_xy; s_xy s_yy].
+    t_00 = conic_xx * s_xx + conic_xy * s_xy
+    t_01 = conic_xx * s_xy + conic_xy * s_yy
+    t_10 = conic_xy * s_xx + conic_yy * s_xy
+    t_11 = conic_xy * s_xy + conic_yy * s_yy
+    cov_xx = (t_00 * conic_xx + t_01 * conic_xy) * HALF
+    cov_xy = (t_00 * conic_xy + t_01 * conic_yy) * HALF
+    cov_yy = (t_10 * conic_xy + t_11 * conic_yy) * HALF
+
+    # The forward projection again, up to V = J W R S.
+    px, py, pz = gather3(means, ids, start)
+    x, y, z = camera_coordinates(camera, px, py, pz)
+    rz = divide(ONE, z)
+    slope_x = x * rz
+    slope_y = y * rz
+    clamped_x = minimum(maximum(slope_x, x_low), x_high)
+    clamped_y = minimum(maximum(slope_y, y_low), y_high)
+    jxx = rz * camera[FX]
+    jxz = ZERO - jxx * clamped_x
+    jyy = rz * camera[FY]
+    jyz = ZERO - jyy * clamped_y
+    a0, a1, a2, b0, b1, b2 = jacobian_rows(camera, jxx, jxz, jyy, jyz)
+    qw, qx, qy, qz = gather4(quats, ids, start)
+    square = qw * qw + qx * qx + qy * qy + qz * qz
+    norm = inverse_length(square)
+    qw = qw * norm
+    qx = qx * norm
+    qy = qy * norm
+    qz = qz * norm
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qw, qx, qy, qz)
+    s0, s1, s2 = gather3(scales, ids, start)
+    p0 = a0 * r00 + a1 * r10 + a2 * r20
+    p1 = a0 * r01 + a1 * r11 + a2 * r21
+    p2 = a0 * r02 + a1 * r12 + a2 * r22
+    q0 = b0 * r00 + b1 * r10 + b2 * r20
+    q1 = b0 * r01 + b1 * r11 + b2 * r21
+    q2 = b0 * r02 + b1 * r12 + b2 * r22
+
+    if antialiased:
+        # The opacity drawn is opacity sqrt(det(V V^T) / det(covariance)), and s_1 the gradient of its
+        # logarithm; d(log det M) = M^-1. Nothing with a vanishing determinant was drawn.
+        u0, u1, u2 = p0 * s0, p1 * s1, p2 * s2
+        v0, v1, v2 = q0 * s0, q1 * s1, q2 * s2
+        n0 = u1 * v2 - u2 * v1
+        n1 = u2 * v0 - u0 * v2
+        n2 = u0 * v1 - u1 * v0
+        inverse = divide(ONE, maximum(n0 * n0 + n1 * n1 + n2 * n2, NORM_MIN))
+        half = s_1 * HALF
+        cov_xx = cov_xx + half * ((v0 * v0 + v1 * v1 + v2 * v2) * inverse - conic_xx)
+        cov_xy = cov_xy - half * ((u0 * v0 + u1 * v1 + u2 * v2) * inverse + conic_xy)
+        cov_yy = cov_yy + half * ((u0 * u0 + u1 * u1 + u2 * u2) * inverse - conic_yy)
+
+    # dL/dV = 2 dL/d(covariance) V, then scales, rotation and the rows of J W.
+    du0 = (cov_xx * p0 + cov_xy * q0) * s0 * TWO
+    du1 = (cov_xx * p1 + cov_xy * q1) * s1 * TWO
+    du2 = (cov_xx * p2 + cov_xy * q2) * s2 * TWO
+    dv0 = (cov_xy * p0 + cov_yy * q0) * s0 * TWO
+    dv1 = (cov_xy * p1 + cov_yy * q1) * s1 * TWO
+    dv2 = (cov_xy * p2 + cov_yy * q2) * s2 * TWO
+    _add3(
+        scales_gradient, ids, start, first_camera,
+        du0 * p0 + dv0 * q0, du1 * p1 + dv1 * q1, du2 * p2 + dv2 * q2,
+    )  # fmt: skip
+    du0 = du0 * s0
+    du1 = du1 * s1
+    du2 = du2 * s2
+    dv0 = dv0 * s0
+    dv1 = dv1 * s1
+    dv2 = dv2 * s2
+    d00 = a0 * du0 + b0 * dv0
+    d01 = a0 * du1 + b0 * dv1
+    d02 = a0 * du2 + b0 * dv2
+    d10 = a1 * du0 + b1 * dv0
+    d11 = a1 * du1 + b1 * dv1
+    d12 = a1 * du2 + b1 * dv2
+    d20 = a2 * du0 + b2 * dv0
+    d21 = a2 * du1 + b2 * dv1
+    d22 = a2 * du2 + b2 * dv2
+    ew = (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01)) * TWO
+    ex = (qy * (d10 + d01) + qz * (d20 + d02) + qw * (d21 - d12) - qx * (d11 + d22) * TWO) * TWO
+    ey = (qx * (d10 + d01) + qz * (d21 + d12) + qw * (d02 - d20) - qy * (d00 + d22) * TWO) * TWO
+    ez = (qx * (d20 + d02) + qy * (d21 + d12) + qw * (d10 - d01) - qz * (d00 + d11) * TWO) * TWO
+    along = ew * qw + ex * qx + ey * qy + ez * qz
+    # A zero quaternion is drawn without a rotation, and stays so.
+    norm = select_gt(square, NORM_MIN, norm, ZERO)
+    _add4(
+        quats_gradient, ids, start, first_camera,
+        (ew - along * qw) * norm, (ex - along * qx) * norm,
+        (ey - along * qy) * norm, (ez - along * qz) * norm,
+    )  # fmt: skip
+    da0 = du0 * r00 + du1 * r01 + du2 * r02
+    da1 = du0 * r10 + du1 * r11 + du2 * r12
+    da2 = du0 * r20 + du1 * r21 + du2 * r22
+    db0 = dv0 * r00 + dv1 * r01 + dv2 * r02
+    db1 = dv0 * r10 + dv1 * r11 + dv2 * r12
+    db2 = dv0 * r20 + dv1 * r21 + dv2 * r22
+
+    # Through J and the projected centre to the mean in camera space (tx, ty, tz). Where the slope was
+    # clamped, J does not depend on it.
+    djxx = da0 * camera[0] + da1 * camera[1] + da2 * camera[2]
+    djxz = (da0 * camera[6] + da1 * camera[7] + da2 * camera[8]) * jxx * rz
+    djyy = db0 * camera[3] + db1 * camera[4] + db2 * camera[5]
+    djyz = (db0 * camera[6] + db1 * camera[7] + db2 * camera[8]) * jyy * rz
+    free_x = _one_where_equal(slope_x, clamped_x)
+    free_y = _one_where_equal(slope_y, clamped_y)
+    mean_x = mean_x * jxx
+    mean_y = mean_y * jyy
+    tx = mean_x - djxz * free_x
+    ty = mean_y - djyz * free_y
+    tz = ZERO - (mean_x * slope_x + mean_y * slope_y) - (djxx * jxx + djyy * jyy) * rz
+    tz = tz + djxz * clamped_x * (free_x + ONE) + djyz * clamped_y * (free_y + ONE)
+    if with_depth:
+        tz = tz + load8(sums, DEPTH)
+    _add3(
+        means_gradient, ids, start, first_camera,
+        tx * camera[0] + ty * camera[3] + tz * camera[6] + dx,
+        tx * camera[1] + ty * camera[4] + tz * camera[7] + dy,
+        tx * camera[2] + ty * camera[5] + tz * camera[8] + dz,
+    )  # fmt: skip
+    if need_camera:
+        # Lanes that repeat a Gaussian do not count.
+        valid = select_gt(f32(size), ramp(ZERO), ONE, ZERO)
+        camera_sums[0] += sum_lanes(valid * (jxx * da0 + tx * px))
+        camera_sums[1] += sum_lanes(valid * (jxx * da1 + tx * py))
+        camera_sums[2] += sum_lanes(valid * (jxx * da2 + tx * pz))
+        camera_sums[3] += sum_lanes(valid * (jyy * db0 + ty * px))
+        camera_sums[4] += sum_lanes(valid * (jyy * db1 + ty * py))
+        camera_sums[5] += sum_lanes(valid * (jyy * db2 + ty * pz))
+        camera_sums[6] += sum_lanes(valid * (jxz * da0 + jyz * db0 + tz * px))
+        camera_sums[7] += sum_lanes(valid * (jxz * da1 + jyz * db1 + tz * py))
+        camera_sums[8] += sum_lanes(valid * (jxz * da2 + jyz * db2 + tz * pz))
+        camera_sums[9] += sum_lanes(valid * tx)
+        camera_sums[10] += sum_lanes(valid * ty)
+        camera_sums[11] += sum_lanes(valid * tz)
+        camera_sums[12] -= sum_lanes(valid * dx)
+        camera_sums[13] -= sum_lanes(valid * dy)
+        camera_sums[14] -= sum_lanes(valid * dz)
+
+
+@kernel
+def _one_where_equal(a, b):
+    return select_ge(a, b, select_ge(b, a, ONE, ZERO), ZERO)
+
+
+@kernel
+def _add3(array, ids, start, first_camera, x, y, z):
+    """Add 3 vectors to the columns of the rows ids[start:start + 8] of an array [N, 3].
+
+    For the first camera the rows are overwritten.
+    """
+    if not first_camera:
+        old_x, old_y, old_z = gather3(array, ids, start)
+        x = x + old_x
+        y = y + old_y
+        z = z + old_z
+    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(x, y, z, x, x, x, x, x)
+    store3(array, 3 * at(ids, start), h0)
+    store3(array, 3 * at(ids, start + 1), h1)
+    store3(array, 3 * at(ids, start + 2), h2)
+    store3(array, 3 * at(ids, start + 3), h3)
+    store3(array, 3 * at(ids, start + 4), h4)
+    store3(array, 3 * at(ids, start + 5), h5)
+    store3(array, 3 * at(ids, start + 6), h6)
+    store3(array, 3 * at(ids, start + 7), h7)
+
+
+@kernel
+def _add4(array, ids, start, first_camera, w, x, y, z):
+    """`_add3` for arrays [N, 4]."""
+    if not first_camera:
+        old_w, old_x, old_y, old_z = gather4(array, ids, start)
+        w = w + old_w
+        x = x + old_x
+        y = y + old_y
+        z = z + old_z
+    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(w, x, y, z, x, x, x, x)
+    store4(array, 4 * at(ids, start), h0)
+    store4(array, 4 * at(ids, start + 1), h1)
+    store4(array, 4 * at(ids, start + 2), h2)
+    store4(array, 4 * at(ids, start + 3), h3)
+    store4(array, 4 * at(ids, start + 4), h4)
+    store4(array, 4 * at(ids, start + 5), h5)
+    store4(array, 4 * at(ids, start + 6), h6)
+    store4(array, 4 * at(ids, start + 7), h7)

@@ -23,7 +23,6 @@ from keyss.rendering.cpu.jit import announce_compilation
 from keyss.rendering.cpu.layout import (
     CAMERA,
     CHUNK,
-    DECAY,
     FX,
     MOMENTS,
     PACKED,
@@ -75,14 +74,14 @@ class Drawing:
     """What the backward pass needs to know of one camera's forward pass."""
 
     camera: Array  # [CAMERA]
-    packed: Array  # [V, PACKED] visible Gaussians by depth
-    features: Array  # [V, feature_channels] their channels
-    rank: Array  # [N] place of each Gaussian in `packed`, -1 where it is not seen
-    first_slots: Array  # [N + 1] first slot of each Gaussian's pairs
+    footprints: Array  # [N, PACKED]
+    features: Array  # [N, feature_channels] channels to draw
+    first_slots: Array  # [N] first slot of each Gaussian's pairs
+    slot_counts: Array  # [N] how many pairs it has
+    slots: int  # how many slots there are; some are not used
     tile_starts: Array  # [tiles + 1] first list entry of each tile
-    tile_ranks: Array  # [pairs] the Gaussian of each list entry, as a rank
-    tile_rows: Array  # [pairs] its rows there, see `layout.LAST_ROW_SHIFT`
-    tile_slots: Array  # [pairs] the slot of each list entry; empty where no gradients are needed
+    entries: Array  # [pairs] Gaussians and their rows, see `layout.ENTRY_ROWS_SHIFT`
+    entry_slots: Array  # [pairs] the slot of each list entry; empty where no gradients are needed
     ends: Array  # [tiles] first list entry that the tile did not come to
 
 
@@ -203,9 +202,9 @@ class _Rasterize(torch.autograd.Function):
                 settings.height,
                 settings.antialiased,
                 settings.feature_channels,
-                drawing.rank,
-                drawing.packed,
+                drawing.footprints,
                 drawing.first_slots,
+                drawing.slot_counts,
                 moments,
                 extras,
                 settings.extra_width,
@@ -253,13 +252,17 @@ def _draw(
     width, height = settings.width, settings.height
     columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
-    footprints = memory.empty((count, DECAY + 1), np.float32)
+    footprints = memory.empty((count, PACKED), np.float32)
+    features = memory.empty((count, settings.feature_channels), np.float32)
+    slot_counts = memory.empty((count,), np.int32)  # at first a bound
     run(
         projection.project,
         means,
         quats,
         scales,
         opacities,
+        colors,
+        settings.sh_count,
         camera,
         width,
         height,
@@ -269,85 +272,65 @@ def _draw(
         np.float32(settings.radius_clip),
         settings.antialiased,
         footprints,
+        features,
         means2d,
         depths,
         radii,
+        slot_counts,
     )
-    rank = memory.empty((count,), np.int32)
     order, spare_order = (memory.empty((count,), np.int32) for _ in range(2))
     keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
-    visible = binning.sort_by_depth(depths, rank, order, spare_order, keys, spare_keys)
-    packed = memory.empty((visible, PACKED), np.float32)
-    features = memory.empty((visible, settings.feature_channels), np.float32)
-    tile_bounds = memory.empty((visible,), np.int32)
-    run(
-        projection.pack,
-        footprints,
-        means,
-        colors,
-        settings.sh_count,
-        camera,
-        columns,
-        rows,
-        depths,
-        rank,
-        radii,
-        packed,
-        features,
-        tile_bounds,
-    )
+    visible = binning.sort_by_depth(depths, order, spare_order, keys, spare_keys)
+    order = order[:visible]
 
     shares = 4 * torch.get_num_threads() if torch.get_num_threads() > 1 else 1
     starts = memory.empty((shares + 1,), np.int64)
-    binning.share_bounds(tile_bounds, starts)
-    if starts[-1] >= MAX_PAIRS:
+    binning.share_bounds(order, slot_counts, starts)
+    slots = int(starts[-1])
+    if slots >= MAX_PAIRS:
         raise BackendError(
-            f"{visible} Gaussians cover {starts[-1]} tiles together, more than the CPU rasterizer can list "
+            f"{visible} Gaussians cover {slots} tiles together, more than the CPU rasterizer can list "
             f"({MAX_PAIRS}): render fewer or smaller Gaussians, or at a lower resolution"
         )
-    tiles = memory.empty((int(starts[-1]),), np.int32)
-    tiles_per_gaussian = memory.empty((visible,), np.int32)
+    tiles = memory.empty((slots + 1,), np.int32)
+    rows_of_pairs = memory.empty((slots + 1,), np.int16)
+    first_slots = memory.empty((count,), np.int32)
     cursors = memory.empty((shares, columns * rows), np.int64)
-    rows_of_pairs = memory.empty((int(starts[-1]),), np.int16)
     run(
         binning.list_pairs,
-        packed,
+        footprints,
+        order,
         columns,
-        rows,
         height,
         starts,
         tiles,
         rows_of_pairs,
-        tiles_per_gaussian,
+        first_slots,
+        slot_counts,
         cursors,
     )
     tile_starts = memory.empty((columns * rows + 1,), np.int64)
-    first_slots = memory.empty((count + 1,), np.int64)
-    pairs = binning.offsets_from_counts(cursors, tiles_per_gaussian, rank, tile_starts, first_slots)
-    tile_ranks = memory.empty((pairs,), np.int32)
-    tile_rows = memory.empty((pairs,), np.int16)
-    tile_slots = memory.empty((pairs if for_backward else 0,), np.int32)
+    pairs = binning.offsets_from_counts(cursors, tile_starts)
+    entries = memory.empty((pairs,), np.int64)
+    entry_slots = memory.empty((pairs if for_backward else 0,), np.int32)
     run(
         binning.sort_pairs,
-        order[:visible],
+        order,
         starts,
         tiles,
         rows_of_pairs,
-        tiles_per_gaussian,
+        slot_counts,
         cursors,
-        first_slots,
-        tile_ranks,
-        tile_rows,
-        tile_slots,
+        entries,
+        entry_slots,
     )
     ends = memory.empty((columns * rows,), np.int64)
     blend = blending_features.blend_features if settings.feature_channels else blending.blend
     run(
         blend,
-        packed,
+        footprints,
         features,
-        tile_ranks,
-        tile_rows,
+        entries,
         tile_starts,
         columns,
         width,
@@ -359,7 +342,7 @@ def _draw(
         ends,
     )
     return Drawing(
-        camera, packed, features, rank, first_slots, tile_starts, tile_ranks, tile_rows, tile_slots, ends
+        camera, footprints, features, first_slots, slot_counts, slots, tile_starts, entries, entry_slots, ends
     )
 
 
@@ -371,19 +354,17 @@ def _blend_backward(
     alpha_gradient: Array,
     settings: Settings,
 ) -> tuple[Array, Array]:
-    """The sums over each (Gaussian, tile) pair: [pairs * MOMENTS] and [pairs * extra_width], see `layout`."""
-    pairs = len(drawing.tile_ranks)
-    moments = memory.empty((pairs * MOMENTS,), np.float32)
-    extras = memory.empty((pairs * settings.extra_width,), np.float32)
+    """The sums over each (Gaussian, tile) pair: [slots * MOMENTS] and [slots * extra_width], see `layout`."""
+    moments = memory.empty((drawing.slots * MOMENTS,), np.float32)
+    extras = memory.empty((drawing.slots * settings.extra_width,), np.float32)
     features = settings.feature_channels > 0
     blend_backward = blending_features.blend_features_backward if features else blending.blend_backward
     run(
         blend_backward,
-        drawing.packed,
+        drawing.footprints,
         drawing.features,
-        drawing.tile_ranks,
-        drawing.tile_rows,
-        drawing.tile_slots,
+        drawing.entries,
+        drawing.entry_slots,
         drawing.tile_starts,
         drawing.ends,
         -(-settings.width // TILE_WIDTH),

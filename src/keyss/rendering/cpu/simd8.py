@@ -4,7 +4,8 @@ LLVM does not vectorise the row loops of the rasterizer by itself, so the kernel
 The type maps to LLVM's <8 x float>, which every target can execute: one AVX register, two SSE or NEON
 registers. `+`, `-` and `*` work between vectors and between a vector and a float32.
 
-Arrays are indexed flat, must be contiguous, and are not bounds-checked.
+Arrays are indexed flat, must be contiguous, and are not bounds-checked. What the compiler may assume of
+floats is what the decorator of the kernel says, see `jit`.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -20,6 +21,8 @@ from numba import extending, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
+from keyss.rendering.cpu.jit import kernel
+
 intrinsic: Any = (
     extending.intrinsic
 )  # what it makes is called inside kernels only, without the typing context
@@ -28,7 +31,8 @@ _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, 8)
 _INT_VECTOR = ir.VectorType(_INT, 8)
-_FAST = ("fast",)
+_ONE, _TWO, _LN_2 = np.float32(1), np.float32(2), np.float32(np.log(2))
+_TWO_THIRDS, _TWO_FIFTHS, _TWO_SEVENTHS, _TWO_NINTHS = (np.float32(2 / n) for n in (3, 5, 7, 9))
 
 
 class Float32x8(types.Type):
@@ -76,7 +80,7 @@ def _as_vectors(builder, signature, values):
 
 
 def _multiply_add(builder, a, b, c):
-    return builder.fadd(builder.fmul(a, b, flags=_FAST), c, flags=_FAST)
+    return builder.fadd(builder.fmul(a, b), c)
 
 
 def _element(context, builder, array_type, array, index):
@@ -103,7 +107,7 @@ def _register_operator(python_operator, instruction):
 
     def lower(context, builder, signature, values):
         a, b = _as_vectors(builder, signature, values)
-        return getattr(builder, instruction)(a, b, flags=_FAST)
+        return getattr(builder, instruction)(a, b)
 
     for operands in ((Float32x8, Float32x8), (Float32x8, types.Float), (types.Float, Float32x8)):
         lower_builtin(python_operator, *operands)(lower)
@@ -144,6 +148,102 @@ def store8(typingctx, array, index, value):
     return types.void(array, index, value), codegen
 
 
+def _partial(parts):
+    """Loads and stores of the first lanes only, in parts of so many floats: nothing beyond is touched."""
+
+    def places(context, builder, signature, arguments):
+        address = _element(context, builder, signature.args[0], *arguments)
+        start = 0
+        for size in parts:
+            part = ir.VectorType(_FLOAT, size)
+            yield start, part, builder.bitcast(builder.gep(address, [_INT(start)]), part.as_pointer())
+            start += size
+
+    @intrinsic
+    def load(typingctx, array, index):
+        def codegen(context, builder, signature, arguments):
+            value = ir.Constant(_VECTOR, None)
+            for start, part, address in places(context, builder, signature, arguments):
+                loaded = builder.load(address)
+                loaded.align = 4
+                wide = [min(lane, part.count - 1) for lane in range(8)]
+                wide = builder.shuffle_vector(loaded, loaded, ir.Constant(_INT_VECTOR, wide))
+                own = range(start, start + part.count)
+                value = _shuffle(
+                    builder, value, wide, [8 + lane - start if lane in own else lane for lane in range(8)]
+                )
+            return value
+
+        return float32x8(array, index), codegen
+
+    @intrinsic
+    def store(typingctx, array, index, value):
+        def codegen(context, builder, signature, arguments):
+            value = arguments[2]
+            for start, part, address in places(context, builder, signature, arguments[:2]):
+                lanes = ir.Constant(ir.VectorType(_INT, part.count), list(range(start, start + part.count)))
+                builder.store(builder.shuffle_vector(value, value, lanes), address).align = 4
+            return context.get_dummy_value()
+
+        return types.void(array, index, value), codegen
+
+    return load, store
+
+
+load2, store2 = _partial((2,))  # the 2 floats from flat position `index`; the other lanes are 0
+load3, store3 = _partial((2, 1))
+load4, store4 = _partial((4,))
+
+
+@intrinsic
+def gather8(typingctx, array, indices, start):
+    """The floats at flat positions indices[start], ... indices[start + 7]."""
+
+    def codegen(context, builder, signature, arguments):
+        array_type, indices_type, _ = signature.args
+        result = ir.Constant(_VECTOR, ir.Undefined)
+        first = _element(context, builder, indices_type, *arguments[1:])
+        for lane in range(8):
+            index = builder.load(builder.gep(first, [_INT(lane)]))
+            value = builder.load(_element(context, builder, array_type, arguments[0], index))
+            result = builder.insert_element(result, value, _INT(lane))
+        return result
+
+    return float32x8(array, indices, start), codegen
+
+
+@intrinsic
+def store_interleaved(typingctx, array, index, a, b, c):
+    """Write (a_0, b_0, c_0, a_1, ...) from flat position `index`."""
+
+    def codegen(context, builder, signature, arguments):
+        a, b, c = arguments[2:]
+        wide = ir.VectorType(_INT, 16)
+        ab = builder.shuffle_vector(a, b, ir.Constant(wide, list(range(16))))
+        cc = builder.shuffle_vector(c, c, ir.Constant(wide, list(range(16))))
+        mask = [8 * (i % 3) + i // 3 for i in range(24)]
+        value = builder.shuffle_vector(ab, cc, ir.Constant(ir.VectorType(_INT, 24), mask))
+        address = _element(context, builder, signature.args[0], *arguments[:2])
+        builder.store(value, builder.bitcast(address, value.type.as_pointer())).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, index, float32x8, float32x8, float32x8), codegen
+
+
+@intrinsic
+def load_interleaved(typingctx, array, index):
+    """Read (a, b, c) as `store_interleaved` writes them."""
+
+    def codegen(context, builder, signature, arguments):
+        address = _element(context, builder, signature.args[0], *arguments)
+        wide = builder.load(builder.bitcast(address, ir.VectorType(_FLOAT, 24).as_pointer()))
+        wide.align = 4
+        parts = [_shuffle(builder, wide, wide, [3 * lane + k for lane in range(8)]) for k in range(3)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return types.UniTuple(float32x8, 3)(array, index), codegen
+
+
 @intrinsic
 def splat(typingctx, scalar):
     """The vector with `scalar` in every lane."""
@@ -160,7 +260,7 @@ def ramp(typingctx, start):
 
     def codegen(context, builder, signature, arguments):
         steps = ir.Constant(_VECTOR, [float(i) for i in range(8)])
-        return builder.fadd(_splat(builder, arguments[0]), steps, flags=_FAST)
+        return builder.fadd(_splat(builder, arguments[0]), steps)
 
     return float32x8(types.float32), codegen
 
@@ -180,7 +280,7 @@ def divide(typingctx, a, b):
     """a / b."""
 
     def codegen(context, builder, signature, arguments):
-        return builder.fdiv(*_as_vectors(builder, signature, arguments), flags=_FAST)
+        return builder.fdiv(*_as_vectors(builder, signature, arguments))
 
     return float32x8(_operand(a), _operand(b)), codegen
 
@@ -216,6 +316,23 @@ def _extremum(predicate):
 
 minimum = _extremum("<")
 maximum = _extremum(">")
+
+
+def _unary(name):
+    @intrinsic
+    def function(typingctx, a):
+        def codegen(context, builder, signature, arguments):
+            return builder.call(_llvm_function(builder, name, _VECTOR, [_VECTOR]), arguments)
+
+        return float32x8(float32x8), codegen
+
+    return function
+
+
+square_root = _unary("llvm.sqrt.v8f32")
+floor8 = _unary("llvm.floor.v8f32")
+ceil8 = _unary("llvm.ceil.v8f32")
+absolute = _unary("llvm.fabs.v8f32")
 
 
 @intrinsic
@@ -258,7 +375,7 @@ def sum_lanes(typingctx, a):
     def codegen(context, builder, signature, arguments):
         value = arguments[0]
         for lanes in ([4, 5, 6, 7, 0, 1, 2, 3], [2, 3, 0, 1, 6, 7, 4, 5], [1, 0, 3, 2, 5, 4, 7, 6]):
-            value = builder.fadd(value, _shuffle(builder, value, value, lanes), flags=_FAST)
+            value = builder.fadd(value, _shuffle(builder, value, value, lanes))
         return builder.extract_element(value, _INT(0))
 
     return types.float32(float32x8), codegen
@@ -272,15 +389,65 @@ def sum_lanes_of_8(typingctx, a0, a1, a2, a3, a4, a5, a6, a7):
         def add_neighbours(a, b):
             even = _shuffle(builder, a, b, [0, 2, 8, 10, 4, 6, 12, 14])
             odd = _shuffle(builder, a, b, [1, 3, 9, 11, 5, 7, 13, 15])
-            return builder.fadd(even, odd, flags=_FAST)
+            return builder.fadd(even, odd)
 
         pairs = [add_neighbours(arguments[i], arguments[i + 1]) for i in range(0, 8, 2)]
         low, high = add_neighbours(*pairs[:2]), add_neighbours(*pairs[2:])
         left = _shuffle(builder, low, high, [0, 1, 2, 3, 8, 9, 10, 11])
         right = _shuffle(builder, low, high, [4, 5, 6, 7, 12, 13, 14, 15])
-        return builder.fadd(left, right, flags=_FAST)
+        return builder.fadd(left, right)
 
     return float32x8(*[float32x8] * 8), codegen
+
+
+@intrinsic
+def transpose(typingctx, a0, a1, a2, a3, a4, a5, a6, a7):
+    """The 8 vectors whose i-th has the i-th lanes of all arguments, in their order."""
+
+    def codegen(context, builder, signature, arguments):
+        rows = list(arguments)
+        # Lanes are exchanged between rows 4, 2 and 1 apart.
+        for distance in (4, 2, 1):
+            low = [lane if not lane & distance else 8 + lane - distance for lane in range(8)]
+            high = [lane + distance if not lane & distance else 8 + lane for lane in range(8)]
+            for i in range(8):
+                if not i & distance:
+                    a, b = rows[i], rows[i + distance]
+                    rows[i] = _shuffle(builder, a, b, low)
+                    rows[i + distance] = _shuffle(builder, a, b, high)
+        return context.make_tuple(builder, signature.return_type, rows)
+
+    return types.UniTuple(float32x8, 8)(*[float32x8] * 8), codegen
+
+
+@intrinsic
+def _exponent_and_fraction(typingctx, x):
+    """(e, f) with x = 2^e f and f in [sqrt(1/2), sqrt(2)), for positive normal x."""
+
+    def codegen(context, builder, signature, arguments):
+        def constant(value):
+            return ir.Constant(_INT_VECTOR, [value] * 8)
+
+        bits = builder.bitcast(arguments[0], _INT_VECTOR)
+        exponent = builder.ashr(builder.sub(bits, constant(0x3F3504F3)), constant(23))
+        fraction = builder.sub(bits, builder.shl(exponent, constant(23)))
+        values = [builder.sitofp(exponent, _VECTOR), builder.bitcast(fraction, _VECTOR)]
+        return context.make_tuple(builder, signature.return_type, values)
+
+    return types.UniTuple(float32x8, 2)(float32x8), codegen
+
+
+@kernel
+def log(x):
+    """Natural logarithm of positive normal numbers, within 1e-7 (1 + |log x|)."""
+    exponent, fraction = _exponent_and_fraction(x)
+    t = divide(fraction - _ONE, fraction + _ONE)
+    tt = t * t
+    # 2 artanh(t)
+    series = multiply_add(tt, _TWO_NINTHS, _TWO_SEVENTHS)
+    series = multiply_add(tt, series, _TWO_FIFTHS)
+    series = multiply_add(tt, series, _TWO_THIRDS)
+    return multiply_add(exponent, _LN_2, t * multiply_add(tt, series, _TWO))
 
 
 # 2^x on [-1/2, 1/2] with the least relative error, 2e-8 (Lawson's method, degree 6).
@@ -304,10 +471,10 @@ def _exponential(power):
     def exponential(typingctx, x):
         def codegen(context, builder, signature, arguments):
             (x,) = arguments
-            scaled = builder.fmul(x, _constant(_LOG2_E), flags=_FAST)
+            scaled = builder.fmul(x, _constant(_LOG2_E))
             round_to_nearest = _llvm_function(builder, "llvm.rint.v8f32", _VECTOR, [_VECTOR])
             exponent = builder.call(round_to_nearest, [scaled])
-            fraction = builder.fsub(scaled, exponent, flags=_FAST)
+            fraction = builder.fsub(scaled, exponent)
             result = _constant(_EXP2_COEFFICIENTS[-1])
             for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
                 result = _multiply_add(builder, result, fraction, _constant(coefficient))
@@ -337,6 +504,17 @@ def at(typingctx, array, index):
         return builder.load(_element(context, builder, signature.args[0], *arguments))
 
     return array.dtype(array, index), codegen
+
+
+@intrinsic
+def put(typingctx, array, index, value):
+    """array.flat[index] = value, without numba's test for negative indices."""
+
+    def codegen(context, builder, signature, arguments):
+        builder.store(arguments[2], _element(context, builder, signature.args[0], *arguments[:2]))
+        return context.get_dummy_value()
+
+    return types.void(array, index, array.dtype), codegen
 
 
 @intrinsic
