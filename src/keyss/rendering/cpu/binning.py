@@ -44,6 +44,7 @@ from keyss.rendering.cpu.simd8 import (
     maximum,
     minimum,
     prefetch_read,
+    put,
     ramp,
     select_ge,
     select_le,
@@ -142,14 +143,11 @@ def _measure_columns(footprints, g, tile_columns, height, first_column, spans, p
 
 
 @kernel
-def list_pairs(
-    counter, footprints, order, tile_columns, height, starts, tiles, rows, first_slots, slot_counts, cursors
-):
+def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, rows, slot_counts, cursors):
     """List the tiles of each Gaussian and its rows there, share by share, that of share w from starts[w] on.
 
-    The place of a pair in this list is its slot: Gaussian i gets slot_counts[i] of them from
-    first_slots[i] on. cursors[w, t] becomes the number of Gaussians in share w that meet tile t. `tiles`
-    and `rows` have room for one more at the end.
+    slot_counts[i] becomes the number of tiles that Gaussian i meets, cursors[w, t] the number of Gaussians
+    in share w that meet tile t. `tiles` and `rows` have room for one more at the end.
     """
     shares = cursors.shape[0]
     count = order.shape[0]
@@ -180,7 +178,6 @@ def list_pairs(
                 _measure_columns(footprints, g, tile_columns, height, first_column, spans, 16 * k)
             for k in range(size):
                 i = np.int64(at(order, start + k))
-                first_slots[i] = place
                 before = place
                 for column in range(columns[k]):
                     first_column = first_columns[k] + column
@@ -204,7 +201,7 @@ def list_pairs(
 
 
 @kernel
-def offsets_from_counts(cursors, tile_starts):
+def offsets_from_counts(cursors, tile_starts, slot_counts, first_slots):
     """Turn counts into starts, in place for the cursors. Returns the number of pairs."""
     total = 0
     for tile in range(cursors.shape[1]):
@@ -214,15 +211,20 @@ def offsets_from_counts(cursors, tile_starts):
             cursors[share, tile] = total
             total += here
     tile_starts[cursors.shape[1]] = total
+    slot = 0
+    for i in range(first_slots.shape[0]):
+        put(first_slots, i, np.int32(slot))
+        slot += at(slot_counts, i)
     return total
 
 
 @kernel
-def sort_pairs(counter, order, starts, tiles, rows, slot_counts, cursors, entries, entry_slots):
+def sort_pairs(counter, order, starts, tiles, rows, slot_counts, first_slots, cursors, entries, entry_slots):
     """Sort the pairs of `list_pairs` into tiles, from the cursors that `offsets_from_counts` left.
 
-    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots;
-    it may be empty: then it stays so.
+    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
+    Gaussian i has slot_counts[i] of them from first_slots[i] on. It may be empty: then it stays so, and
+    first_slots is not read.
     """
     shares = cursors.shape[0]
     count = order.shape[0]
@@ -232,14 +234,18 @@ def sort_pairs(counter, order, starts, tiles, rows, slot_counts, cursors, entrie
         if share >= shares:
             break
         cursor = cursors[share]
-        slot = starts[share]
+        pair = starts[share]
+        slot = 0
         for r in range(share * count // shares, (share + 1) * count // shares):
             i = np.int64(at(order, r))
+            if keep_slots:
+                slot = np.int64(at(first_slots, i))
             for _ in range(at(slot_counts, i)):
-                tile = tiles[slot]
-                place = cursor[tile]
-                cursor[tile] = place + 1
-                entries[place] = i | np.int64(rows[slot]) << ENTRY_ROWS_SHIFT
+                tile = np.int64(at(tiles, pair))
+                place = at(cursor, tile)
+                put(cursor, tile, place + 1)
+                put(entries, place, i | np.int64(at(rows, pair)) << ENTRY_ROWS_SHIFT)
                 if keep_slots:
-                    entry_slots[place] = slot
-                slot += 1
+                    put(entry_slots, place, np.int32(slot))
+                    slot += 1
+                pair += 1

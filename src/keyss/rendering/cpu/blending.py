@@ -36,6 +36,7 @@ from keyss.rendering.cpu.layout import (
     TILE_HEIGHT,
     TILE_PIXELS,
     TILE_WIDTH,
+    TILE_WIDTH_LOG2,
     TRANSMITTANCE_MIN,
     TWO,
     XX,
@@ -61,6 +62,7 @@ from keyss.rendering.cpu.simd8 import (
     negative_abs,
     prefetch_read,
     prefetch_write,
+    put,
     ramp,
     select_ge,
     select_gt,
@@ -75,6 +77,9 @@ from keyss.rendering.cpu.simd8 import (
 ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
 PREFETCH = 6  # how many list entries ahead to ask for memory
 BATCH = 16  # Gaussians between two tests whether the whole tile has stopped
+
+STRIP = 3  # numbers that describe a strip, see `list_strips`
+MAX_STRIPS = BATCH * (TILE_HEIGHT // ANCHOR_ROWS)
 
 SCALE = f32(2.0**64)
 INVERSE = f32(2.0**-64)
@@ -115,53 +120,63 @@ def has_stopped(planes):
 
 
 @finite_kernel
+def list_strips(footprints, entries, start, end, last, left, top, strips, strip_footprints):
+    """Cut the Gaussians of entries start..end into strips of up to ANCHOR_ROWS rows; returns their number.
+
+    A strip is STRIP numbers in `strips`: where the Gaussian's record starts, the first place in a plane, the
+    first place after it. strip_footprints gets what `footprint_and_ratio` gives at its first row. All
+    exponentials of a batch are taken before any of its rows is drawn, since they have long latencies and
+    do not wait for one another. `last` is where the tile's list ends.
+    """
+    centre_x = f32(left) + HALF
+    centre_y = f32(top) + HALF
+    count = 0
+    for e in range(start, end):
+        prefetch_read(footprints, (at(entries, min(e + BATCH, last - 1)) & ENTRY_GAUSSIAN) * PACKED)
+        g = (at(entries, e) & ENTRY_GAUSSIAN) * PACKED
+        rows = at(entries, e) >> ENTRY_ROWS_SHIFT
+        after_rows = (rows >> LAST_ROW_SHIFT) + 1
+        y = at(footprints, g + Y) - centre_y
+        yy = at(footprints, g + YY)
+        opacity = at(footprints, g + OPACITY)
+        dx = ramp(-(at(footprints, g + X) - centre_x))
+        exponent_0 = dx * dx * at(footprints, g + XX)
+        exponent_1 = dx * at(footprints, g + XY)
+        for anchor in range(rows & (TILE_HEIGHT - 1), after_rows, ANCHOR_ROWS):
+            dy = f32(anchor) - y
+            footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
+            store8(strip_footprints, 16 * count, footprint)
+            store8(strip_footprints, 16 * count + 8, ratio)
+            put(strips, STRIP * count, g)
+            put(strips, STRIP * count + 1, 8 * anchor)
+            put(strips, STRIP * count + 2, 8 * min(anchor + ANCHOR_ROWS, after_rows))
+            count += 1
+    return count
+
+
+@finite_kernel
 def _blend_tile(footprints, entries, start, end, left, top, planes, strips, strip_footprints):
     """Blend entries start..end of the list into planes = [transmittance | red | green | blue].
 
-    Takes BATCH entries at a time: first all exponentials, which do not wait for one another, then the
-    rows. In between a Gaussian is a few strips of up to ANCHOR_ROWS rows: `strips` holds where its record
-    starts and the first and last place in a plane, `strip_footprints` what `footprint_and_ratio` gives.
     Returns the entry before which the whole tile had stopped.
     """
     for k in range(0, TILE_PIXELS, 8):
         store8(planes, k, splat(INVERSE))
     for k in range(TILE_PIXELS, 4 * TILE_PIXELS, 8):
         store8(planes, k, splat(ZERO))
-    centre_x = f32(left) + HALF
-    centre_y = f32(top) + HALF
     entry = start
     while entry < end:
         check = min(entry + BATCH, end)
-        count = 0
-        for e in range(entry, check):
-            prefetch_read(footprints, (at(entries, min(e + BATCH, end - 1)) & ENTRY_GAUSSIAN) * PACKED)
-            g = (at(entries, e) & ENTRY_GAUSSIAN) * PACKED
-            rows = at(entries, e) >> ENTRY_ROWS_SHIFT
-            after_rows = (rows >> LAST_ROW_SHIFT) + 1
-            y = at(footprints, g + Y) - centre_y
-            yy = at(footprints, g + YY)
-            opacity = at(footprints, g + OPACITY)
-            dx = ramp(-(at(footprints, g + X) - centre_x))
-            exponent_0 = dx * dx * at(footprints, g + XX)
-            exponent_1 = dx * at(footprints, g + XY)
-            for anchor in range(rows & (TILE_HEIGHT - 1), after_rows, ANCHOR_ROWS):
-                dy = f32(anchor) - y
-                footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
-                store8(strip_footprints, 16 * count, footprint)
-                store8(strip_footprints, 16 * count + 8, ratio)
-                strips[3 * count] = g
-                strips[3 * count + 1] = 8 * anchor
-                strips[3 * count + 2] = 8 * min(anchor + ANCHOR_ROWS, after_rows)
-                count += 1
+        count = list_strips(footprints, entries, entry, check, end, left, top, strips, strip_footprints)
         for strip in range(count):
-            g = at(strips, 3 * strip)
+            g = at(strips, STRIP * strip)
             decay = at(footprints, g + DECAY)
             red = at(footprints, g + RED)
             green = at(footprints, g + GREEN)
             blue = at(footprints, g + BLUE)
             footprint = load8(strip_footprints, 16 * strip)
             ratio = load8(strip_footprints, 16 * strip + 8)
-            for k in range(at(strips, 3 * strip + 1), at(strips, 3 * strip + 2), 8):
+            for k in range(at(strips, STRIP * strip + 1), at(strips, STRIP * strip + 2), 8):
                 _, weight = blend_row(planes, k, footprint)
                 footprint = footprint * ratio
                 ratio = ratio * decay
@@ -195,8 +210,8 @@ def blend(
 ):
     """Draw all tiles; ends[t] is the first list entry of tile t that was not looked at."""
     planes = np.empty(4 * TILE_PIXELS, np.float32)
-    strips = np.empty(3 * BATCH * (TILE_HEIGHT // ANCHOR_ROWS), np.int64)
-    strip_footprints = np.empty(16 * BATCH * (TILE_HEIGHT // ANCHOR_ROWS), np.float32)
+    strips = np.empty(STRIP * (MAX_STRIPS + 1), np.int64)
+    strip_footprints = np.empty(16 * MAX_STRIPS, np.float32)
     while True:
         tile = fetch_add(counter, 0, 1)
         if tile >= ends.shape[0]:
@@ -234,8 +249,9 @@ def blend(
 
 @finite_kernel
 def _blend_tile_backward(
-    footprints, entries, slots, start, end, left, top, planes, moments, extras, extra_width, absgrad
-):
+    footprints, entries, slots, start, end, left, top, planes, strips, strip_footprints, moments, extras,
+    extra_width, absgrad,
+):  # fmt: skip
     """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
 
     planes = [transmittance | behind | red, green and blue gradient], where behind is the part of the loss
@@ -245,76 +261,76 @@ def _blend_tile_backward(
     centre_x = f32(left) + HALF
     centre_y = f32(top) + HALF
     zero = splat(ZERO)
-    for e in range(start, end):
-        ahead = min(e + PREFETCH, end - 1)
-        prefetch_read(footprints, (at(entries, ahead) & ENTRY_GAUSSIAN) * PACKED)
-        prefetch_write(moments, np.int64(at(slots, ahead)) * MOMENTS)
-        g = (at(entries, e) & ENTRY_GAUSSIAN) * PACKED
-        rows = at(entries, e) >> ENTRY_ROWS_SHIFT
-        after_rows = (rows >> LAST_ROW_SHIFT) + 1
-        y = at(footprints, g + Y) - centre_y
-        xx = at(footprints, g + XX)
-        xy = at(footprints, g + XY)
-        yy = at(footprints, g + YY)
-        opacity = at(footprints, g + OPACITY)
-        decay = at(footprints, g + DECAY)
-        red = at(footprints, g + RED)
-        green = at(footprints, g + GREEN)
-        blue = at(footprints, g + BLUE)
-        dx = ramp(-(at(footprints, g + X) - centre_x))
-        exponent_0 = dx * dx * xx
-        exponent_1 = dx * xy
-        sum_1 = zero
-        sum_y = zero
-        sum_yy = zero
-        sum_red = zero
-        sum_green = zero
-        sum_blue = zero
-        sum_abs_x = zero
-        sum_abs_y = zero
-        for anchor in range(rows & (TILE_HEIGHT - 1), after_rows, ANCHOR_ROWS):
-            dy = f32(anchor) - y
-            footprint, ratio = footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity)
-            row_dy = splat(dy)
-            for k in range(8 * anchor, 8 * min(anchor + ANCHOR_ROWS, after_rows), 8):
-                alpha, weight = blend_row(planes, k, footprint)
-                gradient_red = load8(planes, k + 2 * TILE_PIXELS)
-                gradient_green = load8(planes, k + 3 * TILE_PIXELS)
-                gradient_blue = load8(planes, k + 4 * TILE_PIXELS)
-                own = weight * multiply_add(
-                    gradient_red, red, multiply_add(gradient_green, green, gradient_blue * blue)
-                )
-                behind = load8(planes, k + TILE_PIXELS) - own
-                store8(planes, k + TILE_PIXELS, behind)
-                # alpha dL/d(alpha), where what lies behind is dimmed by 1 - alpha.
-                s = own - behind * divide(alpha, SCALE - alpha)
-                s = select_le(footprint, SCALED_ALPHA_MAX, s, ZERO)
-                footprint = footprint * ratio
-                ratio = ratio * decay
-                s_dy = s * row_dy
-                sum_1 = sum_1 + s
-                sum_y = sum_y + s_dy
-                sum_yy = multiply_add(s_dy, row_dy, sum_yy)
-                sum_red = multiply_add(weight, gradient_red, sum_red)
-                sum_green = multiply_add(weight, gradient_green, sum_green)
-                sum_blue = multiply_add(weight, gradient_blue, sum_blue)
-                if absgrad:
-                    along_x = s * multiply_add(row_dy, xy, dx * (xx * TWO))
-                    along_y = s * multiply_add(row_dy, yy * TWO, exponent_1)
-                    sum_abs_x = sum_abs_x - negative_abs(along_x)
-                    sum_abs_y = sum_abs_y - negative_abs(along_y)
-                row_dy = row_dy + ONE
-        sum_x = dx * sum_1
-        slot = np.int64(at(slots, e))
-        store8(
-            moments,
-            slot * MOMENTS,
-            sum_lanes_of_8(sum_1, sum_x, sum_y, sum_x * dx, dx * sum_y, sum_yy, sum_red, sum_green),
-        )
-        extras[slot * extra_width] = sum_lanes(sum_blue)
-        if absgrad:
-            extras[slot * extra_width + 1] = sum_lanes(sum_abs_x)
-            extras[slot * extra_width + 2] = sum_lanes(sum_abs_y)
+    for batch in range(start, end, BATCH):
+        batch_end = min(batch + BATCH, end)
+        count = list_strips(footprints, entries, batch, batch_end, end, left, top, strips, strip_footprints)
+        put(strips, STRIP * count, -1)
+        strip = 0
+        for e in range(batch, batch_end):
+            prefetch_write(moments, np.int64(at(slots, min(e + PREFETCH, end - 1))) * MOMENTS)
+            g = at(strips, STRIP * strip)
+            y = at(footprints, g + Y) - centre_y
+            xx = at(footprints, g + XX)
+            xy = at(footprints, g + XY)
+            yy = at(footprints, g + YY)
+            decay = at(footprints, g + DECAY)
+            red = at(footprints, g + RED)
+            green = at(footprints, g + GREEN)
+            blue = at(footprints, g + BLUE)
+            dx = ramp(-(at(footprints, g + X) - centre_x))
+            sum_1 = zero
+            sum_y = zero
+            sum_yy = zero
+            sum_red = zero
+            sum_green = zero
+            sum_blue = zero
+            sum_abs_x = zero
+            sum_abs_y = zero
+            while at(strips, STRIP * strip) == g:
+                footprint = load8(strip_footprints, 16 * strip)
+                ratio = load8(strip_footprints, 16 * strip + 8)
+                first = at(strips, STRIP * strip + 1)
+                row_dy = splat(f32(first >> TILE_WIDTH_LOG2) - y)
+                for k in range(first, at(strips, STRIP * strip + 2), 8):
+                    alpha, weight = blend_row(planes, k, footprint)
+                    gradient_red = load8(planes, k + 2 * TILE_PIXELS)
+                    gradient_green = load8(planes, k + 3 * TILE_PIXELS)
+                    gradient_blue = load8(planes, k + 4 * TILE_PIXELS)
+                    own = weight * multiply_add(
+                        gradient_red, red, multiply_add(gradient_green, green, gradient_blue * blue)
+                    )
+                    behind = load8(planes, k + TILE_PIXELS) - own
+                    store8(planes, k + TILE_PIXELS, behind)
+                    # alpha dL/d(alpha), where what lies behind is dimmed by 1 - alpha.
+                    s = own - behind * divide(alpha, SCALE - alpha)
+                    s = select_le(footprint, SCALED_ALPHA_MAX, s, ZERO)
+                    footprint = footprint * ratio
+                    ratio = ratio * decay
+                    s_dy = s * row_dy
+                    sum_1 = sum_1 + s
+                    sum_y = sum_y + s_dy
+                    sum_yy = multiply_add(s_dy, row_dy, sum_yy)
+                    sum_red = multiply_add(weight, gradient_red, sum_red)
+                    sum_green = multiply_add(weight, gradient_green, sum_green)
+                    sum_blue = multiply_add(weight, gradient_blue, sum_blue)
+                    if absgrad:
+                        along_x = s * multiply_add(row_dy, xy, dx * (xx * TWO))
+                        along_y = s * multiply_add(row_dy, yy * TWO, dx * xy)
+                        sum_abs_x = sum_abs_x - negative_abs(along_x)
+                        sum_abs_y = sum_abs_y - negative_abs(along_y)
+                    row_dy = row_dy + ONE
+                strip += 1
+            sum_x = dx * sum_1
+            slot = np.int64(at(slots, e))
+            store8(
+                moments,
+                slot * MOMENTS,
+                sum_lanes_of_8(sum_1, sum_x, sum_y, sum_x * dx, dx * sum_y, sum_yy, sum_red, sum_green),
+            )
+            extras[slot * extra_width] = sum_lanes(sum_blue)
+            if absgrad:
+                extras[slot * extra_width + 1] = sum_lanes(sum_abs_x)
+                extras[slot * extra_width + 2] = sum_lanes(sum_abs_y)
 
 
 @finite_kernel
@@ -339,7 +355,9 @@ def blend_backward(
     absgrad,
 ):
     """Fill every slot of `moments` and `extras` from the gradients of the image and of alpha."""
-    planes = np.zeros(5 * TILE_PIXELS + 16, np.float32)
+    planes = np.empty(5 * TILE_PIXELS, np.float32)
+    strips = np.empty(STRIP * (MAX_STRIPS + 1), np.int64)
+    strip_footprints = np.empty(16 * MAX_STRIPS, np.float32)
     while True:
         tile = fetch_add(counter, 0, 1)
         if tile >= ends.shape[0]:
@@ -390,6 +408,8 @@ def blend_backward(
             left,
             top,
             planes,
+            strips,
+            strip_footprints,
             moments,
             extras,
             extra_width,

@@ -43,6 +43,8 @@ from keyss.rendering.cpu.layout import (
 )
 from keyss.rendering.cpu.sh import sh_basis
 from keyss.rendering.cpu.simd8 import (
+    absolute,
+    any_gt,
     at,
     ceil8,
     divide,
@@ -57,14 +59,18 @@ from keyss.rendering.cpu.simd8 import (
     maximum,
     minimum,
     multiply_add,
+    prefetch_read,
+    put,
     select_ge,
     select_gt,
     splat,
     square_root,
+    store3,
     store8,
     transpose,
 )
 
+PREFETCH = 24  # how many Gaussians ahead to ask for memory
 RADIUS_MAX = f32(2**30)
 COLUMN = f32(1 / TILE_WIDTH)
 ROW = f32(1 / TILE_HEIGHT)
@@ -192,7 +198,6 @@ def project(
     ids = np.empty(CHUNK + 8, np.int64)
     seen = np.empty(CHUNK + 8, np.int64)
     results = np.empty(64, np.float32)
-    rgb = np.empty(24, np.float32)
     basis = np.empty(16 * 8, np.float32)
     coefficients = np.empty(48 * 8, np.float32)
     while True:
@@ -210,27 +215,29 @@ def project(
             )  # fmt: skip
             for lane in range(min(8, size - k)):
                 i = start + k + lane
-                means2d[i, 0] = results[lane]
-                means2d[i, 1] = results[8 + lane]
-                depths[i] = results[16 + lane]
-                radii[i, 0] = np.int32(results[24 + lane])
-                radii[i, 1] = np.int32(results[32 + lane])
-                tile_bounds[i] = np.int32(results[40 + lane])
-                seen[visible] = i
-                visible += results[16 + lane] > ZERO
+                put(means2d, 2 * i, at(results, lane))
+                put(means2d, 2 * i + 1, at(results, 8 + lane))
+                put(depths, i, at(results, 16 + lane))
+                put(radii, 2 * i, np.int32(at(results, 24 + lane)))
+                put(radii, 2 * i + 1, np.int32(at(results, 32 + lane)))
+                put(tile_bounds, i, np.int32(at(results, 40 + lane)))
+                put(seen, visible, i)
+                visible += at(results, 16 + lane) > ZERO
         for k in range(visible, min(visible + 8, CHUNK + 8)):
             seen[k] = seen[max(visible - 1, 0)]
         if sh_count > 0:
             for k in range(0, visible, 8):
-                _shade(means, colors, sh_count, camera, seen, k, basis, coefficients, rgb)
-                for lane in range(min(8, visible - k)):
-                    i = seen[k + lane]
-                    for channel in range(3):
-                        value = rgb[8 * channel + lane]
-                        footprints[i, RED + channel] = max(value, ZERO)
-                        # Every test is written so that a NaN fails it.
-                        if not abs(value) < HUGE:
-                            _hide(i, depths, radii, tile_bounds)
+                for ahead in range(k + PREFETCH, min(k + PREFETCH + 8, visible)):
+                    prefetch_coefficients(colors, sh_count, at(seen, ahead))
+                red, green, blue = _shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
+                _store_colors(footprints, seen, k, red, green, blue)
+                # Written so that a NaN counts, too.
+                size_of_color = absolute(red) + absolute(green) + absolute(blue)
+                if any_gt(select_gt(HUGE, size_of_color, ZERO, ONE), ZERO):
+                    store8(results, 0, size_of_color)
+                    for lane in range(min(8, visible - k)):
+                        if not results[lane] < HUGE:
+                            _hide(seen[k + lane], depths, radii, tile_bounds)
         else:
             _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds)
         if features.shape[1] > 0:
@@ -359,6 +366,14 @@ def view_directions(camera, px, py, pz):
 
 
 @kernel
+def prefetch_coefficients(colors, sh_count, i):
+    """Ask for the memory of the SH coefficients of Gaussian i."""
+    row = i * colors.shape[1] * 3
+    for k in range(row, row + 3 * sh_count, 16):
+        prefetch_read(colors, k)
+
+
+@kernel
 def load_coefficients(colors, sh_count, ids, start, coefficients):
     """SH coefficients of the 8 Gaussians ids[start:]: number k of channel c as the vector at 8 (3 k + c)."""
     stride = colors.shape[1] * 3
@@ -393,8 +408,8 @@ def load_coefficients(colors, sh_count, ids, start, coefficients):
 
 
 @kernel
-def _shade(means, colors, sh_count, camera, ids, start, basis, coefficients, rgb):
-    """Colours, not clamped, of the 8 Gaussians ids[start:] as rgb = [red | green | blue]."""
+def _shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
+    """Red, green and blue, not clamped, of the 8 Gaussians ids[start:]."""
     px, py, pz = gather3(means, ids, start)
     x, y, z, _ = view_directions(camera, px, py, pz)
     sh_basis(basis, sh_count, x, y, z)
@@ -407,9 +422,24 @@ def _shade(means, colors, sh_count, camera, ids, start, basis, coefficients, rgb
         red = multiply_add(value, load8(coefficients, 24 * k), red)
         green = multiply_add(value, load8(coefficients, 24 * k + 8), green)
         blue = multiply_add(value, load8(coefficients, 24 * k + 16), blue)
-    store8(rgb, 0, red)
-    store8(rgb, 8, green)
-    store8(rgb, 16, blue)
+    return red, green, blue
+
+
+@kernel
+def _store_colors(footprints, ids, start, red, green, blue):
+    """Clamp colours and put them into the footprints."""
+    red = maximum(red, ZERO)
+    green = maximum(green, ZERO)
+    blue = maximum(blue, ZERO)
+    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(red, green, blue, red, red, red, red, red)
+    store3(footprints, at(ids, start) * PACKED + RED, h0)
+    store3(footprints, at(ids, start + 1) * PACKED + RED, h1)
+    store3(footprints, at(ids, start + 2) * PACKED + RED, h2)
+    store3(footprints, at(ids, start + 3) * PACKED + RED, h3)
+    store3(footprints, at(ids, start + 4) * PACKED + RED, h4)
+    store3(footprints, at(ids, start + 5) * PACKED + RED, h5)
+    store3(footprints, at(ids, start + 6) * PACKED + RED, h6)
+    store3(footprints, at(ids, start + 7) * PACKED + RED, h7)
 
 
 @kernel

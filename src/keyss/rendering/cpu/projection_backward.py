@@ -26,12 +26,14 @@ from keyss.rendering.cpu.layout import (
     f32,
 )
 from keyss.rendering.cpu.projection import (
+    PREFETCH,
     camera_coordinates,
     gather3,
     gather4,
     inverse_length,
     jacobian_rows,
     load_coefficients,
+    prefetch_coefficients,
     rotation_matrix,
     slope_limits,
     view_directions,
@@ -46,7 +48,6 @@ from keyss.rendering.cpu.simd8 import (
     maximum,
     minimum,
     multiply_add,
-    prefetch_read,
     put,
     ramp,
     select_ge,
@@ -64,8 +65,6 @@ SUMS = 0  # over all tiles: the first 6 of `layout.MOMENTS`, two more that are n
 COLOR = 64  # gradients of red, green and blue
 DEPTH = 88  # gradient of the depth
 ALL_SUMS = 96
-
-PREFETCH = 16  # how many Gaussians ahead to ask for memory
 
 
 @kernel
@@ -132,11 +131,9 @@ def project_backward(
             ids[k] = ids[max(drawn - 1, 0)]
         for start in range(0, drawn, 8):
             size = min(8, drawn - start)
-            for k in range(start + PREFETCH, min(start + PREFETCH + 8, drawn)):
-                slot = np.int64(at(first_slots, at(ids, k)))
-                prefetch_read(moments, slot * MOMENTS)
-                prefetch_read(moments, slot * MOMENTS + 16)
-                prefetch_read(extras, slot * extra_width)
+            if sh_count > 1:
+                for ahead in range(start + PREFETCH, min(start + PREFETCH + 8, drawn)):
+                    prefetch_coefficients(colors, sh_count, at(ids, ahead))
             _sum_pairs(
                 ids, start, size, first_slots, slot_counts, moments, extras, extra_width, channels,
                 with_depth, sh_count, first_camera, need_colors, absgrad, colors_gradient,
@@ -263,6 +260,20 @@ def _color_gradients(
     blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
     px, py, pz = gather3(means, ids, start)
     x, y, z, inverse = view_directions(camera, px, py, pz)
+    dx = splat(ZERO)
+    dy = dx
+    dz = dx
+    if sh_count > 1:
+        load_coefficients(colors, sh_count, ids, start, coefficients)
+        for k in range(sh_count):
+            product = load8(coefficients, 24 * k) * red
+            product = multiply_add(load8(coefficients, 24 * k + 8), green, product)
+            store8(basis, 8 * k, multiply_add(load8(coefficients, 24 * k + 16), blue, product))
+        dx, dy, dz = sh_direction_gradient(basis, sh_count, x, y, z)
+        along = dx * x + dy * y + dz * z
+        dx = (dx - along * x) * inverse
+        dy = (dy - along * y) * inverse
+        dz = (dz - along * z) * inverse
     if need_colors:
         sh_basis(basis, sh_count, x, y, z)
         if not first_camera:
@@ -280,16 +291,7 @@ def _color_gradients(
             store8(coefficients, 24 * k + 8, for_green)
             store8(coefficients, 24 * k + 16, for_blue)
         _store_coefficients(colors_gradient, sh_count, ids, start, coefficients)
-    if sh_count == 1:
-        return splat(ZERO), splat(ZERO), splat(ZERO)
-    load_coefficients(colors, sh_count, ids, start, coefficients)
-    for k in range(sh_count):
-        product = load8(coefficients, 24 * k) * red
-        product = multiply_add(load8(coefficients, 24 * k + 8), green, product)
-        store8(basis, 8 * k, multiply_add(load8(coefficients, 24 * k + 16), blue, product))
-    dx, dy, dz = sh_direction_gradient(basis, sh_count, x, y, z)
-    along = dx * x + dy * y + dz * z
-    return (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
+    return dx, dy, dz
 
 
 @kernel

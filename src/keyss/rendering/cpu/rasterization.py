@@ -78,7 +78,6 @@ class Drawing:
     features: Array  # [N, feature_channels] channels to draw
     first_slots: Array  # [N] first slot of each Gaussian's pairs
     slot_counts: Array  # [N] how many pairs it has
-    slots: int  # how many slots there are; some are not used
     tile_starts: Array  # [tiles + 1] first list entry of each tile
     entries: Array  # [pairs] Gaussians and their rows, see `layout.ENTRY_ROWS_SHIFT`
     entry_slots: Array  # [pairs] the slot of each list entry; empty where no gradients are needed
@@ -286,15 +285,14 @@ def _draw(
     shares = 4 * torch.get_num_threads() if torch.get_num_threads() > 1 else 1
     starts = memory.empty((shares + 1,), np.int64)
     binning.share_bounds(order, slot_counts, starts)
-    slots = int(starts[-1])
-    if slots >= MAX_PAIRS:
+    most_pairs = int(starts[-1])
+    if most_pairs >= MAX_PAIRS:
         raise BackendError(
-            f"{visible} Gaussians cover {slots} tiles together, more than the CPU rasterizer can list "
+            f"{visible} Gaussians cover {most_pairs} tiles together, more than the CPU rasterizer can list "
             f"({MAX_PAIRS}): render fewer or smaller Gaussians, or at a lower resolution"
         )
-    tiles = memory.empty((slots + 1,), np.int32)
-    rows_of_pairs = memory.empty((slots + 1,), np.int16)
-    first_slots = memory.empty((count,), np.int32)
+    tiles = memory.empty((most_pairs + 1,), np.int32)
+    rows_of_pairs = memory.empty((most_pairs + 1,), np.int16)
     cursors = memory.empty((shares, columns * rows), np.int64)
     run(
         binning.list_pairs,
@@ -305,12 +303,12 @@ def _draw(
         starts,
         tiles,
         rows_of_pairs,
-        first_slots,
         slot_counts,
         cursors,
     )
     tile_starts = memory.empty((columns * rows + 1,), np.int64)
-    pairs = binning.offsets_from_counts(cursors, tile_starts)
+    first_slots = memory.empty((count if for_backward else 0,), np.int32)
+    pairs = binning.offsets_from_counts(cursors, tile_starts, slot_counts, first_slots)
     entries = memory.empty((pairs,), np.int64)
     entry_slots = memory.empty((pairs if for_backward else 0,), np.int32)
     run(
@@ -320,6 +318,7 @@ def _draw(
         tiles,
         rows_of_pairs,
         slot_counts,
+        first_slots,
         cursors,
         entries,
         entry_slots,
@@ -342,7 +341,7 @@ def _draw(
         ends,
     )
     return Drawing(
-        camera, footprints, features, first_slots, slot_counts, slots, tile_starts, entries, entry_slots, ends
+        camera, footprints, features, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
     )
 
 
@@ -355,8 +354,9 @@ def _blend_backward(
     settings: Settings,
 ) -> tuple[Array, Array]:
     """The sums over each (Gaussian, tile) pair: [slots * MOMENTS] and [slots * extra_width], see `layout`."""
-    moments = memory.empty((drawing.slots * MOMENTS,), np.float32)
-    extras = memory.empty((drawing.slots * settings.extra_width,), np.float32)
+    slots = len(drawing.entries)
+    moments = memory.empty((slots * MOMENTS,), np.float32)
+    extras = memory.empty((slots * settings.extra_width,), np.float32)
     features = settings.feature_channels > 0
     blend_backward = blending_features.blend_features_backward if features else blending.blend_backward
     run(
