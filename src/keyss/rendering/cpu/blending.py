@@ -75,6 +75,8 @@ from keyss.rendering.cpu.simd8 import (
 )
 
 ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
+UNROLLED_ROWS = 4  # blended in one go: a row in which there is nothing to draw costs less than a branch
+PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # with room for what that draws below the tile
 PREFETCH = 6  # how many list entries ahead to ask for memory
 BATCH = 16  # Gaussians between two tests whether the whole tile has stopped
 
@@ -160,9 +162,9 @@ def _blend_tile(footprints, entries, start, end, left, top, planes, strips, stri
 
     Returns the entry before which the whole tile had stopped.
     """
-    for k in range(0, TILE_PIXELS, 8):
+    for k in range(0, PLANE, 8):
         store8(planes, k, splat(INVERSE))
-    for k in range(TILE_PIXELS, 4 * TILE_PIXELS, 8):
+    for k in range(PLANE, 4 * PLANE, 8):
         store8(planes, k, splat(ZERO))
     entry = start
     while entry < end:
@@ -176,16 +178,19 @@ def _blend_tile(footprints, entries, start, end, left, top, planes, strips, stri
             blue = at(footprints, g + BLUE)
             footprint = load8(strip_footprints, 16 * strip)
             ratio = load8(strip_footprints, 16 * strip + 8)
-            for k in range(at(strips, STRIP * strip + 1), at(strips, STRIP * strip + 2), 8):
-                _, weight = blend_row(planes, k, footprint)
-                footprint = footprint * ratio
-                ratio = ratio * decay
-                p = k + TILE_PIXELS
-                store8(planes, p, multiply_add(weight, red, load8(planes, p)))
-                p = k + 2 * TILE_PIXELS
-                store8(planes, p, multiply_add(weight, green, load8(planes, p)))
-                p = k + 3 * TILE_PIXELS
-                store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
+            for four in range(
+                at(strips, STRIP * strip + 1), at(strips, STRIP * strip + 2), 8 * UNROLLED_ROWS
+            ):
+                for k in range(four, four + 8 * UNROLLED_ROWS, 8):
+                    _, weight = blend_row(planes, k, footprint)
+                    footprint = footprint * ratio
+                    ratio = ratio * decay
+                    p = k + PLANE
+                    store8(planes, p, multiply_add(weight, red, load8(planes, p)))
+                    p = k + 2 * PLANE
+                    store8(planes, p, multiply_add(weight, green, load8(planes, p)))
+                    p = k + 3 * PLANE
+                    store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
         entry = check
         if has_stopped(planes):
             break
@@ -209,7 +214,7 @@ def blend(
     ends,
 ):
     """Draw all tiles; ends[t] is the first list entry of tile t that was not looked at."""
-    planes = np.empty(4 * TILE_PIXELS, np.float32)
+    planes = np.empty(4 * PLANE, np.float32)
     strips = np.empty(STRIP * (MAX_STRIPS + 1), np.int64)
     strip_footprints = np.empty(16 * MAX_STRIPS, np.float32)
     while True:
@@ -233,9 +238,9 @@ def blend(
                 store_interleaved(
                     image,
                     3 * pixel,
-                    multiply_add(rest, background[0], load8(planes, k + TILE_PIXELS)),
-                    multiply_add(rest, background[1], load8(planes, k + 2 * TILE_PIXELS)),
-                    multiply_add(rest, background[2], load8(planes, k + 3 * TILE_PIXELS)),
+                    multiply_add(rest, background[0], load8(planes, k + PLANE)),
+                    multiply_add(rest, background[1], load8(planes, k + 2 * PLANE)),
+                    multiply_add(rest, background[2], load8(planes, k + 3 * PLANE)),
                 )
                 continue
             for x in range(columns):
@@ -243,7 +248,7 @@ def blend(
                 transmittance[top + y, left + x] = light
                 alpha[top + y, left + x] = ONE - light
                 for channel in range(3):
-                    drawn = planes[k + x + (1 + channel) * TILE_PIXELS]
+                    drawn = planes[k + x + (1 + channel) * PLANE]
                     image[top + y, left + x, channel] = drawn + light * background[channel]
 
 

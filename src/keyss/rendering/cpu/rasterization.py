@@ -97,15 +97,15 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Draw float32 contiguous CPU tensors. Returns images [C, H, W, D], alphas [C, H, W, 1] and meta."""
     cameras, count = len(viewmats), len(means)
-    means2d = torch.empty(cameras, count, 2)
+    means2d = _empty(cameras, count, 2)
     # The gradient with respect to the projected centres is handed out through an input of its own: the
     # Function reads nothing from it, but returns dL/d(means2d) for it.
     geometry = (means, quats, scales, opacities, viewmats)
     means2d.requires_grad_(torch.is_grad_enabled() and any(tensor.requires_grad for tensor in geometry))
     meta: dict[str, Any] = {
         "means2d": means2d,
-        "depths": torch.empty(cameras, count),
-        "radii": torch.empty(cameras, count, 2, dtype=torch.int32),
+        "depths": _empty(cameras, count),
+        "radii": _empty(cameras, count, 2, dtype=np.int32),
     }
     images, alphas = _Rasterize.apply(  # type: ignore[no-untyped-call]
         means, quats, scales, opacities, colors, viewmats, backgrounds, means2d, Ks, settings, meta
@@ -131,9 +131,9 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         announce_compilation()
         shape = (len(viewmats), settings.height, settings.width)
-        images = torch.empty(*shape, settings.channels)
-        alphas = torch.empty(*shape, 1)
-        transmittances = torch.empty(shape)  # 1 - alphas, without the rounding where alpha is nearly 1
+        images = _empty(*shape, settings.channels)
+        alphas = _empty(*shape, 1)
+        transmittances = _empty(*shape)  # 1 - alphas, without the rounding where alpha is nearly 1
         gaussians = tuple(tensor.detach().numpy() for tensor in (means, quats, scales, opacities, colors))
         drawings = []
         for c in range(len(viewmats)):
@@ -178,7 +178,7 @@ class _Rasterize(torch.autograd.Function):
         shapes = [tuple(tensor.shape) for tensor in (*gaussians, ctx.means2d)]
         if not need_colors:
             shapes[4] = (0, 1, settings.color_channels)
-        *gradients, means2d_gradient = (torch.from_numpy(memory.empty(s, np.float32)) for s in shapes)
+        *gradients, means2d_gradient = (_empty(*shape) for shape in shapes)
         absgrad = torch.empty_like(ctx.means2d if settings.absgrad else means2d_gradient[:, :0])
         pieces = -(-len(means) // CHUNK)
         camera_gradient = np.zeros((pieces if need_camera else 0, 15))
@@ -230,6 +230,11 @@ class _Rasterize(torch.autograd.Function):
             gradient if needed else None
             for gradient, needed in zip(returned, ctx.needs_input_grad, strict=True)
         )
+
+
+def _empty(*shape: int, dtype: Any = np.float32) -> Tensor:
+    """An uninitialised tensor in memory that is used again."""
+    return torch.from_numpy(memory.empty(shape, dtype))
 
 
 def _draw(
