@@ -6,7 +6,7 @@ order of slots, so the backward pass can leave its sums there without any two th
 them up in an order that never changes.
 """
 
-# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
+# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator,assignment"
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ class _Loan:
         self.__array_interface__ = buffer.__array_interface__
 
     def __del__(self) -> None:
-        _free[id(self.buffer)] = self.buffer
+        if _free is not None:  # as it is when the interpreter ends
+            _free[id(self.buffer)] = self.buffer
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> Array:
