@@ -26,10 +26,8 @@ from keyss.rendering.cpu.layout import (
     GREEN,
     HALF,
     HUGE,
-    NORM_MIN,
     ONE,
     PACKED,
-    POSITION,
     RADIUS_SIGMAS,
     RED,
     TILE_HEIGHT,
@@ -41,7 +39,8 @@ from keyss.rendering.cpu.layout import (
     ZERO,
     f32,
 )
-from keyss.rendering.cpu.sh import sh_basis
+from keyss.rendering.cpu.rows import gather3, gather4, scatter3, scatter_columns
+from keyss.rendering.cpu.shading import inverse_length, prefetch_coefficients, shade
 from keyss.rendering.cpu.simd8 import (
     absolute,
     any_gt,
@@ -52,52 +51,22 @@ from keyss.rendering.cpu.simd8 import (
     fetch_add,
     floor8,
     gather8,
-    load3,
-    load4,
-    load8,
     log,
     maximum,
     minimum,
     multiply_add,
-    prefetch_read,
     put,
     select_ge,
     select_gt,
     splat,
     square_root,
-    store3,
     store8,
-    transpose,
 )
 
 PREFETCH = 24  # how many Gaussians ahead to ask for memory
 RADIUS_MAX = f32(2**30)
 COLUMN = f32(1 / TILE_WIDTH)
 ROW = f32(1 / TILE_HEIGHT)
-
-
-@kernel
-def gather3(array, ids, start):
-    """Columns of the rows ids[start:start + 8] of an array [N, 3], as 3 vectors."""
-    x, y, z, _, _, _, _, _ = transpose(
-        load3(array, 3 * at(ids, start)), load3(array, 3 * at(ids, start + 1)),
-        load3(array, 3 * at(ids, start + 2)), load3(array, 3 * at(ids, start + 3)),
-        load3(array, 3 * at(ids, start + 4)), load3(array, 3 * at(ids, start + 5)),
-        load3(array, 3 * at(ids, start + 6)), load3(array, 3 * at(ids, start + 7)),
-    )  # fmt: skip
-    return x, y, z
-
-
-@kernel
-def gather4(array, ids, start):
-    """Columns of the rows ids[start:start + 8] of an array [N, 4], as 4 vectors."""
-    w, x, y, z, _, _, _, _ = transpose(
-        load4(array, 4 * at(ids, start)), load4(array, 4 * at(ids, start + 1)),
-        load4(array, 4 * at(ids, start + 2)), load4(array, 4 * at(ids, start + 3)),
-        load4(array, 4 * at(ids, start + 4)), load4(array, 4 * at(ids, start + 5)),
-        load4(array, 4 * at(ids, start + 6)), load4(array, 4 * at(ids, start + 7)),
-    )  # fmt: skip
-    return w, x, y, z
 
 
 @kernel
@@ -114,12 +83,6 @@ def rotation_matrix(w, x, y, z):
         (y * z + w * x) * TWO,
         ONE - (x * x + y * y) * TWO,
     )
-
-
-@kernel
-def inverse_length(square):
-    """1 / sqrt(square), for squares of no length a finite number."""
-    return divide(ONE, square_root(maximum(square, NORM_MIN)))
 
 
 @kernel
@@ -229,8 +192,11 @@ def project(
             for k in range(0, visible, 8):
                 for ahead in range(k + PREFETCH, min(k + PREFETCH + 8, visible)):
                     prefetch_coefficients(colors, sh_count, at(seen, ahead))
-                red, green, blue = _shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
-                _store_colors(footprints, seen, k, red, green, blue)
+                red, green, blue = shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
+                scatter3(
+                    footprints, seen, k, PACKED, RED,
+                    maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO),
+                )  # fmt: skip
                 # Written so that a NaN counts, too.
                 size_of_color = absolute(red) + absolute(green) + absolute(blue)
                 if any_gt(select_gt(HUGE, size_of_color, ZERO, ONE), ZERO):
@@ -322,29 +288,14 @@ def _project(
     store8(results, 40, select_gt(seen, HALF, columns * rows, ZERO))
 
     zero = splat(ZERO)
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(
-        mean_x, mean_y, cov_yy * inverse * -HALF, cov_xy * inverse, cov_xx * inverse * -HALF,
-        level, opacity, zero,
+    scatter_columns(
+        footprints, ids, start, PACKED, 0, mean_x, mean_y,
+        cov_yy * inverse * -HALF, cov_xy * inverse, cov_xx * inverse * -HALF, level, opacity, zero,
     )  # fmt: skip
-    store8(footprints, at(ids, start) * PACKED, h0)
-    store8(footprints, at(ids, start + 1) * PACKED, h1)
-    store8(footprints, at(ids, start + 2) * PACKED, h2)
-    store8(footprints, at(ids, start + 3) * PACKED, h3)
-    store8(footprints, at(ids, start + 4) * PACKED, h4)
-    store8(footprints, at(ids, start + 5) * PACKED, h5)
-    store8(footprints, at(ids, start + 6) * PACKED, h6)
-    store8(footprints, at(ids, start + 7) * PACKED, h7)
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(
-        zero, zero, extent_x, extent_y, exp(ZERO - cov_xx * inverse), zero, zero, zero
+    decay = exp(ZERO - cov_xx * inverse)
+    scatter_columns(
+        footprints, ids, start, PACKED, 8, zero, zero, extent_x, extent_y, decay, zero, zero, zero
     )
-    store8(footprints, at(ids, start) * PACKED + 8, h0)
-    store8(footprints, at(ids, start + 1) * PACKED + 8, h1)
-    store8(footprints, at(ids, start + 2) * PACKED + 8, h2)
-    store8(footprints, at(ids, start + 3) * PACKED + 8, h3)
-    store8(footprints, at(ids, start + 4) * PACKED + 8, h4)
-    store8(footprints, at(ids, start + 5) * PACKED + 8, h5)
-    store8(footprints, at(ids, start + 6) * PACKED + 8, h6)
-    store8(footprints, at(ids, start + 7) * PACKED + 8, h7)
 
 
 @kernel
@@ -353,93 +304,6 @@ def _tiles(centre, extent, size, per_pixel):
     first = floor8(maximum(ceil8(centre - extent - HALF), ZERO) * per_pixel)
     last = floor8(minimum(floor8(centre + extent - HALF), f32(size - 1)) * per_pixel)
     return maximum(last - first + ONE, ZERO)
-
-
-@kernel
-def view_directions(camera, px, py, pz):
-    """Unit vectors from the camera to points of the world, and the inverse of the distances."""
-    x = px - camera[POSITION]
-    y = py - camera[POSITION + 1]
-    z = pz - camera[POSITION + 2]
-    inverse = inverse_length(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse, inverse
-
-
-@kernel
-def prefetch_coefficients(colors, sh_count, i):
-    """Ask for the memory of the SH coefficients of Gaussian i."""
-    row = i * colors.shape[1] * 3
-    for k in range(row, row + 3 * sh_count, 16):
-        prefetch_read(colors, k)
-
-
-@kernel
-def load_coefficients(colors, sh_count, ids, start, coefficients):
-    """SH coefficients of the 8 Gaussians ids[start:]: number k of channel c as the vector at 8 (3 k + c)."""
-    stride = colors.shape[1] * 3
-    used = sh_count * 3
-    if used < 8:
-        for lane in range(8):
-            for k in range(used):
-                coefficients[8 * k + lane] = at(colors, at(ids, start + lane) * stride + k)
-        return
-    g0 = at(ids, start) * stride
-    g1 = at(ids, start + 1) * stride
-    g2 = at(ids, start + 2) * stride
-    g3 = at(ids, start + 3) * stride
-    g4 = at(ids, start + 4) * stride
-    g5 = at(ids, start + 5) * stride
-    g6 = at(ids, start + 6) * stride
-    g7 = at(ids, start + 7) * stride
-    for block in range(0, used, 8):
-        k = min(block, used - 8)
-        v0, v1, v2, v3, v4, v5, v6, v7 = transpose(
-            load8(colors, g0 + k), load8(colors, g1 + k), load8(colors, g2 + k), load8(colors, g3 + k),
-            load8(colors, g4 + k), load8(colors, g5 + k), load8(colors, g6 + k), load8(colors, g7 + k),
-        )  # fmt: skip
-        store8(coefficients, 8 * k, v0)
-        store8(coefficients, 8 * k + 8, v1)
-        store8(coefficients, 8 * k + 16, v2)
-        store8(coefficients, 8 * k + 24, v3)
-        store8(coefficients, 8 * k + 32, v4)
-        store8(coefficients, 8 * k + 40, v5)
-        store8(coefficients, 8 * k + 48, v6)
-        store8(coefficients, 8 * k + 56, v7)
-
-
-@kernel
-def _shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
-    """Red, green and blue, not clamped, of the 8 Gaussians ids[start:]."""
-    px, py, pz = gather3(means, ids, start)
-    x, y, z, _ = view_directions(camera, px, py, pz)
-    sh_basis(basis, sh_count, x, y, z)
-    load_coefficients(colors, sh_count, ids, start, coefficients)
-    red = splat(HALF)
-    green = splat(HALF)
-    blue = splat(HALF)
-    for k in range(sh_count):
-        value = load8(basis, 8 * k)
-        red = multiply_add(value, load8(coefficients, 24 * k), red)
-        green = multiply_add(value, load8(coefficients, 24 * k + 8), green)
-        blue = multiply_add(value, load8(coefficients, 24 * k + 16), blue)
-    return red, green, blue
-
-
-@kernel
-def _store_colors(footprints, ids, start, red, green, blue):
-    """Clamp colours and put them into the footprints."""
-    red = maximum(red, ZERO)
-    green = maximum(green, ZERO)
-    blue = maximum(blue, ZERO)
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(red, green, blue, red, red, red, red, red)
-    store3(footprints, at(ids, start) * PACKED + RED, h0)
-    store3(footprints, at(ids, start + 1) * PACKED + RED, h1)
-    store3(footprints, at(ids, start + 2) * PACKED + RED, h2)
-    store3(footprints, at(ids, start + 3) * PACKED + RED, h3)
-    store3(footprints, at(ids, start + 4) * PACKED + RED, h4)
-    store3(footprints, at(ids, start + 5) * PACKED + RED, h5)
-    store3(footprints, at(ids, start + 6) * PACKED + RED, h6)
-    store3(footprints, at(ids, start + 7) * PACKED + RED, h7)
 
 
 @kernel

@@ -16,11 +16,13 @@ from keyss.rendering.cpu.layout import (
     CHUNK,
     FX,
     FY,
+    GREEN,
     HALF,
     MOMENTS,
     NORM_MIN,
     ONE,
     PACKED,
+    RED,
     TWO,
     ZERO,
     f32,
@@ -28,17 +30,12 @@ from keyss.rendering.cpu.layout import (
 from keyss.rendering.cpu.projection import (
     PREFETCH,
     camera_coordinates,
-    gather3,
-    gather4,
-    inverse_length,
     jacobian_rows,
-    load_coefficients,
-    prefetch_coefficients,
     rotation_matrix,
     slope_limits,
-    view_directions,
 )
-from keyss.rendering.cpu.sh import sh_basis, sh_direction_gradient
+from keyss.rendering.cpu.rows import gather3, gather4, gather_columns, scatter3, scatter4
+from keyss.rendering.cpu.shading import inverse_length, prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
     at,
     divide,
@@ -47,14 +44,11 @@ from keyss.rendering.cpu.simd8 import (
     load8,
     maximum,
     minimum,
-    multiply_add,
     put,
     ramp,
     select_ge,
     select_gt,
     splat,
-    store3,
-    store4,
     store8,
     sum_lanes,
     transpose,
@@ -143,9 +137,15 @@ def project_backward(
             dy = dx
             dz = dx
             if sh_count > 0:
-                dx, dy, dz = _color_gradients(
-                    means, colors, sh_count, camera, ids, start, first_camera, need_colors, footprints, sums,
-                    basis, coefficients, colors_gradient,
+                _, _, _, _, _, _, _, red = gather_columns(footprints, ids, start, PACKED, RED - RED % 8)
+                green, blue, _, _, _, _, _, _ = gather_columns(footprints, ids, start, PACKED, GREEN - GREEN % 8)
+                # The maximum of 0.5 + basis . colors and 0 lets no gradient through where it is 0.
+                red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
+                green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
+                blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
+                dx, dy, dz = shade_backward(
+                    means, colors, sh_count, camera, ids, start, red, green, blue, first_camera,
+                    need_colors, basis, coefficients, colors_gradient,
                 )  # fmt: skip
             elif need_colors and channels == 0:
                 for lane in range(size):
@@ -247,96 +247,6 @@ def _sum_pairs(
 
 
 @kernel
-def _color_gradients(
-    means, colors, sh_count, camera, ids, start, first_camera, need_colors, footprints, sums, basis,
-    coefficients, colors_gradient,
-):  # fmt: skip
-    """Gradients of the SH coefficients, and dL/d(mean) through the directions, which is returned."""
-    _, _, _, _, _, _, _, red = _half_footprints(footprints, ids, start, 0)
-    green, blue, _, _, _, _, _, _ = _half_footprints(footprints, ids, start, 8)
-    # The maximum of 0.5 + basis . colors and 0 lets no gradient through where it is 0.
-    red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
-    green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
-    blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
-    px, py, pz = gather3(means, ids, start)
-    x, y, z, inverse = view_directions(camera, px, py, pz)
-    dx = splat(ZERO)
-    dy = dx
-    dz = dx
-    if sh_count > 1:
-        load_coefficients(colors, sh_count, ids, start, coefficients)
-        for k in range(sh_count):
-            product = load8(coefficients, 24 * k) * red
-            product = multiply_add(load8(coefficients, 24 * k + 8), green, product)
-            store8(basis, 8 * k, multiply_add(load8(coefficients, 24 * k + 16), blue, product))
-        dx, dy, dz = sh_direction_gradient(basis, sh_count, x, y, z)
-        along = dx * x + dy * y + dz * z
-        dx = (dx - along * x) * inverse
-        dy = (dy - along * y) * inverse
-        dz = (dz - along * z) * inverse
-    if need_colors:
-        sh_basis(basis, sh_count, x, y, z)
-        if not first_camera:
-            load_coefficients(colors_gradient, sh_count, ids, start, coefficients)
-        for k in range(sh_count):
-            value = load8(basis, 8 * k)
-            for_red = value * red
-            for_green = value * green
-            for_blue = value * blue
-            if not first_camera:
-                for_red = for_red + load8(coefficients, 24 * k)
-                for_green = for_green + load8(coefficients, 24 * k + 8)
-                for_blue = for_blue + load8(coefficients, 24 * k + 16)
-            store8(coefficients, 24 * k, for_red)
-            store8(coefficients, 24 * k + 8, for_green)
-            store8(coefficients, 24 * k + 16, for_blue)
-        _store_coefficients(colors_gradient, sh_count, ids, start, coefficients)
-    return dx, dy, dz
-
-
-@kernel
-def _half_footprints(footprints, ids, start, half):
-    """Columns half:half + 8 of the footprints of the 8 Gaussians ids[start:]."""
-    return transpose(
-        load8(footprints, at(ids, start) * PACKED + half),
-        load8(footprints, at(ids, start + 1) * PACKED + half),
-        load8(footprints, at(ids, start + 2) * PACKED + half),
-        load8(footprints, at(ids, start + 3) * PACKED + half),
-        load8(footprints, at(ids, start + 4) * PACKED + half),
-        load8(footprints, at(ids, start + 5) * PACKED + half),
-        load8(footprints, at(ids, start + 6) * PACKED + half),
-        load8(footprints, at(ids, start + 7) * PACKED + half),
-    )
-
-
-@kernel
-def _store_coefficients(colors_gradient, sh_count, ids, start, coefficients):
-    """`projection.load_coefficients` reversed."""
-    stride = colors_gradient.shape[1] * 3
-    used = sh_count * 3
-    if used < 8:
-        for lane in range(8):
-            for k in range(used):
-                put(colors_gradient, at(ids, start + lane) * stride + k, at(coefficients, 8 * k + lane))
-        return
-    for block in range(0, used, 8):
-        k = min(block, used - 8)
-        h0, h1, h2, h3, h4, h5, h6, h7 = transpose(
-            load8(coefficients, 8 * k), load8(coefficients, 8 * k + 8), load8(coefficients, 8 * k + 16),
-            load8(coefficients, 8 * k + 24), load8(coefficients, 8 * k + 32), load8(coefficients, 8 * k + 40),
-            load8(coefficients, 8 * k + 48), load8(coefficients, 8 * k + 56),
-        )  # fmt: skip
-        store8(colors_gradient, at(ids, start) * stride + k, h0)
-        store8(colors_gradient, at(ids, start + 1) * stride + k, h1)
-        store8(colors_gradient, at(ids, start + 2) * stride + k, h2)
-        store8(colors_gradient, at(ids, start + 3) * stride + k, h3)
-        store8(colors_gradient, at(ids, start + 4) * stride + k, h4)
-        store8(colors_gradient, at(ids, start + 5) * stride + k, h5)
-        store8(colors_gradient, at(ids, start + 6) * stride + k, h6)
-        store8(colors_gradient, at(ids, start + 7) * stride + k, h7)
-
-
-@kernel
 def _gaussian_gradients(
     means, quats, scales, opacities, footprints, ids, start, size, camera, width, height, antialiased,
     with_depth, need_camera, first_camera, sums, dx, dy, dz, means_gradient, quats_gradient, scales_gradient,
@@ -350,7 +260,7 @@ def _gaussian_gradients(
     s_xx = load8(sums, SUMS + 24)
     s_xy = load8(sums, SUMS + 32)
     s_yy = load8(sums, SUMS + 40)
-    _, _, conic_xx, conic_xy, conic_yy, _, _, _ = _half_footprints(footprints, ids, start, 0)
+    _, _, conic_xx, conic_xy, conic_yy, _, _, _ = gather_columns(footprints, ids, start, PACKED, 0)
     conic_xx = conic_xx * -TWO
     conic_xy = conic_xy * -ONE
     conic_yy = conic_yy * -TWO
@@ -514,24 +424,13 @@ def _one_where_equal(a, b):
 
 @kernel
 def _add3(array, ids, start, first_camera, x, y, z):
-    """Add 3 vectors to the columns of the rows ids[start:start + 8] of an array [N, 3].
-
-    For the first camera the rows are overwritten.
-    """
+    """Add 3 vectors to the columns of an array [N, 3]; for the first camera, overwrite them."""
     if not first_camera:
         old_x, old_y, old_z = gather3(array, ids, start)
         x = x + old_x
         y = y + old_y
         z = z + old_z
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(x, y, z, x, x, x, x, x)
-    store3(array, 3 * at(ids, start), h0)
-    store3(array, 3 * at(ids, start + 1), h1)
-    store3(array, 3 * at(ids, start + 2), h2)
-    store3(array, 3 * at(ids, start + 3), h3)
-    store3(array, 3 * at(ids, start + 4), h4)
-    store3(array, 3 * at(ids, start + 5), h5)
-    store3(array, 3 * at(ids, start + 6), h6)
-    store3(array, 3 * at(ids, start + 7), h7)
+    scatter3(array, ids, start, 3, 0, x, y, z)
 
 
 @kernel
@@ -543,12 +442,4 @@ def _add4(array, ids, start, first_camera, w, x, y, z):
         x = x + old_x
         y = y + old_y
         z = z + old_z
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(w, x, y, z, x, x, x, x)
-    store4(array, 4 * at(ids, start), h0)
-    store4(array, 4 * at(ids, start + 1), h1)
-    store4(array, 4 * at(ids, start + 2), h2)
-    store4(array, 4 * at(ids, start + 3), h3)
-    store4(array, 4 * at(ids, start + 4), h4)
-    store4(array, 4 * at(ids, start + 5), h5)
-    store4(array, 4 * at(ids, start + 6), h6)
-    store4(array, 4 * at(ids, start + 7), h7)
+    scatter4(array, ids, start, w, x, y, z)
