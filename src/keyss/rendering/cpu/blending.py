@@ -35,6 +35,7 @@ from keyss.rendering.cpu.layout import (
     RED,
     TILE_HEIGHT,
     TILE_PIXELS,
+    TILE_RUN,
     TILE_WIDTH,
     TILE_WIDTH_LOG2,
     TRANSMITTANCE_MIN,
@@ -218,38 +219,39 @@ def blend(
     strips = np.empty(STRIP * (MAX_STRIPS + 1), np.int64)
     strip_footprints = np.empty(16 * MAX_STRIPS, np.float32)
     while True:
-        tile = fetch_add(counter, 0, 1)
-        if tile >= ends.shape[0]:
+        run = fetch_add(counter, 0, 1) * TILE_RUN
+        if run >= ends.shape[0]:
             break
-        left = (tile % tile_columns) * TILE_WIDTH
-        top = (tile // tile_columns) * TILE_HEIGHT
-        ends[tile] = _blend_tile(
-            footprints, entries, tile_starts[tile], tile_starts[tile + 1], left, top,
-            planes, strips, strip_footprints,
-        )  # fmt: skip
-        columns = min(TILE_WIDTH, width - left)
-        for y in range(min(TILE_HEIGHT, height - top)):
-            k = 8 * y
-            pixel = (top + y) * width + left
-            if columns == TILE_WIDTH:
-                rest = (ZERO - negative_abs(load8(planes, k))) * SCALE
-                store8(transmittance, pixel, rest)
-                store8(alpha, pixel, ONE - rest)
-                store_interleaved(
-                    image,
-                    3 * pixel,
-                    multiply_add(rest, background[0], load8(planes, k + PLANE)),
-                    multiply_add(rest, background[1], load8(planes, k + 2 * PLANE)),
-                    multiply_add(rest, background[2], load8(planes, k + 3 * PLANE)),
-                )
-                continue
-            for x in range(columns):
-                light = abs(planes[k + x]) * SCALE
-                transmittance[top + y, left + x] = light
-                alpha[top + y, left + x] = ONE - light
-                for channel in range(3):
-                    drawn = planes[k + x + (1 + channel) * PLANE]
-                    image[top + y, left + x, channel] = drawn + light * background[channel]
+        for tile in range(run, min(run + TILE_RUN, ends.shape[0])):
+            left = (tile % tile_columns) * TILE_WIDTH
+            top = (tile // tile_columns) * TILE_HEIGHT
+            ends[tile] = _blend_tile(
+                footprints, entries, tile_starts[tile], tile_starts[tile + 1], left, top,
+                planes, strips, strip_footprints,
+            )  # fmt: skip
+            columns = min(TILE_WIDTH, width - left)
+            for y in range(min(TILE_HEIGHT, height - top)):
+                k = 8 * y
+                pixel = (top + y) * width + left
+                if columns == TILE_WIDTH:
+                    rest = (ZERO - negative_abs(load8(planes, k))) * SCALE
+                    store8(transmittance, pixel, rest)
+                    store8(alpha, pixel, ONE - rest)
+                    store_interleaved(
+                        image,
+                        3 * pixel,
+                        multiply_add(rest, background[0], load8(planes, k + PLANE)),
+                        multiply_add(rest, background[1], load8(planes, k + 2 * PLANE)),
+                        multiply_add(rest, background[2], load8(planes, k + 3 * PLANE)),
+                    )
+                    continue
+                for x in range(columns):
+                    light = abs(planes[k + x]) * SCALE
+                    transmittance[top + y, left + x] = light
+                    alpha[top + y, left + x] = ONE - light
+                    for channel in range(3):
+                        drawn = planes[k + x + (1 + channel) * PLANE]
+                        image[top + y, left + x, channel] = drawn + light * background[channel]
 
 
 @finite_kernel
@@ -364,59 +366,60 @@ def blend_backward(
     strips = np.empty(STRIP * (MAX_STRIPS + 1), np.int64)
     strip_footprints = np.empty(16 * MAX_STRIPS, np.float32)
     while True:
-        tile = fetch_add(counter, 0, 1)
-        if tile >= ends.shape[0]:
+        run = fetch_add(counter, 0, 1) * TILE_RUN
+        if run >= ends.shape[0]:
             break
-        left = (tile % tile_columns) * TILE_WIDTH
-        top = (tile // tile_columns) * TILE_HEIGHT
-        rows = min(TILE_HEIGHT, height - top)
-        columns = min(TILE_WIDTH, width - left)
-        for e in range(ends[tile], tile_starts[tile + 1]):
-            slot = np.int64(at(entry_slots, e))
-            store8(moments, slot * MOMENTS, splat(ZERO))
-            for k in range(slot * extra_width, (slot + 1) * extra_width):
-                extras[k] = ZERO
-        if tile_starts[tile] == ends[tile]:
-            continue
-        for y in range(rows):
-            k = 8 * y
-            pixel = (top + y) * width + left
-            if columns == TILE_WIDTH:
-                red, green, blue = load_interleaved(image_gradient, 3 * pixel)
-                drawn_red, drawn_green, drawn_blue = load_interleaved(image, 3 * pixel)
-                behind = red * drawn_red + green * drawn_green + blue * drawn_blue
-                behind = behind - load8(alpha_gradient, pixel) * load8(transmittance, pixel)
-                store8(planes, k, splat(INVERSE))
-                store8(planes, k + TILE_PIXELS, behind)
-                store8(planes, k + 2 * TILE_PIXELS, red)
-                store8(planes, k + 3 * TILE_PIXELS, green)
-                store8(planes, k + 4 * TILE_PIXELS, blue)
+        for tile in range(run, min(run + TILE_RUN, ends.shape[0])):
+            left = (tile % tile_columns) * TILE_WIDTH
+            top = (tile // tile_columns) * TILE_HEIGHT
+            rows = min(TILE_HEIGHT, height - top)
+            columns = min(TILE_WIDTH, width - left)
+            for e in range(ends[tile], tile_starts[tile + 1]):
+                slot = np.int64(at(entry_slots, e))
+                store8(moments, slot * MOMENTS, splat(ZERO))
+                for k in range(slot * extra_width, (slot + 1) * extra_width):
+                    extras[k] = ZERO
+            if tile_starts[tile] == ends[tile]:
                 continue
-            for x in range(TILE_WIDTH):
-                inside = x < columns
-                planes[k + x] = INVERSE if inside else -INVERSE
-                light_behind = ZERO
-                if inside:
-                    light_behind = -alpha_gradient[top + y, left + x] * transmittance[top + y, left + x]
-                for channel in range(3):
-                    gradient = image_gradient[top + y, left + x, channel] if inside else ZERO
-                    planes[k + x + (2 + channel) * TILE_PIXELS] = gradient
+            for y in range(rows):
+                k = 8 * y
+                pixel = (top + y) * width + left
+                if columns == TILE_WIDTH:
+                    red, green, blue = load_interleaved(image_gradient, 3 * pixel)
+                    drawn_red, drawn_green, drawn_blue = load_interleaved(image, 3 * pixel)
+                    behind = red * drawn_red + green * drawn_green + blue * drawn_blue
+                    behind = behind - load8(alpha_gradient, pixel) * load8(transmittance, pixel)
+                    store8(planes, k, splat(INVERSE))
+                    store8(planes, k + TILE_PIXELS, behind)
+                    store8(planes, k + 2 * TILE_PIXELS, red)
+                    store8(planes, k + 3 * TILE_PIXELS, green)
+                    store8(planes, k + 4 * TILE_PIXELS, blue)
+                    continue
+                for x in range(TILE_WIDTH):
+                    inside = x < columns
+                    planes[k + x] = INVERSE if inside else -INVERSE
+                    light_behind = ZERO
                     if inside:
-                        light_behind += gradient * image[top + y, left + x, channel]
-                planes[k + x + TILE_PIXELS] = light_behind
-        _blend_tile_backward(
-            footprints,
-            entries,
-            entry_slots,
-            tile_starts[tile],
-            ends[tile],
-            left,
-            top,
-            planes,
-            strips,
-            strip_footprints,
-            moments,
-            extras,
-            extra_width,
-            absgrad,
-        )
+                        light_behind = -alpha_gradient[top + y, left + x] * transmittance[top + y, left + x]
+                    for channel in range(3):
+                        gradient = image_gradient[top + y, left + x, channel] if inside else ZERO
+                        planes[k + x + (2 + channel) * TILE_PIXELS] = gradient
+                        if inside:
+                            light_behind += gradient * image[top + y, left + x, channel]
+                    planes[k + x + TILE_PIXELS] = light_behind
+            _blend_tile_backward(
+                footprints,
+                entries,
+                entry_slots,
+                tile_starts[tile],
+                ends[tile],
+                left,
+                top,
+                planes,
+                strips,
+                strip_footprints,
+                moments,
+                extras,
+                extra_width,
+                absgrad,
+            )

@@ -35,6 +35,7 @@ from keyss.rendering.cpu.layout import (
     PACKED,
     TILE_HEIGHT,
     TILE_PIXELS,
+    TILE_RUN,
     TILE_WIDTH,
     TWO,
     XX,
@@ -135,25 +136,26 @@ def blend_features(
     planes = np.empty((1 + channels) * TILE_PIXELS, np.float32)
     weights = np.empty(TILE_PIXELS, np.float32)
     while True:
-        tile = fetch_add(counter, 0, 1)
-        if tile >= ends.shape[0]:
+        run = fetch_add(counter, 0, 1) * TILE_RUN
+        if run >= ends.shape[0]:
             break
-        left = (tile % tile_columns) * TILE_WIDTH
-        top = (tile // tile_columns) * TILE_HEIGHT
-        rows = min(TILE_HEIGHT, height - top)
-        ends[tile] = _blend_tile(
-            footprints, features, channels, entries, tile_starts[tile], tile_starts[tile + 1],
-            left, top, planes, weights,
-        )  # fmt: skip
-        for y in range(rows):
-            for x in range(min(TILE_WIDTH, width - left)):
-                k = y * 8 + x
-                rest = abs(planes[k]) * SCALE
-                for channel in range(channels):
-                    drawn = planes[k + (1 + channel) * TILE_PIXELS]
-                    image[top + y, left + x, channel] = drawn + rest * background[channel]
-                transmittance[top + y, left + x] = rest
-                alpha[top + y, left + x] = ONE - rest
+        for tile in range(run, min(run + TILE_RUN, ends.shape[0])):
+            left = (tile % tile_columns) * TILE_WIDTH
+            top = (tile // tile_columns) * TILE_HEIGHT
+            rows = min(TILE_HEIGHT, height - top)
+            ends[tile] = _blend_tile(
+                footprints, features, channels, entries, tile_starts[tile], tile_starts[tile + 1],
+                left, top, planes, weights,
+            )  # fmt: skip
+            for y in range(rows):
+                for x in range(min(TILE_WIDTH, width - left)):
+                    k = y * 8 + x
+                    rest = abs(planes[k]) * SCALE
+                    for channel in range(channels):
+                        drawn = planes[k + (1 + channel) * TILE_PIXELS]
+                        image[top + y, left + x, channel] = drawn + rest * background[channel]
+                    transmittance[top + y, left + x] = rest
+                    alpha[top + y, left + x] = ONE - rest
 
 
 @finite_kernel
@@ -287,37 +289,38 @@ def blend_features_backward(
     weights = np.empty(TILE_PIXELS, np.float32)
     products = np.empty(TILE_PIXELS, np.float32)
     while True:
-        tile = fetch_add(counter, 0, 1)
-        if tile >= ends.shape[0]:
+        run = fetch_add(counter, 0, 1) * TILE_RUN
+        if run >= ends.shape[0]:
             break
-        left = (tile % tile_columns) * TILE_WIDTH
-        top = (tile // tile_columns) * TILE_HEIGHT
-        rows = min(TILE_HEIGHT, height - top)
-        columns = min(TILE_WIDTH, width - left)
-        for e in range(ends[tile], tile_starts[tile + 1]):
-            slot = np.int64(at(entry_slots, e))
-            store8(moments, slot * MOMENTS, splat(ZERO))
-            for k in range(slot * extra_width, (slot + 1) * extra_width):
-                extras[k] = ZERO
-        if tile_starts[tile] == ends[tile]:
-            continue
-        for y in range(rows):
-            for x in range(TILE_WIDTH):
-                k = y * 8 + x
-                inside = x < columns
-                planes[k] = INVERSE if inside else -INVERSE
-                behind = ZERO
-                if inside:
-                    rest = transmittance[top + y, left + x]
-                    behind = -alpha_gradient[top + y, left + x] * rest
-                for channel in range(channels):
-                    gradient = ZERO
+        for tile in range(run, min(run + TILE_RUN, ends.shape[0])):
+            left = (tile % tile_columns) * TILE_WIDTH
+            top = (tile // tile_columns) * TILE_HEIGHT
+            rows = min(TILE_HEIGHT, height - top)
+            columns = min(TILE_WIDTH, width - left)
+            for e in range(ends[tile], tile_starts[tile + 1]):
+                slot = np.int64(at(entry_slots, e))
+                store8(moments, slot * MOMENTS, splat(ZERO))
+                for k in range(slot * extra_width, (slot + 1) * extra_width):
+                    extras[k] = ZERO
+            if tile_starts[tile] == ends[tile]:
+                continue
+            for y in range(rows):
+                for x in range(TILE_WIDTH):
+                    k = y * 8 + x
+                    inside = x < columns
+                    planes[k] = INVERSE if inside else -INVERSE
+                    behind = ZERO
                     if inside:
-                        gradient = image_gradient[top + y, left + x, channel]
-                        behind += gradient * image[top + y, left + x, channel]
-                    planes[k + (2 + channel) * TILE_PIXELS] = gradient
-                planes[k + TILE_PIXELS] = behind
-        _blend_tile_backward(
-            footprints, features, channels, entries, entry_slots, tile_starts[tile], ends[tile],
-            left, top, planes, weights, products, moments, extras, extra_width, absgrad,
-        )  # fmt: skip
+                        rest = transmittance[top + y, left + x]
+                        behind = -alpha_gradient[top + y, left + x] * rest
+                    for channel in range(channels):
+                        gradient = ZERO
+                        if inside:
+                            gradient = image_gradient[top + y, left + x, channel]
+                            behind += gradient * image[top + y, left + x, channel]
+                        planes[k + (2 + channel) * TILE_PIXELS] = gradient
+                    planes[k + TILE_PIXELS] = behind
+            _blend_tile_backward(
+                footprints, features, channels, entries, entry_slots, tile_starts[tile], ends[tile],
+                left, top, planes, weights, products, moments, extras, extra_width, absgrad,
+            )  # fmt: skip

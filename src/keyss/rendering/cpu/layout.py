@@ -55,6 +55,9 @@ CX = 14
 CY = 15
 POSITION = 16
 
+# Tiles per piece of work: neighbours, since their slots share cache lines.
+TILE_RUN = 8
+
 # Gaussians per piece of work in the kernels that go over Gaussians. Part of the results: sums of camera
 # gradients are taken within a piece first.
 CHUNK = 2048

@@ -138,7 +138,9 @@ def project_backward(
             dz = dx
             if sh_count > 0:
                 _, _, _, _, _, _, _, red = gather_columns(footprints, ids, start, PACKED, RED - RED % 8)
-                green, blue, _, _, _, _, _, _ = gather_columns(footprints, ids, start, PACKED, GREEN - GREEN % 8)
+                green, blue, _, _, _, _, _, _ = gather_columns(
+                    footprints, ids, start, PACKED, GREEN - GREEN % 8
+                )
                 # The maximum of 0.5 + basis . colors and 0 lets no gradient through where it is 0.
                 red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
                 green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
