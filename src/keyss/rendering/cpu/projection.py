@@ -18,6 +18,7 @@ from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     BLUE,
+    CHANNEL_MAX,
     CHUNK,
     CX,
     CY,
@@ -247,8 +248,8 @@ def pack(
     sh_count is the number of SH coefficients to use, or 0 where colors[:, 0] is the colour itself.
     Where `features` has columns, it gets the channels to draw: the colour, of any number of channels, and
     in one column more the depth. tile_bounds[r] becomes a number of tiles that Gaussian r of the depth
-    order meets at most. A Gaussian without a finite colour is hidden: its rank becomes -1, its radii and
-    extents are made empty.
+    order meets at most. A Gaussian whose colour is not below CHANNEL_MAX is hidden: its rank becomes -1, its
+    radii and extents are made empty.
     """
     count = rank.shape[0]
     channels = features.shape[1]
@@ -270,7 +271,7 @@ def pack(
             blue = ZERO
             if sh_count == 0 and channels > 0:
                 for channel in range(colors.shape[2]):
-                    finite = finite and abs(colors[i, 0, channel]) < HUGE
+                    finite = finite and abs(colors[i, 0, channel]) < CHANNEL_MAX
                     features[r, channel] = colors[i, 0, channel]
             elif sh_count == 0:
                 red = colors[i, 0, 0]
@@ -289,7 +290,9 @@ def pack(
                     red += basis[k] * colors[i, k, 0]
                     green += basis[k] * colors[i, k, 1]
                     blue += basis[k] * colors[i, k, 2]
-            if not (finite and abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE):
+            if not (
+                finite and abs(red) < CHANNEL_MAX and abs(green) < CHANNEL_MAX and abs(blue) < CHANNEL_MAX
+            ):
                 rank[i] = -1
                 radii[i, 0] = 0
                 radii[i, 1] = 0
