@@ -69,7 +69,7 @@ def check_finite(results: dict[str, Tensor]) -> None:
         assert (results[f"gradient of {name}"][unseen] == 0).all(), name
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_hostile_gaussians_give_finite_images_and_gradients(data: st.DataObject) -> None:
     scene = random_scene(
@@ -89,7 +89,7 @@ def test_hostile_gaussians_give_finite_images_and_gradients(data: st.DataObject)
     check_finite(scene.results({name: leaf.requires_grad_() for name, leaf in leaves.items()}))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.data())
 def test_hostile_cameras_give_finite_images_or_an_error_by_name(data: st.DataObject) -> None:
     scene = random_scene(count=12, width=21, height=35, size=0.3, **data.draw(colors), **data.draw(modes))
@@ -113,7 +113,7 @@ def test_hostile_cameras_give_finite_images_or_an_error_by_name(data: st.DataObj
         check_finite(results)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_types_and_layouts_do_not_matter(data: st.DataObject) -> None:
     scene = random_scene(
