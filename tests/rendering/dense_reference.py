@@ -8,6 +8,8 @@ from torch import Tensor
 
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
+Margins = dict[str, Tensor]
+
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
@@ -63,38 +65,41 @@ def dense_rasterization(
     shifts: Tensor | None = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Image [H, W, D], alpha [H, W], and a mask [H, W] of the pixels where no decision was a close call.
+    margins: Margins | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Image [H, W, D] and alpha [H, W] of one camera.
 
-    All inputs float64; a colour is SH coefficients where sh_degree is given. `shifts` [N, H * W, 2] moves
-    each projected centre as each pixel sees it: its gradient is that of means2d, pixel by pixel.
+    A colour is SH coefficients where sh_degree is given. `shifts` [N, H * W, 2] moves each projected centre
+    as each pixel sees it: its gradient is that of means2d, pixel by pixel. `margins` gets for every kind of
+    decision how far each Gaussian [N] stays from where it would be taken otherwise; see `clear_cut`.
     """
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     if sh_degree is not None:
         position = -rotation.T @ translation
         directions = torch.nn.functional.normalize(means - position, dim=-1)
         basis = sh_basis(sh_degree, directions)
-        colors = (0.5 + torch.einsum("nk,nkc->nc", basis, colors[:, : basis.shape[1]])).clamp_min(0)
+        unclamped = 0.5 + torch.einsum("nk,nkc->nc", basis, colors[:, : basis.shape[1]])
+        colors = unclamped.clamp_min(0)
 
     in_camera = means @ rotation.T + translation
-    order = in_camera[:, 2].argsort()
+    order = in_camera[:, 2].argsort(stable=True)
     order = order[in_camera[order, 2] >= near_plane]
     x, y, z = in_camera[order].unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
-    u = (x / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
-    v = (y / z).clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    limits_x = (-cx / fx - margin_x, (width - cx) / fx + margin_x)
+    limits_y = (-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    u, v = (x / z).clamp(*limits_x), (y / z).clamp(*limits_y)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
     half = jacobian @ rotation @ rotation_matrices(quats[order]) @ torch.diag_embed(scales[order])
     sharp = half @ half.mT
     covariance = sharp + eps2d * torch.eye(2, dtype=means.dtype)
-    conic = torch.linalg.inv(covariance)
     opacities = opacities[order]
     if rasterize_mode == "antialiased":
         opacities = opacities * (torch.linalg.det(sharp) / torch.linalg.det(covariance)).sqrt()
     depth = in_camera[order, 2:]
-    colors, background = {
+    channels, background = {
         "RGB": lambda: (colors[order], background),
         "D": lambda: (depth, background.new_zeros(1)),
         "RGB+D": lambda: (
@@ -102,30 +107,82 @@ def dense_rasterization(
             torch.cat([background, background.new_zeros(1)]),
         ),
     }[render_mode.replace("ED", "D")]()
-
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([columns, rows], -1).to(means).reshape(-1, 2)
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+    found: Margins | None = None if margins is None else {}
+    image, alpha = dense_blending(
+        centres,
+        torch.linalg.inv(covariance),
+        opacities,
+        channels,
+        width,
+        height,
+        background,
+        None if shifts is None else shifts[order],
+        found,
+    )
+    if render_mode.endswith("ED"):
+        image = torch.cat([image[..., :-1], image[..., -1:] / alpha[..., None].clamp_min(1e-10)], -1)
+
+    if margins is not None and found is not None:
+        z_all, infinity = in_camera[:, 2], torch.full_like(in_camera[:, 2], torch.inf)
+        found["the view where the perspective is linearised"] = torch.stack(
+            [(x / z - limit).abs() for limit in limits_x] + [(y / z - limit).abs() for limit in limits_y]
+        ).amin(0)
+        # A tie of depths is no close call: Gaussians at one place stay in the order of the arguments.
+        gaps = torch.diff(z)
+        gaps = torch.where(gaps == 0, torch.inf, gaps)
+        found["order"] = torch.minimum(
+            torch.cat([gaps, gaps.new_full((1,), torch.inf)])[: len(z)],
+            torch.cat([gaps.new_full((1,), torch.inf), gaps])[: len(z)],
+        )
+        for name, values in found.items():
+            margins[name] = infinity.index_copy(0, order, values).detach()
+        # Exactly on the near plane is no close call either, where the camera looks along an axis.
+        distance = (z_all - near_plane).abs()
+        on_plane = (distance == 0) & ((rotation == 0) | (rotation.abs() == 1)).all()
+        margins["near plane"] = torch.where(on_plane, torch.inf, distance).detach()
+        if sh_degree is not None:
+            seen = z_all[:, None] >= near_plane
+            margins["black"] = torch.where(seen, unclamped.abs(), torch.inf).amin(1).detach()
+    return image, alpha
+
+
+def dense_blending(
+    centres: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    channels: Tensor,
+    width: int,
+    height: int,
+    background: Tensor,
+    shifts: Tensor | None = None,
+    margins: Margins | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Image [H, W, D] and alpha [H, W] of 2D Gaussians from front to back, with conics [N, 2, 2]."""
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([columns, rows], -1).to(centres).reshape(-1, 2)
     offsets = pixels - centres[:, None]  # [N, P, 2]
     if shifts is not None:
-        offsets = offsets - shifts[order]
-    sigma = 0.5 * torch.einsum("npi,nij,npj->np", offsets, conic, offsets)
+        offsets = offsets - shifts
+    sigma = 0.5 * torch.einsum("npi,nij,npj->np", offsets, conics, offsets)
     footprint = opacities[:, None] * torch.exp(-sigma)
-    alpha = torch.where(footprint >= ALPHA_MIN, footprint.clamp_max(ALPHA_MAX), 0.0)
+    unstopped = torch.where(footprint >= ALPHA_MIN, footprint.clamp_max(ALPHA_MAX), 0.0)
+    after = torch.cumprod(1 - unstopped, 0)
+    alpha = unstopped * (after > TRANSMITTANCE_MIN)
+    if margins is not None:
+        # Where a pixel had stopped before, or the Gaussian is too faint, nothing more is decided.
+        before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
+        decided = (before > TRANSMITTANCE_MIN) & (unstopped > 0)
+        for name, values, threshold, asked in (
+            ("alpha 1/255", footprint, ALPHA_MIN, before > TRANSMITTANCE_MIN),
+            ("alpha 0.999", footprint, ALPHA_MAX, before > TRANSMITTANCE_MIN),
+            ("transmittance", after, TRANSMITTANCE_MIN, decided),
+        ):
+            margin = torch.where(asked, (values / threshold - 1).abs(), torch.inf)
+            margins[name] = margin.amin(1).detach()
     after = torch.cumprod(1 - alpha, 0)
-    drawn = after > TRANSMITTANCE_MIN
-    alpha = alpha * drawn
-    after = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
-    last = torch.cat([torch.ones_like(before[:1]), after])[-1] if len(after) else pixels.new_ones(len(pixels))
-    image = (alpha * before).mT @ colors + last[:, None] * background
-    if render_mode.endswith("ED"):
-        image = torch.cat([image[:, :-1], image[:, -1:] / (1 - last[:, None]).clamp_min(1e-10)], -1)
-
-    def near(values: Tensor, threshold: float) -> Tensor:
-        return ((values / threshold - 1).abs() < 3e-4).any(0)
-
-    unstopped = torch.cumprod(1 - torch.where(footprint >= ALPHA_MIN, footprint.clamp_max(ALPHA_MAX), 0.0), 0)
-    close_call = near(footprint, ALPHA_MIN) | near(footprint, ALPHA_MAX) | near(unstopped, TRANSMITTANCE_MIN)
+    before = torch.cat([torch.ones_like(after[:1]), after])
+    last = before[-1]
+    image = (alpha * before[:-1]).mT @ channels + last[:, None] * background
     shape = (height, width)
-    return image.reshape(*shape, -1), (1 - last).reshape(shape), ~close_call.reshape(shape)
+    return image.reshape(*shape, -1), (1 - last).reshape(shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -54,6 +55,19 @@ def good_arguments() -> dict[str, Any]:
         ("render_mode", "RGB+DEPTH"),
         ("rasterize_mode", "sharp"),
         ("backgrounds", torch.zeros(1, 4)),
+        ("backgrounds", torch.zeros(1, 3, dtype=torch.bool)),
+        ("quats", torch.ones(2, 4, dtype=torch.complex64)),
+        ("quats", [[1.0, 0, 0, 0]]),
+        ("colors", None),
+        ("viewmats", torch.full((1, 4, 4), math.nan)),
+        ("viewmats", torch.full((1, 4, 4), 1e300, dtype=torch.float64)),
+        ("Ks", torch.full((1, 3, 3), math.inf)),
+        ("Ks", torch.zeros(1, 3, 3)),
+        ("Ks", -torch.eye(3)[None]),
+        ("backgrounds", torch.tensor([[0.0, math.nan, 0.0]])),
+        ("backgrounds", torch.full((1, 3), 1e12)),
+        ("width", math.nan),
+        ("near_plane", math.nan),
     ],
 )
 def test_wrong_shapes_and_values(name: str, value: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numba
@@ -21,17 +22,26 @@ def test_kernels_are_cached_in_the_folder_of_these_sources() -> None:
     assert Path(blending.blend.stats.cache_path).is_relative_to(folder)
 
 
-def test_any_change_of_a_source_makes_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = tmp_path / "package"
-    package.mkdir()
-    (package / "jit.py").write_text("")
-    (package / "simd8.py").write_text("a = 1")
-    monkeypatch.setattr(jit, "__file__", str(package / "jit.py"))
-    monkeypatch.setattr(jit, "_cache_parents", lambda: [tmp_path])
-    first = jit.cache_folder.__wrapped__()
-    assert first == jit.cache_folder.__wrapped__()
-    (package / "simd8.py").write_text("a = 2")
-    assert jit.cache_folder.__wrapped__() != first
+SOURCES = sorted(Path(jit.__file__).parent.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", [path.name for path in SOURCES])
+def test_a_change_of_any_source_makes_a_new_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in SOURCES:
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "jit.py"))
+    monkeypatch.setattr(jit, "_cache_parents", lambda: [tmp_path / "cache"])
+    find = jit.cache_folder.__wrapped__
+    folders = [find(), find()]
+    with (tmp_path / name).open("a") as file:
+        file.write("# changed\n")
+    folders.append(find())
+    (tmp_path / name).rename(tmp_path / "renamed.py")
+    folders.append(find())
+    assert len(set(folders[:2])) == 1
+    assert len(set(folders)) == 3
 
 
 def test_an_unwritable_place_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,6 +60,16 @@ def test_kernels_compile_without_any_cache(monkeypatch: pytest.MonkeyPatch) -> N
     compiled = jit.kernel(add_one)
     assert compiled(np.float32(1)) == 2
     assert compiled.stats.cache_path is None
+
+
+def test_a_cache_folder_that_goes_away_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    monkeypatch.setattr(jit, "cache_folder", lambda: folder)
+    compiled = jit.kernel(add_one)
+    shutil.rmtree(folder)
+    assert compiled(np.float32(1)) == 2
+    assert list(folder.rglob("*.nbi"))
 
 
 def test_the_users_cache_setting_is_respected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,12 +1,17 @@
-"""Memory for the kernels is used again, and never by two at once."""
+"""Memory for the kernels is used again, never by two at once, and there is not too much of it."""
 
 from __future__ import annotations
 
 import gc
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import keyss
 from keyss.rendering.cpu import memory
 
 
@@ -39,3 +44,49 @@ def test_free_memory_is_bounded() -> None:
 
 def test_arrays_may_be_empty() -> None:
     assert memory.empty((0, 16), np.float32).shape == (0, 16)
+
+
+# A million Gaussians as in fitted scenes, of which nearly all are seen. A few are drawn before, so that what
+# the compiler takes is not counted.
+DRAW_A_MILLION = """
+import math, resource, torch
+from keyss.rendering import rasterization
+
+def draw(count, width, height):
+    generator = torch.Generator().manual_seed(0)
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 4
+    K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1]])
+    scales = (math.log(0.42 * count ** (-1 / 3)) + 0.5 * normal(count, 3)).exp()
+    inputs = [normal(count, 3), normal(count, 4), scales, normal(count).mul(1.5).sigmoid()]
+    inputs.append(0.2 * normal(count, 16, 3))
+    inputs = [tensor.requires_grad_() for tensor in inputs]
+    with open("/proc/self/statm") as file:
+        before = int(file.read().split()[1]) * resource.getpagesize()
+    images, _, meta = rasterization(*inputs, viewmat[None], K[None], width, height, sh_degree=3)
+    images.sum().backward()
+    assert (meta["radii"] > 0).all(-1).sum() > 0.5 * count
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+
+draw(100, 64, 64)
+print(draw(1_000_000, 1600, 1066))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_million_gaussians_need_no_more_than_4_gib() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", DRAW_A_MILLION],
+        env={**os.environ, "PYTHONPATH": str(Path(keyss.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    growth = int(done.stdout)
+    print(f"peak resident memory grew by {growth / 2**30:.2f} GiB")
+    assert growth <= 4 * 2**30

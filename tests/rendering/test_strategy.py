@@ -7,6 +7,7 @@ import torch
 from gsplat import DefaultStrategy
 
 from keyss.rendering import rasterization
+from rendering.scenes import random_scene
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
@@ -40,7 +41,7 @@ def test_default_strategy_grows_and_prunes(cameras: int, absgrad: bool) -> None:
     K = torch.tensor([[50.0, 0, size / 2], [0, 50, size / 2], [0, 0, 1]])
     target = torch.rand(cameras, size, size, 3)
     sizes = []
-    for step in range(1, 11):
+    for step in range(1, 31):
         images, _, info = rasterization(
             params["means"],
             params["quats"],
@@ -68,3 +69,18 @@ def test_default_strategy_grows_and_prunes(cameras: int, absgrad: bool) -> None:
             assert (params["opacities"].sigmoid() >= 0.005).all()
     assert sizes[3] == count
     assert sizes[4] > count
+    assert len(set(sizes)) >= 4  # it goes on to the end
+    assert all(parameter.isfinite().all() for parameter in params.values())
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_meta_is_what_gsplat_returns_unpacked(cameras: int) -> None:
+    scene = random_scene(cameras=cameras)
+    count = len(scene.means)
+    _, _, meta = scene.draw(scene.leaves())
+    assert meta["means2d"].shape == meta["radii"].shape == (cameras, count, 2)
+    assert meta["depths"].shape == meta["opacities"].shape == (cameras, count)
+    assert meta["radii"].dtype == torch.int32
+    assert (meta["width"], meta["height"], meta["n_cameras"]) == (scene.width, scene.height, cameras)
+    assert meta["n_batches"] == 1
+    assert meta["batch_ids"] is meta["camera_ids"] is meta["gaussian_ids"] is None

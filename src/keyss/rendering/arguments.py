@@ -5,10 +5,12 @@ from __future__ import annotations
 from torch import Tensor
 
 from keyss.core import UsageError
-from keyss.rendering.cpu.layout import EPS2D_MIN
+from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32
+CAMERA_MAX = 1e12  # in viewmats and Ks: products of such numbers are still floats
+FOCAL_LENGTH_MIN = 1e-6  # pixels
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
@@ -38,11 +40,24 @@ def check_arguments(
         raise ValueError(
             f"rasterize_mode: expected one of {', '.join(RASTERIZE_MODES)}, got {rasterize_mode!r}"
         )
-    if means.dim() != 2 or viewmats.dim() != 3:
-        raise ValueError(
-            f"expected means [N, 3] and viewmats [C, 4, 4] without batch dimensions, "
-            f"got {list(means.shape)} and {list(viewmats.shape)}"
-        )
+    tensors = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+        "backgrounds": backgrounds,
+    }
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor) and (name, tensor) != ("backgrounds", None):
+            raise ValueError(f"{name}: expected a torch tensor, got {type(tensor).__name__}")
+    for name, tensor, shape in (("means", means, "[N, 3]"), ("viewmats", viewmats, "[C, 4, 4]")):
+        if tensor.dim() != shape.count(",") + 1:
+            raise ValueError(
+                f"{name}: expected shape {shape} without batch dimensions, got {list(tensor.shape)}"
+            )
     count, cameras = len(means), len(viewmats)
     _check_shape("means", means, count, 3)
     _check_shape("quats", quats, count, 4)
@@ -69,22 +84,15 @@ def check_arguments(
             )
     if backgrounds is not None:
         _check_shape("backgrounds", backgrounds, cameras, colors.shape[-1])
-    for name, tensor in (
-        ("means", means),
-        ("quats", quats),
-        ("scales", scales),
-        ("opacities", opacities),
-        ("colors", colors),
-        ("viewmats", viewmats),
-        ("Ks", Ks),
-        ("backgrounds", backgrounds),
-    ):
+    for name, tensor in tensors.items():
         if tensor is None:
             continue
         if not tensor.is_floating_point():
             raise ValueError(f"{name}: expected floating point numbers, got {tensor.dtype}")
         if tensor.device != means.device:
             raise ValueError(f"{name}: is on {tensor.device}, but means is on {means.device}")
+    if means.device.type == "cpu":  # on a GPU these checks would wait for what it is doing
+        _check_cameras(viewmats, Ks, backgrounds)
     for name, side in (("width", width), ("height", height)):
         if not 1 <= side <= MAX_SIDE:
             raise ValueError(f"{name}: expected 1 to {MAX_SIDE} pixels, got {side}")
@@ -94,6 +102,25 @@ def check_arguments(
         raise ValueError(
             f"eps2d: expected {EPS2D_MIN} or more, got {eps2d}: narrower footprints would be "
             f"drawn wrongly by the CPU rasterizer"
+        )
+
+
+def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
+    """Raise ValueError where a number would spoil every pixel; bad Gaussians are only left out."""
+    limits = {
+        "viewmats": (viewmats, CAMERA_MAX),
+        "Ks": (Ks, CAMERA_MAX),
+        "backgrounds": (backgrounds, float(CHANNEL_MAX)),
+    }
+    for name, (tensor, limit) in limits.items():
+        if tensor is not None and not bool((tensor.detach().abs() < limit).all()):
+            raise ValueError(
+                f"{name}: expected finite numbers below {limit:g}, got others in {list(tensor.shape)}"
+            )
+    focal_lengths = Ks.detach()[:, [0, 1], [0, 1]]
+    if not bool((focal_lengths > FOCAL_LENGTH_MIN).all()):
+        raise ValueError(
+            f"Ks: expected focal lengths above {FOCAL_LENGTH_MIN:g} pixels, got others in {list(Ks.shape)}"
         )
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from keyss.core import UsageError
 from keyss.rendering import cuda
 from keyss.rendering.arguments import check_arguments
-from keyss.rendering.cpu.layout import EPS2D_MIN
+from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
 from keyss.rendering.cpu.rasterization import Settings
 from keyss.rendering.cpu.rasterization import rasterize as rasterize_on_cpu
 
@@ -72,8 +72,8 @@ def rasterization(
         width, height, n_cameras, gaussian_ids (None: nothing is packed).
 
     On the CPU there are gradients to all tensors but Ks, everything is computed in float32 and is
-    bit-identical from run to run and for any number of threads, Gaussians that are not finite are not
-    drawn, and means2d is a leaf: losses on it do not reach the means.
+    bit-identical from run to run and for any number of threads, Gaussians that are not finite or have a
+    colour or depth of 1e12 or more are not drawn, and means2d is a leaf: losses on it do not reach the means.
 
     Raises:
         ValueError: a shape, dtype or number is not as above.
@@ -116,7 +116,7 @@ def rasterization(
         width=int(width),
         height=int(height),
         near_plane=near_plane,
-        far_plane=far_plane,
+        far_plane=min(far_plane, float(CHANNEL_MAX)),
         radius_clip=radius_clip,
         eps2d=eps2d,
         sh_count=0 if sh_degree is None else (sh_degree + 1) ** 2,

@@ -67,4 +67,6 @@ HALF = f32(0.5)
 ONE = f32(1)
 TWO = f32(2)
 HUGE = f32(1e30)  # what is larger is treated like infinity: skipped
+# Colours and depths from here on are not drawn: the backward pass multiplies them by 2^64.
+CHANNEL_MAX = f32(1e12)
 NORM_MIN = f32(1e-24)  # smallest squared length that is normalised

@@ -17,6 +17,7 @@ from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     BLUE,
+    CHANNEL_MAX,
     CHUNK,
     CX,
     CY,
@@ -149,8 +150,8 @@ def project(
 ):
     """Fill one row per Gaussian of `footprints` (packed layout), means2d, depths, radii and tile_bounds.
 
-    tile_bounds[i] is a number of tiles that the Gaussian meets at most. What cannot be seen, or has no
-    finite colour, gets depth 0, radii 0 and no tiles; its footprint means nothing. sh_count is the number
+    tile_bounds[i] is a number of tiles that the Gaussian meets at most. What cannot be seen, or has a
+    colour of CHANNEL_MAX or more, gets depth 0, radii 0 and no tiles; its footprint means nothing. sh_count is the number
     of SH coefficients to use, or 0 where colors[:, 0] is the colour itself. Where `features` has columns,
     it gets the channels to draw: the colour, of any number of channels, and in one column more the depth.
 
@@ -199,10 +200,10 @@ def project(
                 )  # fmt: skip
                 # Written so that a NaN counts, too.
                 size_of_color = absolute(red) + absolute(green) + absolute(blue)
-                if any_gt(select_gt(HUGE, size_of_color, ZERO, ONE), ZERO):
+                if any_gt(select_gt(CHANNEL_MAX, size_of_color, ZERO, ONE), ZERO):
                     store8(results, 0, size_of_color)
                     for lane in range(min(8, visible - k)):
-                        if not results[lane] < HUGE:
+                        if not results[lane] < CHANNEL_MAX:
                             _hide(seen[k + lane], depths, radii, tile_bounds)
         else:
             _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds)
@@ -327,7 +328,7 @@ def _copy_colors(colors, seen, visible, features, footprints, depths, radii, til
                 features[i, channel] = value
             else:
                 footprints[i, RED + channel] = value
-            if not abs(value) < HUGE:
+            if not abs(value) < CHANNEL_MAX:
                 _hide(i, depths, radii, tile_bounds)
 
 

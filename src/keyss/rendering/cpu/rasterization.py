@@ -179,6 +179,9 @@ class _Rasterize(torch.autograd.Function):
         if not need_colors:
             shapes[4] = (0, 1, settings.color_channels)
         *gradients, means2d_gradient = (_empty(*shape) for shape in shapes)
+        if not ctx.drawings:  # no camera, and it is the first one that overwrites what is in this memory
+            for gradient in gradients:
+                gradient.zero_()
         absgrad = torch.empty_like(ctx.means2d if settings.absgrad else means2d_gradient[:, :0])
         pieces = -(-len(means) // CHUNK)
         camera_gradient = np.zeros((pieces if need_camera else 0, 15))

@@ -1,0 +1,269 @@
+"""Small scenes that between them reach every branch of the rasterizer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from keyss.rendering import rasterization
+
+DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+
+
+@dataclass
+class Scene:
+    """The arguments of `rasterization`, in float64 but rounded to float32, so that both see the same."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor  # [N, 16, 3], or [N, D] where sh_degree is None
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    backgrounds: Tensor
+    sh_degree: int | None
+    render_mode: str = "RGB"
+    rasterize_mode: str = "classic"
+    near_plane: float = 2.0**-6  # a float32, as the kernels compare depths with one
+
+    def __post_init__(self) -> None:
+        self.round()
+
+    def round(self) -> None:
+        """Round every tensor to the nearest float32 numbers."""
+        for name in (*DIFFERENTIABLE, "Ks"):
+            setattr(self, name, getattr(self, name).float().double())
+
+    def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+        """Fresh copies of all differentiable inputs, each a leaf that wants its gradient."""
+        return {name: getattr(self, name).to(dtype).clone().requires_grad_() for name in DIFFERENTIABLE}
+
+    def settings(self) -> dict[str, Any]:
+        """The keyword arguments that are not tensors."""
+        names = ("width", "height", "sh_degree", "render_mode", "rasterize_mode", "near_plane")
+        return {name: getattr(self, name) for name in names}
+
+    def draw(self, leaves: dict[str, Tensor], **changes: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """`rasterization` of the leaves."""
+        return rasterization(**{**leaves, "Ks": self.Ks.to(leaves["means"]), **self.settings(), **changes})
+
+    def results(self, leaves: dict[str, Tensor] | None = None, **changes: Any) -> dict[str, Tensor]:
+        """Everything that comes out: images, alphas, meta and every gradient of a fixed, random loss."""
+        leaves = self.leaves() if leaves is None else leaves
+        images, alphas, meta = self.draw(leaves, absgrad=True, **changes)
+        meta["means2d"].retain_grad()
+        generator = torch.Generator().manual_seed(1)
+        weights = [torch.randn(t.shape, generator=generator).to(t.device) for t in (images, alphas)]
+        torch.autograd.backward([images, alphas], weights)
+        found = {"images": images, "alphas": alphas, "radii": meta["radii"], "depths": meta["depths"]}
+        found["means2d"] = meta["means2d"]
+        found["gradient of means2d"] = meta["means2d"].grad
+        found["absgrad"] = meta["means2d"].absgrad
+        for name, leaf in leaves.items():
+            # None for what has no part in the picture, as the colours where only depths are drawn.
+            found[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+        return {name: tensor.detach() for name, tensor in found.items()}
+
+    def dense_arguments(self, leaves: dict[str, Tensor], camera: int) -> dict[str, Any]:
+        """The arguments of `dense_rasterization` for one of the cameras."""
+        arguments: dict[str, Any] = {**leaves, **self.settings()}
+        viewmats, backgrounds = arguments.pop("viewmats"), arguments.pop("backgrounds")
+        return {
+            **arguments,
+            "viewmat": viewmats[camera],
+            "K": self.Ks[camera],
+            "background": backgrounds[camera],
+        }
+
+
+def random_scene(
+    count: int = 60,
+    width: int = 48,
+    height: int = 40,
+    *,
+    cameras: int = 1,
+    sh_degree: int | None = 3,
+    channels: int = 3,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    distance: float = 4.0,
+    spread: float = 1.0,
+    size: float = 0.1,
+    seed: int = 0,
+) -> Scene:
+    """Random Gaussians before slightly turned cameras whose principal points are off centre."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    viewmats, Ks = [], []
+    for camera in range(cameras):
+        cosine, sine = math.cos(0.3 - 0.5 * camera), math.sin(0.3 - 0.5 * camera)
+        viewmats.append(
+            [[cosine, 0, sine, 0.1], [0, 1, 0, -0.05], [-sine, 0, cosine, distance], [0, 0, 0, 1]]
+        )
+        Ks.append(
+            [[(0.9 + 0.1 * camera) * width, 0, 0.52 * width], [0, 1.1 * height, 0.47 * height], [0, 0, 1]]
+        )
+    return Scene(
+        means=spread * normal(count, 3),
+        quats=normal(count, 4),
+        scales=size * (0.3 * normal(count, 3)).exp(),
+        opacities=0.05 + 0.9 * uniform(count),
+        colors=uniform(count, channels) if sh_degree is None else 0.3 * normal(count, 16, 3),
+        viewmats=torch.tensor(viewmats, dtype=torch.float64).reshape(-1, 4, 4),
+        Ks=torch.tensor(Ks, dtype=torch.float64).reshape(-1, 3, 3),
+        width=width,
+        height=height,
+        backgrounds=uniform(cameras, channels),
+        sh_degree=sh_degree,
+        render_mode=render_mode,
+        rasterize_mode=rasterize_mode,
+    )
+
+
+def scene_of_modes(colors: int | str, render_mode: str, rasterize_mode: str) -> Scene:
+    """A random scene of so many channels, or of the SH degree "degree 0" to "degree 3"."""
+    modes = {"render_mode": render_mode, "rasterize_mode": rasterize_mode}
+    if isinstance(colors, str):
+        return with_backdrop(random_scene(count=40, sh_degree=int(colors[-1]), seed=30, **modes))
+    return with_backdrop(random_scene(count=40, sh_degree=None, channels=colors, seed=31, **modes))
+
+
+COLORS = ("degree 0", "degree 1", "degree 2", "degree 3", 1, 2, 3, 5, 32)
+
+
+def with_backdrop(scene: Scene) -> Scene:
+    """The scene with one large Gaussian behind everything.
+
+    The expected depth divides by alpha, which float32 knows to 6e-8 only: behind the last faint rim of a
+    Gaussian, alpha is 0.004, and the quotient would be right to 1e-5 at best.
+    """
+    backdrop: dict[str, Any] = {}
+    for name, value in (("means", (-1.0, 0.0, 3.0)), ("quats", (1.0, 0, 0, 0)), ("scales", (8.0, 8.0, 0.1))):
+        row = torch.tensor([value], dtype=torch.float64)
+        backdrop[name] = torch.cat([getattr(scene, name), row])
+    backdrop["opacities"] = torch.cat([scene.opacities, scene.opacities.new_full((1,), 0.7)])
+    backdrop["colors"] = torch.cat([scene.colors, scene.colors[:1]])
+    return replace(scene, **backdrop)
+
+
+def opaque_walls() -> Scene:
+    """Large, nearly opaque Gaussians: pixels stop early, and alphas reach the clamp."""
+    scene = random_scene(count=80, size=0.5, seed=1)
+    return replace(scene, opacities=0.9 + 0.1 * torch.linspace(0, 1, 80))
+
+
+def opaque_walls_of_features() -> Scene:
+    """Pixels that stop early, and alphas at the clamp, with many channels and the depth."""
+    features = random_scene(count=80, sh_degree=None, channels=5, render_mode="RGB+D")
+    wall = opaque_walls()
+    return replace(
+        wall, colors=features.colors, backgrounds=features.backgrounds, sh_degree=None, render_mode="RGB+D"
+    )
+
+
+def coincident(**changes: Any) -> Scene:
+    """10,000 Gaussians at one place, so faint that thousands of them add to each pixel before it stops."""
+    scene = random_scene(count=10_000, width=6, height=5, size=0.5, seed=20, **changes)
+    return replace(
+        scene,
+        means=scene.means[:1].expand(10_000, 3) * 0.1,
+        opacities=0.0042 + 0.003 * scene.opacities,
+    )
+
+
+def needles(**changes: Any) -> Scene:
+    """Long and thin, in all directions and along the rows: the exponential recurrence at its limit."""
+    scene = random_scene(count=60, width=70, height=80, seed=2, **changes)
+    half_turns = torch.linspace(-0.3, 0.3, 30).double() / 2
+    scene.quats[:30] = torch.stack([half_turns.cos(), 0 * half_turns, 0 * half_turns, half_turns.sin()], -1)
+    thickness = 0.01 if scene.rasterize_mode == "antialiased" else 0.001
+    return replace(scene, scales=torch.tensor([0.5, thickness, thickness]).expand(60, 3))
+
+
+def specks() -> Scene:
+    """Much smaller than a pixel."""
+    return random_scene(count=200, size=1e-4, seed=3)
+
+
+def around_the_camera(**changes: Any) -> Scene:
+    """On all sides of the camera, and far outside the image."""
+    return random_scene(count=150, distance=0.2, spread=1.5, size=0.15, seed=4, **changes)
+
+
+def around_the_near_plane() -> Scene:
+    """Behind the camera, behind the near plane, exactly on it, across it, and beyond."""
+    scene = random_scene(count=50, size=0.1, spread=0.4, seed=21)
+    near = 0.25
+    means = scene.means.clone()
+    means[:, 2] = torch.cat(
+        [
+            torch.linspace(-2, -0.01, 10),  # behind the camera
+            torch.linspace(0.01, 0.24, 10),  # before it, and not drawn
+            torch.full((10,), near),  # on the plane, which is drawn
+            near * (1 + torch.tensor([-0.1, -1e-3, -1e-4, 1e-4, 1e-3, 0.01, 0.02, 0.05, 0.1, 0.2])),
+            torch.linspace(0.3, 3, 10),
+        ]
+    )
+    # Looking straight along z from the origin, depths are exact.
+    return replace(scene, means=means, viewmats=torch.eye(4)[None], near_plane=near)
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "random": random_scene,
+    "opaque walls": opaque_walls,
+    "opaque walls of features": opaque_walls_of_features,
+    "10,000 coincident": coincident,
+    "around the camera": around_the_camera,
+    "around the near plane": around_the_near_plane,
+    "needles": needles,
+    "specks": specks,
+    "one pixel": lambda: random_scene(count=20, width=1, height=1, size=0.5, seed=5),
+    "7 x 1013 pixels": lambda: random_scene(count=60, width=7, height=1013, seed=6),
+    "101 x 7 pixels": lambda: random_scene(count=60, width=101, height=7, seed=7),
+    "degree 0": lambda: random_scene(sh_degree=0, seed=8),
+    "degree 1": lambda: random_scene(sh_degree=1, seed=9),
+    "degree 2": lambda: random_scene(sh_degree=2, seed=10),
+    "3 channels": lambda: random_scene(sh_degree=None, seed=11),
+    "1 channel": lambda: random_scene(sh_degree=None, channels=1, seed=12),
+    "2 channels, 7 x 101 pixels": lambda: random_scene(
+        width=7, height=101, sh_degree=None, channels=2, seed=13
+    ),
+    "5 channels": lambda: random_scene(sh_degree=None, channels=5, seed=19),
+    "32 channels": lambda: random_scene(sh_degree=None, channels=32, seed=14),
+    "depth": lambda: around_the_camera(render_mode="D"),
+    "expected depth": lambda: with_backdrop(random_scene(render_mode="ED", seed=15)),
+    "colour and depth": lambda: random_scene(render_mode="RGB+D", seed=16),
+    "colour and expected depth": lambda: with_backdrop(
+        random_scene(sh_degree=1, render_mode="RGB+ED", seed=17)
+    ),
+    "antialiased": lambda: random_scene(size=0.03, rasterize_mode="antialiased", seed=18),
+    "antialiased needles": lambda: needles(rasterize_mode="antialiased"),
+    "antialiased around the camera": lambda: around_the_camera(
+        render_mode="RGB+D", rasterize_mode="antialiased"
+    ),
+    "three cameras": lambda: random_scene(cameras=3, seed=22),
+    "three cameras, features and expected depth, antialiased": lambda: with_backdrop(
+        random_scene(
+            cameras=3,
+            sh_degree=None,
+            channels=4,
+            render_mode="RGB+ED",
+            rasterize_mode="antialiased",
+            seed=23,
+        )
+    ),
+}

@@ -1,0 +1,248 @@
+"""Any numbers, types and layouts give a finite picture or an error by name; what should not matter does not.
+
+Bad input is made up by hypothesis. Inputs lie within memory full of NaN, so that what a kernel read before
+or behind them would show.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from torch import Tensor
+
+from keyss.core import UsageError
+from keyss.rendering import rasterization
+from keyss.rendering.arguments import RASTERIZE_MODES, RENDER_MODES
+from rendering.clear_cut import clear_cut
+from rendering.scenes import DIFFERENTIABLE, Scene, random_scene, with_backdrop
+
+# NaN, infinities, zeros, denormal, small, huge and largest numbers, and one that is as usual.
+HOSTILE = (
+    *(math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-45, -1e-40, 1e-38, -1e-12, 1e-6),
+    *(1e3, -1e3, 1e8, 1e15, -1e15, 1e19, -1e25, 1e30, -1e30, 3.4e38, -3.4e38, 1.0),
+)
+GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
+DTYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
+
+modes = st.fixed_dictionaries(
+    {"render_mode": st.sampled_from(RENDER_MODES), "rasterize_mode": st.sampled_from(RASTERIZE_MODES)}
+)
+# SH degree or number of channels.
+colors = st.one_of(
+    st.fixed_dictionaries({"sh_degree": st.integers(0, 3)}),
+    st.fixed_dictionaries({"sh_degree": st.none(), "channels": st.sampled_from([1, 2, 3, 4, 11, 32])}),
+)
+
+
+def guarded(tensor: Tensor) -> Tensor:
+    """A contiguous copy with NaN before and behind it in memory."""
+    memory = torch.full((tensor.numel() + 128,), math.nan, dtype=tensor.dtype)
+    inside = memory[64 : 64 + tensor.numel()].view(tensor.shape)
+    return inside.copy_(tensor)
+
+
+def strided(tensor: Tensor) -> Tensor:
+    """A copy of which no two numbers are neighbours in memory, with NaN between them."""
+    return torch.stack([tensor, torch.full_like(tensor, math.nan)], -1)[..., 0]
+
+
+def transposed(tensor: Tensor) -> Tensor:
+    """A copy whose dimensions lie in memory in reverse."""
+    reverse = tuple(reversed(range(tensor.dim())))
+    return tensor.permute(reverse).contiguous().permute(reverse)
+
+
+def check_finite(results: dict[str, Tensor]) -> None:
+    for name, tensor in results.items():
+        if name != "means2d":  # of Gaussians too far aside
+            assert tensor.isfinite().all(), name
+    assert ((results["alphas"] >= 0) & (results["alphas"] <= 1)).all()
+    hidden = (results["radii"] == 0).any(-1)
+    assert (results["gradient of means2d"][hidden] == 0).all()
+    unseen = hidden.all(0)
+    for name in GAUSSIAN:
+        assert (results[f"gradient of {name}"][unseen] == 0).all(), name
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_hostile_gaussians_give_finite_images_and_gradients(data: st.DataObject) -> None:
+    scene = random_scene(
+        count=data.draw(st.sampled_from([0, 1, 12])),
+        width=data.draw(st.integers(1, 40)),
+        height=data.draw(st.integers(1, 40)),
+        size=0.3,
+        cameras=data.draw(st.integers(1, 2)),
+        seed=data.draw(st.integers(0, 5)),
+        **data.draw(colors),
+        **data.draw(modes),
+    )
+    leaves = {name: guarded(leaf.detach()) for name, leaf in scene.leaves().items()}
+    for _ in range(data.draw(st.integers(1, 10)) if len(scene.means) else 0):
+        numbers = leaves[data.draw(st.sampled_from(GAUSSIAN))].view(-1)
+        numbers[data.draw(st.integers(0, len(numbers) - 1))] = data.draw(st.sampled_from(HOSTILE))
+    check_finite(scene.results({name: leaf.requires_grad_() for name, leaf in leaves.items()}))
+
+
+@settings(max_examples=120, deadline=None)
+@given(st.data())
+def test_hostile_cameras_give_finite_images_or_an_error_by_name(data: st.DataObject) -> None:
+    scene = random_scene(count=12, width=21, height=35, size=0.3, **data.draw(colors), **data.draw(modes))
+    arguments = {name: guarded(leaf.detach()) for name, leaf in scene.leaves().items()}
+    arguments["Ks"] = guarded(scene.Ks.float())
+    spoiled = data.draw(st.lists(st.sampled_from(["viewmats", "Ks", "backgrounds"]), min_size=1, max_size=3))
+    for name in spoiled:
+        numbers = arguments[name].view(-1)
+        numbers[data.draw(st.integers(0, len(numbers) - 1))] = data.draw(st.sampled_from(HOSTILE))
+    leaves = {name: arguments[name].requires_grad_() for name in DIFFERENTIABLE}
+    message, results = "", {}
+    try:
+        results = scene.results(leaves, Ks=arguments["Ks"])
+    except ValueError as error:
+        message = str(error)
+    if message:
+        assert any(
+            message.startswith(f"{name}:") and str(list(arguments[name].shape)) in message for name in spoiled
+        )
+    else:
+        check_finite(results)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_types_and_layouts_do_not_matter(data: st.DataObject) -> None:
+    scene = random_scene(
+        count=data.draw(st.sampled_from([0, 1, 20])),
+        width=21,
+        height=35,
+        cameras=data.draw(st.integers(0, 2)),
+        **data.draw(colors),
+        **data.draw(modes),
+    )
+    names = (*DIFFERENTIABLE, "Ks")
+    layouts = st.sampled_from([guarded, strided, transposed])
+    given_ = {
+        name: data.draw(layouts)(getattr(scene, name).to(data.draw(st.sampled_from(DTYPES))))
+        for name in names
+    }
+    plain = {name: tensor.float().contiguous() for name, tensor in given_.items()}
+    both = []
+    for arguments in (given_, plain):
+        leaves = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE}
+        both.append(scene.results(leaves, Ks=arguments["Ks"]))
+    for name, tensor in both[0].items():
+        if not name.startswith("gradient of") or name.endswith("means2d"):
+            assert torch.equal(tensor, both[1][name]), name
+        else:
+            assert tensor.dtype == given_[name.removeprefix("gradient of ")].dtype
+            assert torch.equal(tensor, both[1][name].to(tensor.dtype)), name
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_wrong_shapes_are_named(data: st.DataObject) -> None:
+    scene = random_scene(count=4, sh_degree=data.draw(st.sampled_from([None, 2])))
+    arguments: dict[str, Any] = {**scene.leaves(), "Ks": scene.Ks.float(), **scene.settings()}
+    name = data.draw(st.sampled_from((*DIFFERENTIABLE, "Ks")))
+    right = tuple(arguments[name].shape)
+    # Near to the right shape, or any other.
+    shape = list(data.draw(st.one_of(st.permutations(right), st.lists(st.integers(0, 5), max_size=4))))
+    if data.draw(st.booleans()):
+        shape = [*right, 1] if data.draw(st.booleans()) else [1, *right]
+    assume(tuple(shape) != right)
+    if (
+        name == "colors"
+    ):  # any number of channels is right where there is no background, and more coefficients
+        assume(not (len(shape) == len(right) and shape[0] == right[0]))
+    arguments[name] = torch.zeros(shape)
+    with pytest.raises((ValueError, UsageError)) as refused:
+        rasterization(**arguments)
+    message = str(refused.value)
+    if name in ("means", "viewmats") and shape[:1] != list(right[:1]):
+        # Another number of Gaussians or cameras: then it is the first of the others that does not fit.
+        assert any(message.startswith(f"{other}:") for other in arguments)
+    else:
+        assert message.startswith(f"{name}:")
+        assert str(shape) in message
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), colors, modes)
+def test_the_order_of_the_gaussians_does_not_matter(seed: int, colors: Any, modes: Any) -> None:
+    scene = random_scene(count=150, seed=seed, **colors, **modes)
+    shuffle = torch.randperm(150, generator=torch.Generator().manual_seed(seed))
+    results = scene.results()
+    depths = results["depths"][results["depths"] > 0]
+    assume(len(depths.unique()) == len(depths))
+    leaves = {
+        name: (leaf.detach()[shuffle] if name in GAUSSIAN else leaf.detach()).requires_grad_()
+        for name, leaf in scene.leaves().items()
+    }
+    for name, tensor in scene.results(leaves).items():
+        expected = results[name]
+        if name.removeprefix("gradient of ") in GAUSSIAN:
+            expected = expected[shuffle]
+        elif name in ("radii", "depths", "means2d", "gradient of means2d", "absgrad"):
+            expected = expected[:, shuffle]
+        scale = max(1.0, float(expected.abs().max()))
+        assert (tensor - expected).abs().max() <= 1e-6 * scale, name
+
+
+def rotation(quaternion: Tensor) -> Tensor:
+    w, x, y, z = quaternion.tolist()
+    return torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=torch.float64,
+    )
+
+
+def moved(scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
+    """The scene and its cameras after one and the same rigid motion."""
+    w, *v = torch.nn.functional.normalize(torch.randn(4, generator=generator, dtype=torch.float64), dim=0)
+    vector = torch.stack(v)
+    turn = rotation(torch.stack([w, *v]))
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = turn
+    motion[:3, 3] = torch.randn(3, generator=generator)
+    real, imaginary = scene.quats[:, :1], scene.quats[:, 1:]
+    quats = torch.cat(
+        [
+            w * real - imaginary @ vector[:, None],
+            w * imaginary + real * vector + torch.linalg.cross(vector.expand_as(imaginary), imaginary),
+        ],
+        dim=1,
+    )
+    return {
+        **scene.leaves(torch.float64),
+        "means": scene.means @ turn.T + motion[:3, 3],
+        "quats": quats,
+        "viewmats": scene.viewmats @ torch.linalg.inv(motion),
+    }
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(["RGB", "D", "RGB+ED"]), st.sampled_from(RASTERIZE_MODES))
+def test_only_the_place_relative_to_the_camera_matters(
+    seed: int, render_mode: str, rasterize_mode: str
+) -> None:
+    # Soft footprints: where the world is moved, float32 rounds centres by up to 1e-5 pixels, and where a
+    # footprint is steep that alone is a difference of 1e-5.
+    scene = random_scene(
+        sh_degree=None, size=0.3, seed=seed, render_mode=render_mode, rasterize_mode=rasterize_mode
+    )
+    scene = clear_cut(with_backdrop(scene))
+    leaves = moved(scene, torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        images, alphas, _ = scene.draw(scene.leaves())
+        moved_images, moved_alphas, _ = scene.draw(leaves)
+    assert (images - moved_images).abs().max() <= 1e-5 * max(1.0, float(images.abs().max()))
+    assert (alphas - moved_alphas).abs().max() <= 1e-5

@@ -1,0 +1,135 @@
+"""The same input gives the same bits, whichever threads and processes draw; and no more threads than told."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
+import pytest
+import torch
+from torch import Tensor
+
+from keyss.rendering.cpu import parallel
+from rendering.child_process import digest, digest_on_threads
+from rendering.scenes import Scene, random_scene
+
+
+@pytest.fixture(autouse=True)
+def _eight_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As many helper threads as torch is told to use, on any machine."""
+    monkeypatch.setattr(parallel, "_CORES", 8)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def differing(first: dict[str, Tensor], second: dict[str, Tensor]) -> list[str]:
+    assert first.keys() == second.keys()
+    return [name for name in first if not torch.equal(first[name], second[name])]
+
+
+def many(**modes: object) -> Scene:
+    """More Gaussians than fit into one piece of work, seen from two sides, on many tiles."""
+    return random_scene(count=7000, width=150, height=130, size=0.05, cameras=2, **modes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        many(),
+        many(sh_degree=None, channels=7),
+        many(render_mode="RGB+ED", rasterize_mode="antialiased"),
+    ],
+    ids=["colour", "features", "antialiased colour and depth"],
+)
+def test_images_and_gradients_are_the_same_for_any_number_of_threads(scene: Scene) -> None:
+    torch.set_num_threads(1)
+    expected = scene.results()
+    for name, tensor in expected.items():
+        assert tensor.isfinite().all(), name
+    assert differing(scene.results(), expected) == []
+    for threads in (2, 3, 7):
+        torch.set_num_threads(threads)
+        for _ in range(2):
+            assert differing(scene.results(), expected) == []
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_python_threads_may_render_at_once(threads: int) -> None:
+    torch.set_num_threads(threads)
+    scenes = [
+        random_scene(count=2000, width=90, height=70, size=0.05, seed=0),
+        random_scene(count=900, width=33, height=120, size=0.05, seed=1, sh_degree=None, channels=5),
+        random_scene(count=2000, width=90, height=70, size=0.05, seed=2, render_mode="ED"),
+        random_scene(count=3000, width=64, height=64, size=0.02, seed=3, cameras=2),
+    ]
+    expected = [scene.results() for scene in scenes]
+    started = threading.Barrier(2)
+
+    def draw_repeatedly(some: list[int]) -> list[list[str]]:
+        started.wait(10)
+        return [differing(scenes[i].results(), expected[i]) for _ in range(3) for i in some]
+
+    with ThreadPoolExecutor(2) as pool:
+        for wrong in pool.map(draw_repeatedly, ([0, 1, 2, 3], [3, 2, 1, 0])):
+            assert wrong == [[]] * 12
+
+
+@pytest.mark.parametrize(("threads", "cores", "expected"), [(1, 8, 1), (2, 8, 2), (7, 8, 7), (7, 2, 2)])
+def test_no_more_threads_than_torch_uses_and_the_machine_has(
+    threads: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parallel, "_CORES", cores)
+    torch.set_num_threads(threads)
+    everyone = threading.Barrier(expected)
+    seen: list[int] = []
+
+    def kernel(counter: object) -> None:
+        seen.append(threading.get_ident())
+        everyone.wait(10)  # breaks, with an error, where fewer come
+
+    parallel.run(kernel)
+    assert len(seen) == len(set(seen)) == expected
+    assert threading.get_ident() in seen
+
+
+def test_an_error_on_a_helper_thread_is_raised() -> None:
+    torch.set_num_threads(2)
+    here, both = threading.get_ident(), threading.Barrier(2)
+
+    def kernel(counter: object) -> None:
+        both.wait(10)
+        if threading.get_ident() != here:
+            raise RuntimeError("the helper failed")
+
+    with pytest.raises(RuntimeError, match="the helper failed"):
+        parallel.run(kernel)
+
+
+def test_spawned_processes_draw_the_same() -> None:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        there = pool.submit(digest_on_threads, 2).result(timeout=60)
+    assert there == digest_on_threads(1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="fork is the default nowhere else")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_forked_processes_draw_the_same() -> None:
+    # The scene is made before the fork: after it torch's own operations hang, even exp of 1000 numbers.
+    scene = random_scene(count=300, width=60, height=70)
+    torch.set_num_threads(2)
+    expected = digest(scene)
+    assert parallel._pools  # helper threads, none of which lives on in the child
+    context = multiprocessing.get_context("fork")
+    queue: multiprocessing.Queue[str] = context.Queue()
+    child = context.Process(target=lambda: queue.put(digest(scene)))
+    child.start()
+    try:
+        assert queue.get(timeout=20) == expected
+    finally:
+        child.join(10)
+        child.kill()
+    assert digest(scene) == expected
