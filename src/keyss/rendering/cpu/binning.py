@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined, kernel
 from keyss.rendering.cpu.layout import (
     ENTRY_ROWS_SHIFT,
     EXTENT_X,
@@ -111,7 +111,7 @@ def share_bounds(order, tile_bounds, starts):
     starts[shares] = total
 
 
-@kernel
+@inlined
 def _measure_columns(footprints, g, tile_columns, height, first_column, spans, place):
     """The rows of pixels that an ellipse alpha >= 1/255 meets, for 8 columns of tiles.
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import finite_kernel
+from keyss.rendering.cpu.jit import finite_inlined, finite_kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -91,14 +91,14 @@ SCALED_ALPHA_MAX = ALPHA_MAX * SCALE
 SCALED_TRANSMITTANCE_MIN = TRANSMITTANCE_MIN * INVERSE
 
 
-@finite_kernel
+@finite_inlined
 def footprint_and_ratio(exponent_0, exponent_1, yy, dy, opacity):
     """The footprint, times 2^64, `dy` rows below the centre, and its ratio to that one row further down."""
     footprint = exp_times_2_64(multiply_add(exponent_1 + yy * dy, dy, exponent_0)) * opacity
     return footprint, exp(exponent_1 + yy * (dy + dy + ONE))
 
 
-@finite_kernel
+@finite_inlined
 def blend_row(planes, k, footprint):
     """Let a row of a footprint dim the transmittance at planes[k:k + 8].
 
@@ -113,7 +113,7 @@ def blend_row(planes, k, footprint):
     return alpha, select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
 
 
-@finite_kernel
+@finite_inlined
 def has_stopped(planes):
     """Whether no pixel of the tile lets anything more through."""
     most = load8(planes, 0)
@@ -122,7 +122,7 @@ def has_stopped(planes):
     return not any_gt(most, SCALED_TRANSMITTANCE_MIN)
 
 
-@finite_kernel
+@finite_inlined
 def list_strips(footprints, entries, start, end, last, left, top, strips, strip_footprints):
     """Cut the Gaussians of entries start..end into strips of up to ANCHOR_ROWS rows; returns their number.
 
@@ -157,7 +157,7 @@ def list_strips(footprints, entries, start, end, last, left, top, strips, strip_
     return count
 
 
-@finite_kernel
+@finite_inlined
 def _blend_tile(footprints, entries, start, end, left, top, planes, strips, strip_footprints):
     """Blend entries start..end of the list into planes = [transmittance | red | green | blue].
 
@@ -254,7 +254,7 @@ def blend(
                         image[top + y, left + x, channel] = drawn + light * background[channel]
 
 
-@finite_kernel
+@finite_inlined
 def _blend_tile_backward(
     footprints, entries, slots, start, end, left, top, planes, strips, strip_footprints, moments, extras,
     extra_width, absgrad,

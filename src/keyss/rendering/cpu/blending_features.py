@@ -22,7 +22,7 @@ from keyss.rendering.cpu.blending import (
     footprint_and_ratio,
     has_stopped,
 )
-from keyss.rendering.cpu.jit import finite_kernel
+from keyss.rendering.cpu.jit import finite_inlined, finite_kernel
 from keyss.rendering.cpu.layout import (
     DECAY,
     ENTRY_GAUSSIAN,
@@ -64,7 +64,7 @@ from keyss.rendering.cpu.simd8 import (
 )
 
 
-@finite_kernel
+@finite_inlined
 def _blend_tile(footprints, features, channels, entries, start, end, left, top, planes, weights):
     """Blend entries start..end of the list into planes = [transmittance | one per channel].
 
@@ -158,7 +158,7 @@ def blend_features(
                     alpha[top + y, left + x] = ONE - rest
 
 
-@finite_kernel
+@finite_inlined
 def _blend_tile_backward(
     footprints,
     features,

@@ -35,8 +35,23 @@ def finite_kernel(function: Any) -> Any:
     return _compiled(function, fastmath=True)
 
 
-def _compiled(function: Any, fastmath: bool | set[str]) -> Any:
-    options = {"fastmath": fastmath, "error_model": "numpy", "nogil": True}
+def inlined(function: Any) -> Any:
+    """For functions that only kernels call: their code becomes part of the kernel's.
+
+    LLVM would leave large ones as functions. Those exist twice, by themselves and optimised along with the
+    kernel; a process that compiles calls the first and one that loads from the cache the second, and the
+    two round differently.
+    """
+    return _compiled(function, fastmath=_NAN_SAFE, forceinline=True)
+
+
+def finite_inlined(function: Any) -> Any:
+    """`inlined`, for functions that only a `finite_kernel` calls."""
+    return _compiled(function, fastmath=True, forceinline=True)
+
+
+def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:
+    options = {"fastmath": fastmath, "forceinline": forceinline, "error_model": "numpy", "nogil": True}
     folder = cache_folder()
     if folder is None:
         return _numba.njit(**options)(function)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined, kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     BLUE,
@@ -70,7 +70,7 @@ COLUMN = f32(1 / TILE_WIDTH)
 ROW = f32(1 / TILE_HEIGHT)
 
 
-@kernel
+@inlined
 def rotation_matrix(w, x, y, z):
     """The 9 entries, row-major, of the rotations by unit quaternions."""
     return (
@@ -86,7 +86,7 @@ def rotation_matrix(w, x, y, z):
     )
 
 
-@kernel
+@inlined
 def slope_limits(camera, width, height):
     """Smallest and largest x/z and y/z at which the perspective is linearised: the image and a margin."""
     image_width = f32(width)
@@ -101,7 +101,7 @@ def slope_limits(camera, width, height):
     )
 
 
-@kernel
+@inlined
 def camera_coordinates(camera, px, py, pz):
     """x, y and depth in the camera's frame of points of the world."""
     return (
@@ -111,7 +111,7 @@ def camera_coordinates(camera, px, py, pz):
     )
 
 
-@kernel
+@inlined
 def jacobian_rows(camera, jxx, jxz, jyy, jyz):
     """The 6 entries of J W."""
     return (
@@ -151,9 +151,10 @@ def project(
     """Fill one row per Gaussian of `footprints` (packed layout), means2d, depths, radii and tile_bounds.
 
     tile_bounds[i] is a number of tiles that the Gaussian meets at most. What cannot be seen, or has a
-    colour of CHANNEL_MAX or more, gets depth 0, radii 0 and no tiles; its footprint means nothing. sh_count is the number
-    of SH coefficients to use, or 0 where colors[:, 0] is the colour itself. Where `features` has columns,
-    it gets the channels to draw: the colour, of any number of channels, and in one column more the depth.
+    colour of CHANNEL_MAX or more, gets depth 0, radii 0 and no tiles; its footprint means nothing. sh_count
+    is the number of SH coefficients to use, or 0 where colors[:, 0] is the colour itself. Where `features`
+    has columns, it gets the channels to draw: the colour, of any number of channels, and in one column more
+    the depth.
 
     With `antialiased` the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that
     widening a footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
@@ -211,7 +212,7 @@ def project(
             _copy_features(sh_count, colors.shape[2], seen, visible, footprints, depths, features)
 
 
-@kernel
+@inlined
 def _project(
     means, quats, scales, opacities, camera, width, height, near, far, eps2d, radius_clip, antialiased,
     footprints, ids, start, results,
@@ -299,7 +300,7 @@ def _project(
     )
 
 
-@kernel
+@inlined
 def _tiles(centre, extent, size, per_pixel):
     """How many tiles, along one axis, hold pixel centres within the extents."""
     first = floor8(maximum(ceil8(centre - extent - HALF), ZERO) * per_pixel)
@@ -307,7 +308,7 @@ def _tiles(centre, extent, size, per_pixel):
     return maximum(last - first + ONE, ZERO)
 
 
-@kernel
+@inlined
 def _hide(i, depths, radii, tile_bounds):
     depths[i] = ZERO
     radii[i, 0] = 0
@@ -315,7 +316,7 @@ def _hide(i, depths, radii, tile_bounds):
     tile_bounds[i] = 0
 
 
-@kernel
+@inlined
 def _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds):
     """Colours that are no SH: into the footprints where they are drawn from there, else into `features`."""
     channels = colors.shape[2]
@@ -332,7 +333,7 @@ def _copy_colors(colors, seen, visible, features, footprints, depths, radii, til
                 _hide(i, depths, radii, tile_bounds)
 
 
-@kernel
+@inlined
 def _copy_features(sh_count, color_channels, seen, visible, footprints, depths, features):
     """Colours computed from SH, and depths, into `features`."""
     for k in range(visible):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined, kernel
 from keyss.rendering.cpu.layout import (
     CHUNK,
     FX,
@@ -166,7 +166,7 @@ def project_backward(
                 camera_gradient[piece, k] = camera_sums[k]
 
 
-@kernel
+@inlined
 def _find_drawn(
     start, end, sh_count, slot_counts, first_camera, need_colors, absgrad, ids, means_gradient,
     quats_gradient, scales_gradient, opacities_gradient, colors_gradient, means2d_gradient, means2d_absgrad,
@@ -199,7 +199,7 @@ def _find_drawn(
     return drawn
 
 
-@kernel
+@inlined
 def _sum_pairs(
     ids, start, size, first_slots, slot_counts, moments, extras, extra_width, channels, with_depth, sh_count,
     first_camera, need_colors, absgrad, colors_gradient, means2d_absgrad, sums,
@@ -248,7 +248,7 @@ def _sum_pairs(
         store8(sums, COLOR + 8, green)
 
 
-@kernel
+@inlined
 def _gaussian_gradients(
     means, quats, scales, opacities, footprints, ids, start, size, camera, width, height, antialiased,
     with_depth, need_camera, first_camera, sums, dx, dy, dz, means_gradient, quats_gradient, scales_gradient,
@@ -419,12 +419,12 @@ def _gaussian_gradients(
         camera_sums[14] -= sum_lanes(valid * dz)
 
 
-@kernel
+@inlined
 def _one_where_equal(a, b):
     return select_ge(a, b, select_ge(b, a, ONE, ZERO), ZERO)
 
 
-@kernel
+@inlined
 def _add3(array, ids, start, first_camera, x, y, z):
     """Add 3 vectors to the columns of an array [N, 3]; for the first camera, overwrite them."""
     if not first_camera:
@@ -435,7 +435,7 @@ def _add3(array, ids, start, first_camera, x, y, z):
     scatter3(array, ids, start, 3, 0, x, y, z)
 
 
-@kernel
+@inlined
 def _add4(array, ids, start, first_camera, w, x, y, z):
     """`_add3` for arrays [N, 4]."""
     if not first_camera:

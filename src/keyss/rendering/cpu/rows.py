@@ -8,7 +8,7 @@ times; what is stored must then be the same for all of them.
 
 from __future__ import annotations
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined
 from keyss.rendering.cpu.simd8 import (
     at,
     load3,
@@ -21,7 +21,7 @@ from keyss.rendering.cpu.simd8 import (
 )
 
 
-@kernel
+@inlined
 def gather3(array, ids, start):
     """The columns of an array [N, 3]."""
     x, y, z, _, _, _, _, _ = transpose(
@@ -37,7 +37,7 @@ def gather3(array, ids, start):
     return x, y, z
 
 
-@kernel
+@inlined
 def gather4(array, ids, start):
     """The columns of an array [N, 4]."""
     w, x, y, z, _, _, _, _ = transpose(
@@ -53,7 +53,7 @@ def gather4(array, ids, start):
     return w, x, y, z
 
 
-@kernel
+@inlined
 def gather_columns(array, ids, start, stride, column):
     """Columns column:column + 8 of rows of `stride` floats."""
     return transpose(
@@ -68,7 +68,7 @@ def gather_columns(array, ids, start, stride, column):
     )
 
 
-@kernel
+@inlined
 def scatter3(array, ids, start, stride, column, x, y, z):
     """Write columns column:column + 3 of rows of `stride` floats."""
     h0, h1, h2, h3, h4, h5, h6, h7 = transpose(x, y, z, x, x, x, x, x)
@@ -82,7 +82,7 @@ def scatter3(array, ids, start, stride, column, x, y, z):
     store3(array, at(ids, start + 7) * stride + column, h7)
 
 
-@kernel
+@inlined
 def scatter4(array, ids, start, w, x, y, z):
     """Write the columns of an array [N, 4]."""
     h0, h1, h2, h3, h4, h5, h6, h7 = transpose(w, x, y, z, x, x, x, x)
@@ -96,7 +96,7 @@ def scatter4(array, ids, start, w, x, y, z):
     store4(array, 4 * at(ids, start + 7), h7)
 
 
-@kernel
+@inlined
 def scatter_columns(array, ids, start, stride, column, v0, v1, v2, v3, v4, v5, v6, v7):
     """Write columns column:column + 8 of rows of `stride` floats."""
     h0, h1, h2, h3, h4, h5, h6, h7 = transpose(v0, v1, v2, v3, v4, v5, v6, v7)

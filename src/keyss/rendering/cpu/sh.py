@@ -8,7 +8,7 @@ convention of 3DGS. The k-th of 8 basis functions is the vector at 8 k.
 
 from __future__ import annotations
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined
 from keyss.rendering.cpu.layout import ONE, TWO, f32
 from keyss.rendering.cpu.simd8 import load8, splat, store8
 
@@ -31,7 +31,7 @@ _10 = f32(10)
 _15 = f32(15)
 
 
-@kernel
+@inlined
 def sh_basis(basis, count, x, y, z):
     """Fill basis[:8 count] (count 1, 4, 9 or 16) for the unit directions (x, y, z)."""
     store8(basis, 0, splat(C0))
@@ -59,7 +59,7 @@ def sh_basis(basis, count, x, y, z):
             store8(basis, 120, (xx - yy * _3) * x * -C3_YXX)
 
 
-@kernel
+@inlined
 def sh_direction_gradient(d, count, x, y, z):
     """dL/d(x, y, z) where d[8 k:] = dL/d(basis k), count 4 or more; x, y, z are treated as independent."""
     gx = load8(d, 24) * -C1

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined
 from keyss.rendering.cpu.layout import HALF, NORM_MIN, ONE, POSITION, ZERO
 from keyss.rendering.cpu.rows import gather3, gather_columns, scatter_columns
 from keyss.rendering.cpu.sh import sh_basis, sh_direction_gradient
@@ -22,7 +22,7 @@ from keyss.rendering.cpu.simd8 import (
 )
 
 
-@kernel
+@inlined
 def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
     """Red, green and blue, not clamped, of the 8 Gaussians ids[start:]."""
     px, py, pz = gather3(means, ids, start)
@@ -40,7 +40,7 @@ def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
     return red, green, blue
 
 
-@kernel
+@inlined
 def shade_backward(
     means, colors, sh_count, camera, ids, start, red, green, blue, first_camera, need_colors, basis,
     coefficients, colors_gradient,
@@ -85,7 +85,7 @@ def shade_backward(
     return dx, dy, dz
 
 
-@kernel
+@inlined
 def view_directions(camera, px, py, pz):
     """Unit vectors from the camera to points of the world, and the inverse of the distances."""
     x = px - camera[POSITION]
@@ -95,13 +95,13 @@ def view_directions(camera, px, py, pz):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@kernel
+@inlined
 def inverse_length(square):
     """1 / sqrt(square), for squares of no length a finite number."""
     return divide(ONE, square_root(maximum(square, NORM_MIN)))
 
 
-@kernel
+@inlined
 def prefetch_coefficients(colors, sh_count, i):
     """Ask for the memory of the SH coefficients of Gaussian i."""
     row = i * colors.shape[1] * 3
@@ -109,7 +109,7 @@ def prefetch_coefficients(colors, sh_count, i):
         prefetch_read(colors, k)
 
 
-@kernel
+@inlined
 def load_coefficients(colors, sh_count, ids, start, coefficients):
     """SH coefficients of the 8 Gaussians ids[start:]: number k of channel c as the vector at 8 (3 k + c)."""
     stride = colors.shape[1] * 3
@@ -132,7 +132,7 @@ def load_coefficients(colors, sh_count, ids, start, coefficients):
         store8(coefficients, 8 * k + 56, v7)
 
 
-@kernel
+@inlined
 def store_coefficients(colors_gradient, sh_count, ids, start, coefficients):
     """`load_coefficients` reversed."""
     stride = colors_gradient.shape[1] * 3

@@ -21,7 +21,7 @@ from numba import extending, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.jit import inlined
 
 intrinsic: Any = (
     extending.intrinsic
@@ -437,7 +437,7 @@ def _exponent_and_fraction(typingctx, x):
     return types.UniTuple(float32x8, 2)(float32x8), codegen
 
 
-@kernel
+@inlined
 def log(x):
     """Natural logarithm of positive normal numbers, within 1e-7 (1 + |log x|)."""
     exponent, fraction = _exponent_and_fraction(x)
