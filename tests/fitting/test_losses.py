@@ -75,6 +75,35 @@ def test_photometric_loss_mixes_l1_and_ssim() -> None:
     assert mixed == pytest.approx(0.8 * l1 + 0.2 * (1 - float(ssim(a, target))), abs=1e-6)
 
 
+@pytest.mark.parametrize("weight", [0.2, 1.0])
+def test_gradient_of_the_photometric_loss_agrees_with_autograd(weight: float) -> None:
+    a, b = _images(37, 29)
+    a[:5] = b[:5]  # |x| has no slope at 0
+    target = Target.of(b)
+    fast, slow = a.clone().requires_grad_(), a.clone().requires_grad_()
+    (3 * photometric_loss(fast, target, weight)).backward()
+    (3 * ((1 - weight) * (slow - b).abs().mean() + weight * (1 - ssim_torch(slow, target)))).backward()
+    assert fast.grad is not None
+    assert slow.grad is not None
+    assert (fast.grad - slow.grad).abs().max() <= 1e-5 * slow.grad.abs().max()
+
+
+def test_one_thread_or_many_give_the_same_bits() -> None:
+    a, b = _images(300, 200)
+    values, gradients = [], []
+    before = torch.get_num_threads()
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        image = a.clone().requires_grad_()
+        loss = photometric_loss(image, Target.of(b), 0.2)
+        loss.backward()
+        values.append(loss.item())
+        gradients.append(image.grad)
+    torch.set_num_threads(before)
+    assert len(set(values)) == 1
+    assert all(torch.equal(gradient, gradients[0]) for gradient in gradients)
+
+
 def test_target_of_bytes_is_target_of_their_fractions() -> None:
     pixels = (torch.rand(9, 8, 3) * 255).to(torch.uint8)
     assert torch.equal(Target.of(pixels).image, pixels.float() / 255)

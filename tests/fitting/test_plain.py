@@ -74,6 +74,16 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
         fit_scene(tiny_scene(3), replace(CONFIG, iterations=5), checkpoint=path, resume=True)
 
 
+def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
+    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
+    fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path)
+    tensors, meta = load_checkpoint(path)
+    tensors["sh0"] = tensors.pop("sh")
+    save_checkpoint(path, tensors, meta)
+    with pytest.raises(InputError, match="this version"):
+        fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path, resume=True)
+
+
 def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, {"a": torch.ones(3)}, {"iteration": 1})

@@ -57,8 +57,10 @@ def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimize
         prefix = f"{name}."
         moments = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         if moments:
+            counts_on_cpu = not optimizer.param_groups[0]["fused"]
             optimizer.state[parameter] = {
-                key: value if key == "step" else value.to(old.device) for key, value in moments.items()
+                key: value if key == "step" and counts_on_cpu else value.to(old.device)
+                for key, value in moments.items()
             }
         parameters[name] = parameter
 

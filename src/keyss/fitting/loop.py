@@ -103,9 +103,12 @@ def train(
                     f"{checkpoint}: belongs to a run with other settings or inputs; "
                     "give the same ones, or start anew with --overwrite"
                 )
-            torch.set_rng_state(tensors.pop("rng"))
-            run.load(tensors, meta)
-            spent = float(meta["seconds"])
+            try:
+                torch.set_rng_state(tensors.pop("rng"))
+                run.load(tensors, meta)
+                spent = float(meta["seconds"])
+            except KeyError as error:
+                raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
         else:
             run.prepare()
         started = saved = time.monotonic()

@@ -50,19 +50,28 @@ class Target:
         return Target(image, planes, mean, square - mean * mean)
 
 
-class _SsimCpu(torch.autograd.Function):
+class _PhotometricCpu(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Target) -> Tensor:
-        planes = image.detach().permute(2, 0, 1).contiguous()
-        arrays = (planes, target.planes, target.mean, target.variance)
-        value, gradient = ssim_cpu.ssim_and_gradient(*(a.numpy() for a in arrays))
+    def forward(ctx: Any, image: Tensor, target: Target, ssim_weight: float) -> Tensor:
+        value, gradient = ssim_cpu.loss_and_gradient(
+            image.detach().contiguous().numpy(),
+            target.planes.numpy(),
+            target.mean.numpy(),
+            target.variance.numpy(),
+            ssim_weight,
+        )
         ctx.save_for_backward(torch.from_numpy(gradient))
         return image.new_tensor(value)
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        return (upstream * gradient).permute(1, 2, 0), None
+        return upstream * gradient, None, None
+
+
+def _photometric_cpu(image: Tensor, target: Target, ssim_weight: float) -> Tensor:
+    value: Tensor = _PhotometricCpu.apply(image, target, ssim_weight)  # type: ignore[no-untyped-call]
+    return value
 
 
 def ssim_torch(image: Tensor, target: Target) -> Tensor:
@@ -79,13 +88,14 @@ def ssim_torch(image: Tensor, target: Target) -> Tensor:
 def ssim(image: Tensor, target: Target) -> Tensor:
     """Mean structural similarity of `image` [H, W, 3] and the target: a differentiable scalar, at most 1."""
     if image.device.type == "cpu":
-        value: Tensor = _SsimCpu.apply(image, target)  # type: ignore[no-untyped-call]
-        return value
+        return 1 - _photometric_cpu(image, target, 1.0)
     return ssim_torch(image, target)
 
 
 def photometric_loss(image: Tensor, target: Target, ssim_weight: float) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM) of `image` [H, W, 3] against the target, w in [0, 1]."""
+    if ssim_weight != 0 and image.device.type == "cpu":
+        return _photometric_cpu(image, target, ssim_weight)
     loss = (image - target.image).abs().mean()
     if ssim_weight == 0:
         return loss

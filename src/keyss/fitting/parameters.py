@@ -1,12 +1,13 @@
 """A 3DGS model as optimisers and gsplat's strategies want it: a dict of parameters with an Adam each.
 
-The spelling `means quats scales opacities sh0 shN` (scales and opacities still raw) is gsplat's and
-stays inside `fit` and `hide`.
+The spelling `means quats scales opacities` (scales and opacities still raw) is gsplat's and stays inside
+`fit` and `hide`. Unlike there, all SH coefficients are one parameter, so that no step copies them.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
@@ -15,12 +16,13 @@ from torch import Tensor
 from keyss.core.alignment import focus_point
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Scene
+from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
 
 Parameters = dict[str, torch.nn.Parameter]
-Optimizers = dict[str, torch.optim.Optimizer]
+Optimizers = dict[str, RowAdam]
 
 
 def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
@@ -30,10 +32,12 @@ def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
         "quats": gaussians.quats,
         "scales": gaussians.log_scales,
         "opacities": gaussians.opacity_logits,
-        "sh0": gaussians.sh[:, :1],
-        "shN": gaussians.sh[:, 1:],
+        "sh": gaussians.sh,
     }
-    return {name: torch.nn.Parameter(t.detach().to(device).clone()) for name, t in tensors.items()}
+    return {
+        name: torch.nn.Parameter(t.detach().to(device).clone(memory_format=torch.contiguous_format))
+        for name, t in tensors.items()
+    }
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:
@@ -43,24 +47,26 @@ def to_gaussians(parameters: Parameters) -> Gaussians:
         parameters["quats"],
         parameters["scales"],
         parameters["opacities"],
-        torch.cat([parameters["sh0"], parameters["shN"]], dim=1),
+        parameters["sh"],
     )
 
 
 def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) -> Optimizers:
     """One Adam per attribute; the position's rate scales with the scene's `extent` (world units)."""
-    rates = {
-        "means": config.means_rate * extent,
-        "quats": config.quats_rate,
-        "scales": config.scales_rate,
-        "opacities": config.opacities_rate,
-        "sh0": config.sh0_rate,
-        "shN": config.shN_rate,
+    sh_rate = max(config.sh0_rate, config.shN_rate) or 1.0
+    sh_scale = parameters["sh"].new_full((parameters["sh"].shape[1], 1), config.shN_rate / sh_rate)
+    sh_scale[0] = config.sh0_rate / sh_rate
+    groups: dict[str, dict[str, Any]] = {
+        "means": {"lr": config.means_rate * extent},
+        "quats": {"lr": config.quats_rate},
+        "scales": {"lr": config.scales_rate},
+        "opacities": {"lr": config.opacities_rate},
+        "sh": {"lr": sh_rate, "lr_scale": sh_scale},
     }
     fused = parameters["means"].device.type == "cuda"
     return {
-        name: torch.optim.Adam([{"params": [parameters[name]], "lr": rate}], eps=1e-15, fused=fused)
-        for name, rate in rates.items()
+        name: RowAdam([{"params": [parameters[name]], **group}], eps=1e-15, fused=fused)
+        for name, group in groups.items()
     }
 
 

@@ -40,4 +40,5 @@ def render_with_meta(
         sh_degree=gaussians.sh_degree if sh_degree is None else sh_degree,
         backgrounds=None if background is None else background.to(device)[None],
     )
-    return images[0], meta | {"alpha": alphas[0, ..., 0]}
+    # Unlike an index, a squeezed axis costs no copy in the backward pass.
+    return images.squeeze(0), meta | {"alpha": alphas.squeeze(0).squeeze(-1)}

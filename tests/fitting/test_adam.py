@@ -1,0 +1,142 @@
+"""Our Adam is torch's, with a learning rate for each SH coefficient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from gsplat.strategy.ops import duplicate, remove, split
+from torch import Tensor
+
+from keyss.core import BackendError
+from keyss.fitting.adam import RowAdam
+from keyss.fitting.config import FitConfig
+from keyss.fitting.parameters import Parameters, make_optimizers, to_parameters
+from keyss.rendering import resolve_device
+from tiny_scenes import random_gaussians
+
+RATE, EPS = 0.01, 1e-15
+SCALE = torch.cat([torch.ones(1, 1), torch.full((15, 1), 0.05)])
+
+
+def _gradients(shape: tuple[int, ...], steps: int) -> Tensor:
+    """Of very different sizes, and some exactly zero, as those of Gaussians that are not seen."""
+    generator = torch.Generator().manual_seed(1)
+    values = torch.randn(steps, *shape, generator=generator)
+    values *= 10 ** torch.randint(-12, 2, (1, *shape), generator=generator).double()
+    return values * (torch.rand(steps, *shape, generator=generator) < 0.7)
+
+
+def _run(make: Any, start: Tensor, gradients: Tensor) -> Tensor:
+    parameter = torch.nn.Parameter(start.clone())
+    optimizer = make(parameter)
+    for gradient in gradients:
+        parameter.grad = gradient.to(parameter.dtype)
+        optimizer.step()
+    return parameter.detach()
+
+
+@pytest.mark.parametrize("shape", [(1,), (1000,), (999, 3), (2049, 4), (700, 16, 3), (3, 20_000)])
+def test_it_is_torchs_adam(shape: tuple[int, ...]) -> None:
+    start, gradients = torch.rand(shape), _gradients(shape, 20)
+    ours = _run(lambda p: RowAdam([p], lr=RATE, eps=EPS), start, gradients)
+    theirs = _run(lambda p: torch.optim.Adam([p], lr=RATE, eps=EPS), start.double(), gradients)
+    assert (ours - theirs).abs().max() < 1e-6
+    assert not torch.equal(ours, start)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_each_number_of_a_row_has_its_rate(dtype: torch.dtype) -> None:
+    """In float64 by torch's operations, as on a GPU."""
+    start, gradients = torch.rand(500, 16, 3, dtype=torch.float64), _gradients((500, 16, 3), 20)
+    ours = _run(
+        lambda p: RowAdam([{"params": [p], "lr_scale": SCALE}], lr=RATE, eps=EPS), start.to(dtype), gradients
+    )
+    for part, rate in ((slice(0, 1), RATE), (slice(1, 16), 0.05 * RATE)):
+        theirs = _run(
+            lambda p, rate=rate: torch.optim.Adam([p], lr=rate, eps=EPS),
+            start[:, part],
+            gradients[:, :, part],
+        )
+        assert (ours[:, part] - theirs).abs().max() < 1e-6
+
+
+def test_one_thread_or_many_give_the_same_bits() -> None:
+    start, gradients = torch.rand(9001, 16, 3), _gradients((9001, 16, 3), 3)
+    results = []
+    before = torch.get_num_threads()
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        results.append(_run(lambda p: RowAdam([p], lr=RATE, eps=EPS), start, gradients))
+    torch.set_num_threads(before)
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])
+
+
+def test_what_never_had_a_gradient_stays() -> None:
+    start, gradients = torch.rand(100, 16, 3), _gradients((100, 16, 3), 5)
+    gradients[:, :, 4:] = 0
+    after = _run(lambda p: RowAdam([p], lr=RATE, eps=EPS), start, gradients)
+    assert torch.equal(after[:, 4:], start[:, 4:])
+
+
+def test_options_that_the_kernel_lacks_are_torchs() -> None:
+    start, gradients = torch.rand(50, 3), _gradients((50, 3), 5)
+    ours = _run(lambda p: RowAdam([p], lr=RATE, weight_decay=0.1, amsgrad=True), start, gradients)
+    theirs = _run(lambda p: torch.optim.Adam([p], lr=RATE, weight_decay=0.1, amsgrad=True), start, gradients)
+    assert torch.equal(ours, theirs)
+
+
+def test_densification_edits_it_as_it_edits_torchs() -> None:
+    config, gaussians = FitConfig(), random_gaussians(120)
+
+    def run(parameters: Parameters, optimizers: Any) -> dict[str, Tensor]:
+        torch.manual_seed(0)
+        for change in (duplicate, remove, split, None):
+            for _ in range(4):
+                count = len(parameters["means"])
+                sh = _gradients((count, 16, 3), 1)[0].float()
+                gradients = {"sh": sh, "sh0": sh[:, :1], "shN": sh[:, 1:]}
+                for name, parameter in parameters.items():
+                    shape = tuple(parameter.shape)
+                    parameter.grad = gradients[name] if name in gradients else _gradients(shape, 1)[0].float()
+                    optimizers[name].step()
+            if change is not None:
+                change(parameters, optimizers, {}, torch.arange(count) % 5 == 0)
+        return {name: parameter.detach() for name, parameter in parameters.items()}
+
+    parameters = to_parameters(gaussians, torch.device("cpu"))
+    ours = run(parameters, make_optimizers(parameters, config, extent=1.0))
+    parameters = to_parameters(gaussians, torch.device("cpu"))
+    sh = parameters.pop("sh").detach()
+    parameters["sh0"], parameters["shN"] = torch.nn.Parameter(sh[:, :1]), torch.nn.Parameter(sh[:, 1:])
+    rates = {name: getattr(config, f"{name}_rate") for name in parameters}
+    theirs = run(
+        parameters,
+        {name: torch.optim.Adam([parameters[name]], lr=rate, eps=EPS) for name, rate in rates.items()},
+    )
+    theirs["sh"] = torch.cat([theirs.pop("sh0"), theirs.pop("shN")], dim=1)
+    assert len(ours["means"]) == 138
+    for name, value in ours.items():
+        assert torch.allclose(value, theirs[name], rtol=1e-6, atol=3e-6), name
+
+
+@pytest.mark.cuda
+def test_on_a_gpu_it_is_the_same() -> None:
+    try:
+        device = resolve_device("cuda")
+    except BackendError as error:
+        pytest.skip(str(error))
+    start, gradients = torch.rand(500, 16, 3), _gradients((500, 16, 3), 20)
+    here, there = (
+        _run(
+            lambda p, d=d: RowAdam(
+                [{"params": [p], "lr_scale": SCALE.to(d)}], lr=RATE, eps=EPS, fused=d.type == "cuda"
+            ),
+            start.to(d),
+            gradients.to(d),
+        )
+        for d in (torch.device("cpu"), device)
+    )
+    assert (here - there.cpu()).abs().max() < 1e-6
