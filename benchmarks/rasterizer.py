@@ -22,6 +22,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
 from keyss.core import Camera, Gaussians
 from keyss.files import read_ply
 from keyss.files.atomic import write_bytes
@@ -150,6 +151,7 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     assert graph is not None
     (drawing,) = graph.next_functions[0][0].drawings  # type: ignore[union-attr]
     pairs = blended_pairs(drawing, camera.width, camera.height)
+    floor = 1e3 * OPERATIONS_PER_PAIR * pairs / 8 / peak_operations() / threads
     return [
         f"{case.name}, {case.width}x{case.height}",
         str(threads),
@@ -159,6 +161,7 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
         f"{pairs / 1e6:.1f}",
         f"{pairs / only.best / 1e6:.2f}",
         f"{pairs / (forward.best + backward.best) / 1e6:.2f}",
+        f"{floor:.1f} ({floor / only.best:.0%})",
         f"{peak / 2**20:.0f}",
     ]
 
@@ -308,7 +311,7 @@ def main() -> None:
         "median.",
         table(
             ["scene, SH 3", "threads", "forward only", "forward", "backward", "M pairs blended",
-             "G pairs/s forward only", "G pairs/s both", "peak MiB"],
+             "G pairs/s forward only", "G pairs/s both", "arithmetic floor of forward only", "peak MiB"],
             [alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
         ),
         table(

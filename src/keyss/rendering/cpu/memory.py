@@ -14,7 +14,7 @@ import torch
 
 Array = np.ndarray[Any, Any]
 
-MAX_FREE = 24  # buffers kept while nobody uses them: what one call needs, and some
+MAX_FREE = 40  # buffers kept while nobody uses them: what one call needs, and some
 WORTH_KEEPING = 2**15  # bytes; smaller ones come from numpy
 
 # Free buffers by identity, the longest unused first. A loan may end in the garbage collector at any
