@@ -126,10 +126,12 @@ def extract(stego: Gaussians, key: str) -> bytes:
 
 def extract_derived(stego: Gaussians, key: DerivedKey, names: Sequence[bytes] | None = None) -> bytes:
     """`extract` after key derivation; `names`: the identities, if they are known already."""
+    chunk = chunk_bytes(stego.sh_degree)
+    if chunk == 0:
+        raise WrongKeyError("this key opens nothing here")
     names = identities(stego) if names is None else names
     table, width = read_low_bits(stego).tobytes(), bytes_per_gaussian(stego.sh_degree)
     cells = [table[start : start + width] for start in range(0, len(table), width)]
-    chunk = chunk_bytes(stego.sh_degree)
     found = dict(_header_cipher(key).open_all(names, cells))
     if not found:
         raise WrongKeyError("this key opens nothing here")

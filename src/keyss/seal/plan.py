@@ -54,8 +54,8 @@ def shares(secrets: int) -> int:
 
 
 def chunk_bytes(sh_degree: int) -> int:
-    """Bytes of payload in one cell: 70 at degree 3."""
-    return bytes_per_gaussian(sh_degree) - OVERHEAD
+    """Bytes of payload in one cell: 0, 12, 35 and 66 at degrees 0 to 3."""
+    return max(0, bytes_per_gaussian(sh_degree) - OVERHEAD)
 
 
 def header_parts(sh_degree: int) -> int:
@@ -70,12 +70,14 @@ def header_cells(sh_degree: int) -> int:
 
 def plan(cells: int, secrets: int, sh_degree: int, size: int) -> Plan | None:
     """The most redundant way to spread `size` bytes for each of `secrets`; None if it would not be safe."""
+    chunk = chunk_bytes(sh_degree)
+    if chunk < 1:
+        return None
     left = cells // shares(secrets) - header_cells(sh_degree)
     if left < 1:
         return None
     blocks = min(-(-left // MAX_CHUNKS), MAX_BLOCKS)
     n = min(left // blocks, MAX_CHUNKS)
-    chunk = chunk_bytes(sh_degree)
     k = max(1, -(-size // (chunk * blocks)))
     return Plan(blocks, n, k, chunk) if k <= _most_data(n, blocks) else None
 
@@ -89,7 +91,9 @@ def capacity(cells: int, secrets: int = 1, sh_degree: int = 3) -> int:
 
 
 def cells_for(size: int, secrets: int, sh_degree: int) -> int:
-    """The least number of cells from which on `size` bytes for each of `secrets` fit."""
+    """The least number of cells in which `size` bytes for each of `secrets` fit. `sh_degree`: 1 to 3."""
+    if chunk_bytes(sh_degree) == 0:
+        raise ValueError(f"no number of cells will do for SH degree {sh_degree}")
     low, high = 0, 1 << 10
     while capacity(high, secrets, sh_degree) < size:
         low, high = high, 2 * high
@@ -108,6 +112,11 @@ def check_room(compressed: int, gaussians: int, secrets: int, sh_degree: int) ->
 
 def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree: int) -> str:
     """What to tell the owner of a model of which a share `usable` can be used."""
+    if chunk_bytes(sh_degree) == 0:
+        return (
+            "a model without spherical harmonics has no room for anything in its low bits; "
+            "--sidecar writes a file beside it"
+        )
     need = cells_for(size, secrets, sh_degree) / max(usable, 0.01)
     digits = max(0, len(str(int(need))) - 2)
     rounded = math.ceil(need / 10**digits) * 10**digits
