@@ -94,8 +94,8 @@ def is_random(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
 
     Not so with zeros, integers and short fractions, subnormal numbers, values that are there too often (after
     a few steps of training many are the same small multiple of the learning rate), and Gaussians that are
-    there twice. Such a test must exclude hardly anything that is random: what is excluded stays, the same comes
-    up among the new low bits, and twice as much of it as by chance would be a tell.
+    there twice. Such a test must exclude hardly anything that is random: what is excluded stays, the same
+    comes up among the new low bits, and twice as much of it as by chance would be a tell.
     """
     used = _used(gaussians)
     exponents = used >> 23 & 255
@@ -153,11 +153,11 @@ def _mask(gaussians: Gaussians) -> Words:
 
 
 def _unlikely_copies(count: int) -> int:
-    """The least c so that sets of c equal ones are rare among `count` trained values: 3 up to a million.
+    """The least c from 3 on so that sets of c equal ones are rare among `count` values: 3 up to a million.
 
     For 2^26 equally likely values there would be count^c / c! / 2^(26 (c - 1)) such sets, here at most 30.
     """
-    copies = 2
+    copies = 3
     while copies * math.log(max(count, 1)) - math.lgamma(copies + 1) > math.log(
         30 * 2.0 ** (26 * (copies - 1))
     ):
