@@ -28,10 +28,24 @@ def test_argon2id_rfc_9106_section_5_3() -> None:
     context = argon2_ffi.new(
         "argon2_context *",
         {
-            "version": 0x13, "out": out, "outlen": 32, "pwd": password, "pwdlen": 32,
-            "salt": salt, "saltlen": 16, "secret": secret, "secretlen": 8, "ad": associated, "adlen": 12,
-            "t_cost": 3, "m_cost": 32, "lanes": 4, "threads": 4,
-            "allocate_cbk": null, "free_cbk": null, "flags": argon2_lib.ARGON2_DEFAULT_FLAGS,
+            "version": 0x13,
+            "out": out,
+            "outlen": 32,
+            "pwd": password,
+            "pwdlen": 32,
+            "salt": salt,
+            "saltlen": 16,
+            "secret": secret,
+            "secretlen": 8,
+            "ad": associated,
+            "adlen": 12,
+            "t_cost": 3,
+            "m_cost": 32,
+            "lanes": 4,
+            "threads": 4,
+            "allocate_cbk": null,
+            "free_cbk": null,
+            "flags": argon2_lib.ARGON2_DEFAULT_FLAGS,
         },
     )
     assert argon2_core(context, Type.ID.value) == argon2_lib.ARGON2_OK
