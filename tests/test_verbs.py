@@ -16,7 +16,7 @@ import torch
 import keyss
 from keyss import FitConfig, HideConfig, Secret
 from keyss.core import InputError, OutputError, Scene, WrongKeyError
-from tiny_scenes import HEIGHT, WIDTH, tiny_scene
+from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = HideConfig(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
@@ -149,6 +149,26 @@ def test_a_sidecar_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> 
         keyss.reveal(run / "private" / "secret-1.ply", "the key", decoder=sidecar)
     with pytest.raises(WrongKeyError):
         keyss.reveal(stego, "the key")
+
+
+def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """Without a sidecar the published model carries what the key opens, and looks like any other."""
+    fit = replace(CONFIG.fit, iterations=20, max_gaussians=1500, grow_every=10)
+    config = replace(CONFIG, fit=fit, distil_steps=20, hidden=8, branch=4, frequencies=1)
+    models = [random_gaussians(1500, seed=seed) for seed in (0, 1)]
+    secret = Secret(folders[1], "the key", model=models[1])
+    out = tmp_path / "run"
+    result = keyss.hide(folders[0], [secret], config=config, cover_model=models[0], out=out)
+    assert result.sidecar is None
+    assert not list(out.glob("decoder*"))
+    (tmp_path / "moved.ply").write_bytes((out / "stego.ply").read_bytes())
+    revealed = keyss.reveal(tmp_path / "moved.ply", "the key")
+    assert torch.equal(revealed.means, keyss.reveal(result.stego, "the key").means)
+    assert keyss.evaluate(out, ["the key"]) == json.loads((out / "metrics.json").read_text())
+    with pytest.raises(WrongKeyError):
+        keyss.reveal(tmp_path / "moved.ply", "The key")
+    decoy = keyss.reveal(tmp_path / "moved.ply", "The key", decoy=True)
+    assert torch.equal(decoy.means, result.stego.means)
 
 
 def test_outputs_that_exist_are_refused_before_any_work(
