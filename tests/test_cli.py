@@ -61,9 +61,18 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("world")
     write_blender(folder / "a", count=3, channels=3)
     write_nerfstudio(folder / "b", count=4)
-    (folder / "key.txt").write_text("0123456789abcdef\n")
+    (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
+    (folder / "key.txt").chmod(0o600)
     (folder / "wrong.txt").write_text("fedcba9876543210\n")
-    arguments = ["--cover", folder / "a", "--secret", folder / "b", "--key-file", folder / "key.txt"]
+    arguments = [
+        "--sidecar",
+        "--cover",
+        folder / "a",
+        "--secret",
+        folder / "b",
+        "--key-file",
+        folder / "key.txt",
+    ]
     status = main(["hide", *map(str, arguments), "-o", str(folder / "hidden"), *SMALL])
     assert status == 0
     return folder
@@ -135,6 +144,11 @@ class TestKeygen:
         assert len(keyss("keygen", "--length", 40).out) == 41
         assert_refused(keyss("keygen", "--length", 0), 2, "1 to 1024")
 
+    def test_bits(self, keyss: Callable[..., Said]) -> None:
+        assert len(keyss("keygen", "--bits", 128).out) == 22 + 1
+        assert_refused(keyss("keygen", "--bits", 128, "--length", 9), 2, "not both")
+        assert_refused(keyss("keygen", "--bits", 0), 2, "--bits")
+
     def test_takes_no_seed(self, keyss: Callable[..., Said]) -> None:
         assert_refused(keyss("keygen", "--seed", 1), 2, "no secret")
 
@@ -142,7 +156,7 @@ class TestKeygen:
 class TestTheWholePath:
     def test_hide_left_its_results(self, world: Path) -> None:
         names = {path.name for path in (world / "hidden").iterdir()}
-        assert names == {"stego.ply", "decoder.safetensors", "metrics.json", "config.json", "private"}
+        assert names == {"stego.ply", "decoder.sealed", "metrics.json", "config.json", "private"}
 
     def test_reveal_render_evaluate_info(
         self, keyss: Callable[..., Said], world: Path, tmp_path: Path
@@ -248,6 +262,7 @@ class TestArguments:
             "width": 10,
             "background": (1.0, 0.5, 0.0),
             "cover_model": Path("m.ply"),
+            "sidecar": False,
             "device": "cpu",
             "out": Path("out"),
             "overwrite": False,
@@ -313,7 +328,7 @@ def _ply_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]
 
 def _decoder_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
     def prepare(folder: Path) -> list[object]:
-        decoder = folder / "hidden" / "decoder.safetensors"
+        decoder = folder / "hidden" / "decoder.sealed"
         decoder.write_bytes(change(decoder.read_bytes()))
         stego = folder / "hidden" / "stego.ply"
         return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
@@ -326,9 +341,7 @@ def _keep(path: Path, size: int) -> None:
 
 
 def _later_version(data: bytes) -> bytes:
-    old, new = b'\\"version\\": 1', b'\\"version\\": 7'
-    assert data.count(old) == 1
-    return data.replace(old, new)
+    return data[:8] + b"\x07" + data[9:]
 
 
 def _with_nan(data: bytes) -> bytes:
@@ -351,7 +364,7 @@ def _hide(folder: Path, **changes: object) -> list[object]:
     options |= {"--out": folder / "out"} | {
         f"--{name.replace('_', '-')}": value for name, value in changes.items()
     }
-    return ["hide", *(part for option in options.items() for part in option), *SMALL]
+    return ["hide", "--sidecar", *(part for option in options.items() for part in option), *SMALL]
 
 
 def _empty_key(folder: Path) -> list[object]:
@@ -385,12 +398,12 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "absurd count": (4, "stego.ply", _ply_with(_with_count("99999999999999"))),
     "NaN": (4, "NaN", _ply_with(_with_nan)),
     "another version": (4, "version", _decoder_with(_later_version)),
-    "decoder truncated": (4, "decoder.safetensors", _decoder_with(lambda data: data[:-9])),
-    "decoder empty": (4, "decoder.safetensors", _decoder_with(lambda data: b"")),
+    "decoder truncated": (4, "decoder.sealed", _decoder_with(lambda data: data[:-9])),
+    "decoder empty": (4, "decoder.sealed", _decoder_with(lambda data: b"")),
     "another model": (4, "another model", _other_model),
-    "no decoder": (
-        4,
-        "decoder",
+    "no sidecar and nothing in the model": (
+        3,
+        "opens nothing",
         lambda f: ["reveal", f / "hidden/private/cover.ply", "--key-file", f / "key.txt", "-o", f / "s.ply"],
     ),
     "file exists": (

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from keyss.cli.keys import key_of_file, keys
+from keyss.cli.keys import key_of_file, keys, warn_of_weak_keys
 from keyss.core import InputError, UsageError
+from keyss.seal import generate_key
 
 
 @pytest.fixture(autouse=True)
@@ -120,3 +121,27 @@ class TestPrompt:
         monkeypatch.setattr(getpass, "getpass", ctrl_d)
         with pytest.raises(UsageError, match="no key was typed"):
             keys([], 1)
+
+
+def test_a_key_file_that_others_can_read_gets_a_warning_without_the_key(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, b"tell nobody")
+    path.chmod(0o600)
+    key_of_file(path)
+    assert capsys.readouterr().err == ""
+    path.chmod(0o640)
+    key_of_file(path)
+    said = capsys.readouterr().err
+    assert "others can read" in said
+    assert "tell nobody" not in said
+
+
+def test_weak_keys_get_a_warning_without_the_key(capsys: pytest.CaptureFixture[str]) -> None:
+    warn_of_weak_keys([generate_key(20)])
+    assert capsys.readouterr().err == ""
+    warn_of_weak_keys([generate_key(20), "hunter2"])
+    said = capsys.readouterr().err
+    assert "key 2: " in said
+    assert "bits" in said
+    assert "hunter2" not in said

@@ -19,6 +19,8 @@ def test_the_python_example_runs(
     assert len(example.splitlines()) <= 20
     short = example.replace("max_gaussians=20_000", "max_gaussians=100, iterations=10")
     assert short != example
+    short = short.replace("width=200,\n    out", "width=200,\n    sidecar=True,\n    out")  # has no room
+    assert "sidecar" in short
     write_blender(tmp_path / "scenes" / "bonsai", count=2)
     write_nerfstudio(tmp_path / "scenes" / "fox")
     monkeypatch.chdir(tmp_path)

@@ -15,8 +15,8 @@ import torch
 
 import keyss
 from keyss import FitConfig, HideConfig, Secret
-from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
-from tiny_scenes import HEIGHT, WIDTH, tiny_scene
+from keyss.core import InputError, OutputError, Scene, WrongKeyError
+from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = HideConfig(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
@@ -51,7 +51,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "hidden"
-    keyss.hide(folders[0], [Secret(folders[1], "the key")], config=CONFIG, out=out)
+    keyss.hide(folders[0], [Secret(folders[1], "the key")], config=CONFIG, sidecar=True, out=out)
     return out
 
 
@@ -59,7 +59,7 @@ def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
         "stego.ply",
-        "decoder.safetensors",
+        "decoder.sealed",
         "config.json",
         "metrics.json",
         "private/cover.ply",
@@ -113,8 +113,10 @@ def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path]
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    keyss.hide(folders[0], [Secret(folders[1], "the key")], config=CONFIG, out=tmp_path / "again")
-    for name in ("stego.ply", "decoder.safetensors", "private/secret-1.ply"):
+    keyss.hide(
+        folders[0], [Secret(folders[1], "the key")], config=CONFIG, sidecar=True, out=tmp_path / "again"
+    )
+    for name in ("stego.ply", "decoder.sealed", "private/secret-1.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
 
 
@@ -123,7 +125,7 @@ def test_existing_models_are_bounds_and_are_not_fitted_again(
 ) -> None:
     given = run / "private" / "cover.ply"
     secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
-    keyss.hide(folders[0], [secret], config=CONFIG, cover_model=given, out=tmp_path / "again")
+    keyss.hide(folders[0], [secret], config=CONFIG, sidecar=True, cover_model=given, out=tmp_path / "again")
     assert (tmp_path / "again" / "stego.ply").read_bytes() == (run / "stego.ply").read_bytes()
 
 
@@ -135,15 +137,38 @@ def test_wrong_key_writes_nothing_and_decoy_writes_the_cover(run: Path, tmp_path
     assert len(decoy) == len(keyss.read_ply(tmp_path / "x.ply"))
 
 
-def test_a_decoder_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> None:
+def test_a_sidecar_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> None:
     (tmp_path / "stego.ply").write_bytes((run / "stego.ply").read_bytes())
-    with pytest.raises(InputError, match="--decoder"):
+    with pytest.raises(WrongKeyError):
         keyss.reveal(tmp_path / "stego.ply", "the key")
-    keyss.reveal(tmp_path / "stego.ply", "the key", decoder=run / "decoder.safetensors")
+    sidecar = run / "decoder.sealed"
+    whole = keyss.reveal(tmp_path / "stego.ply", "the key", decoder=sidecar)
+    stego = keyss.read_ply(run / "stego.ply")
+    assert torch.equal(keyss.reveal(stego, "the key", decoder=sidecar.read_bytes()).means, whole.means)
     with pytest.raises(InputError, match="another model"):
-        keyss.reveal(run / "private" / "secret-1.ply", "the key", decoder=run / "decoder.safetensors")
-    with pytest.raises(UsageError, match="decoder"):
-        keyss.reveal(keyss.read_ply(run / "stego.ply"), "the key")
+        keyss.reveal(run / "private" / "secret-1.ply", "the key", decoder=sidecar)
+    with pytest.raises(WrongKeyError):
+        keyss.reveal(stego, "the key")
+
+
+def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """Without a sidecar the published model carries what the key opens, and looks like any other."""
+    fit = replace(CONFIG.fit, iterations=20, max_gaussians=1500, grow_every=10)
+    config = replace(CONFIG, fit=fit, distil_steps=20, hidden=8, branch=4, frequencies=1)
+    models = [random_gaussians(1500, seed=seed) for seed in (0, 1)]
+    secret = Secret(folders[1], "the key", model=models[1])
+    out = tmp_path / "run"
+    result = keyss.hide(folders[0], [secret], config=config, cover_model=models[0], out=out)
+    assert result.sidecar is None
+    assert not list(out.glob("decoder*"))
+    (tmp_path / "moved.ply").write_bytes((out / "stego.ply").read_bytes())
+    revealed = keyss.reveal(tmp_path / "moved.ply", "the key")
+    assert torch.equal(revealed.means, keyss.reveal(result.stego, "the key").means)
+    assert keyss.evaluate(out, ["the key"]) == json.loads((out / "metrics.json").read_text())
+    with pytest.raises(WrongKeyError):
+        keyss.reveal(tmp_path / "moved.ply", "The key")
+    decoy = keyss.reveal(tmp_path / "moved.ply", "The key", decoy=True)
+    assert torch.equal(decoy.means, result.stego.means)
 
 
 def test_outputs_that_exist_are_refused_before_any_work(
@@ -194,7 +219,9 @@ def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, P
 
 def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tuple[Path, Path]) -> None:
     assert keyss.info(run / "stego.ply")["sh_degree"] == 3
-    assert keyss.info(run / "decoder.safetensors")["mask"] == "op,ro,sc,xyz"
+    sealed = keyss.info(run / "decoder.sealed")
+    assert sealed.keys() == {"kind", "path", "bytes", "key_derivation"}  # not how many secrets there are
+    assert keyss.info(run / "stego.ply").keys() == keyss.info(run / "private" / "cover.ply").keys()
     assert keyss.info(folders[0])["test_views"] == 2
     assert keyss.info(run)["metrics"]["gaussians"] == len(keyss.read_ply(run / "stego.ply"))
     with pytest.raises(InputError, match="no such"):

@@ -35,7 +35,7 @@ CONFIG = HideConfig(
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
 _RESULTS = (
-    *(verbs.STEGO, verbs.DECODER, verbs.CONFIG, verbs.METRICS, verbs.PRIVATE),
+    *(verbs.STEGO, verbs.SIDECAR, verbs.CONFIG, verbs.METRICS, verbs.PRIVATE),
     *(SECRET_PLY, COMPARISON, KEY, SCENES),
 )
 
@@ -55,6 +55,7 @@ def run_demo(
     device: Backend = "auto",
     overwrite: bool = False,
     config: HideConfig = CONFIG,
+    sidecar: bool = False,
     views: int = VIEWS,
     width: int = WIDTH,
     height: int = HEIGHT,
@@ -80,6 +81,7 @@ def run_demo(
             out / SCENES / COVER,
             [verbs.Secret(out / SCENES / SECRET, key)],
             config=config.with_fit(seed=seed),
+            sidecar=sidecar,
             device=device,
             out=out,
             overwrite=True,

@@ -5,6 +5,7 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from keyss._version import __version__
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.files.atomic import write_bytes
@@ -28,20 +29,21 @@ from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.hiding.config import HideConfig
-from keyss.hiding.decoder_file import SavedDecoder, load_decoder, save_decoder
+from keyss.hiding.payload import HiddenSecret, pack_secret
 from keyss.hiding.pipeline import hide_scenes
-from keyss.hiding.revealing import Frame, reveal_gaussians
+from keyss.hiding.revealing import Frame, open_secret, read_sidecar, reveal_gaussians
 from keyss.measure.hiding import measure_hiding
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering import render as render_image
+from keyss.seal.sidecar import read_header
 
 Split = Literal["test", "train", "all"]
 Background = Tensor | Sequence[float] | None
 PathLike = str | Path
 
-STEGO, DECODER, CONFIG, METRICS, MODEL = (
+STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
     "stego.ply",
-    "decoder.safetensors",
+    "decoder.sealed",
     "config.json",
     "metrics.json",
     "model.ply",
@@ -65,8 +67,8 @@ class Secret:
 class HideResult:
     """A hiding and how well it works."""
 
-    stego: Gaussians  # to be published
-    decoder: SavedDecoder  # for those who hold a key
+    stego: Gaussians  # to be published; with a key, all that revealing needs unless there is a sidecar
+    sidecar: bytes | None  # the sealed secrets, where they are not in the low bits of `stego`
     metrics: dict[str, Any]
 
 
@@ -131,6 +133,7 @@ def hide(
     width: int | None = None,
     background: Background = None,
     cover_model: PathLike | Gaussians | None = None,
+    sidecar: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -139,9 +142,10 @@ def hide(
 ) -> HideResult:
     """Hide every secret in the cover, and measure the result on the test photos.
 
-    Plain models of all scenes come first unless they are given. `out` (a folder) gets `stego.ply`,
-    `decoder.safetensors`, `config.json`, `metrics.json` and `private/` with the plain models; while it
-    runs, checkpoints from which `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+    Plain models of all scenes come first unless they are given. What a key opens lies sealed in the low bits
+    of `stego.ply`, or with `sidecar` in a file `decoder.sealed`. `out` (a folder) gets these, `config.json`,
+    `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which `resume` goes
+    on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or HideConfig()
     if not secrets:
@@ -158,6 +162,7 @@ def hide(
         keys,
         config,
         plains=plains,
+        sidecar=sidecar,
         device=target,
         checkpoints=folder.checkpoints() if folder else None,
         resume=resume,
@@ -165,9 +170,8 @@ def hide(
     )
     metrics = measure_hiding(
         hidden.stego.to(target),
-        hidden.decoder,
+        hidden.secrets,
         scenes,
-        keys,
         [plain.to(target) for plain in hidden.plains],
         seed=config.fit.seed,
     )
@@ -185,26 +189,28 @@ def hide(
             "models_given": [model is not None for model in given],
             "width": width,
             "background": None if background is None else [float(x) for x in background],
+            "payloads": [_fingerprint(secret) for secret in hidden.secrets],
             "config": asdict(config),
             "version": __version__,
         }
         writers: dict[str, Callable[[Path], None]] = {
             STEGO: lambda path: write_ply(path, hidden.stego),
-            DECODER: lambda path: save_decoder(path, hidden.decoder),
             CONFIG: _json_writer(settings),
             METRICS: _json_writer(metrics),
         }
+        if hidden.sidecar is not None:
+            writers[SIDECAR] = _bytes_writer(hidden.sidecar)
         for name, plain in zip(_plain_names(len(secrets)), hidden.plains, strict=True):
             writers[name] = _ply_writer(plain)
         folder.fill(writers)
-    return HideResult(hidden.stego, hidden.decoder, metrics)
+    return HideResult(hidden.stego, hidden.sidecar, metrics)
 
 
 def reveal(
     stego: PathLike | Gaussians,
     key: str,
     *,
-    decoder: PathLike | SavedDecoder | None = None,
+    decoder: PathLike | bytes | None = None,
     frame: Frame = "secret",
     decoy: bool = False,
     force: bool = False,
@@ -214,21 +220,24 @@ def reveal(
 ) -> Gaussians:
     """The secret that `key` opens in a stego model, as an ordinary model; see `reveal_gaussians`.
 
-    The decoder of a file is looked for beside it. `out` (a file) gets the revealed PLY. Raises
-    WrongKeyError for a key that opens nothing (with `decoy` the cover comes instead), InputError for
-    files that are not what they should be or do not belong together.
+    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
+    lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
+    opens nothing (with `decoy` the cover comes instead), InputError for files that are not what they should
+    be or do not belong together.
     """
     target = resolve_device(device)
     path = None if out is None else check_output_file(out, overwrite)
     model = _model(stego)
-    if decoder is None:
-        if isinstance(stego, Gaussians):
-            raise UsageError("revealing from Gaussians in memory needs the decoder")
-        decoder = Path(stego).with_name(DECODER)
-        if not decoder.exists():
-            raise InputError(f"{decoder}: no decoder beside the model; name it with --decoder FILE")
-    saved = decoder if isinstance(decoder, SavedDecoder) else load_decoder(decoder)
-    revealed = reveal_gaussians(model.to(target), saved, key, frame=frame, decoy=decoy, force=force).to("cpu")
+    if decoder is None and not isinstance(stego, Gaussians):
+        decoder = _sidecar_beside(Path(stego))
+    try:
+        secret = _open(model, key, decoder)
+    except WrongKeyError:
+        if not decoy:
+            raise
+        revealed = model
+    else:
+        revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
     if path is not None:
         write_ply(path, revealed)
     return revealed
@@ -276,7 +285,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
 
-    `keys`: those of all its secrets, in any order.
+    `keys`: those of all its secrets, in any order. Raises WrongKeyError for a key that opens nothing,
+    UsageError for a secret without a key.
     """
     target = resolve_device(device)
     folder = Path(run)
@@ -285,21 +295,23 @@ def evaluate(
     try:
         sources = [settings["cover"], *settings["secrets"]]
         width, background = settings["width"], settings["background"]
+        fingerprints = list(settings["payloads"])
     except (KeyError, TypeError) as error:
         raise InputError(
             f"{folder / CONFIG}: not the configuration of a hiding ({error} is missing)"
         ) from error
     if not all(isinstance(source, str) for source in sources):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    stego, saved = read_ply(folder / STEGO), load_decoder(folder / DECODER)
-    saved.check_belongs_to(stego)
+    stego, beside = read_ply(folder / STEGO), _sidecar_beside(folder / STEGO)
+    opened = {_fingerprint(secret): secret for secret in (_open(stego, key, beside) for key in keys)}
+    if set(opened) != set(fingerprints):
+        raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(opened)} of them")
     scenes = [load_scene(source, width=width, background=background) for source in sources]
     bounds = [read_ply(folder / name) for name in _plain_names(len(scenes) - 1)]
     metrics = measure_hiding(
         stego.to(target),
-        saved,
+        [opened[fingerprint] for fingerprint in fingerprints],
         scenes,
-        keys,
         [bound.to(target) for bound in bounds],
         wrong_keys=wrong_keys,
         seed=seed,
@@ -310,7 +322,7 @@ def evaluate(
 
 
 def info(path: PathLike) -> dict[str, Any]:
-    """What is in a PLY, a decoder, a scene folder or a folder of results, as JSON-able facts."""
+    """What is in a PLY, a sealed decoder, a scene folder or a folder of results, as JSON-able facts."""
     path = Path(path)
     if path.is_dir():
         if (path / STEGO).exists():
@@ -331,19 +343,19 @@ def info(path: PathLike) -> dict[str, Any]:
             "bounding_box": [[round(x, 4) for x in corner] for corner in (facts.lower, facts.upper)],
             "opacity_below_0.05": round(facts.faint_share, 4),
         }
-    saved = load_decoder(path)
+    try:
+        derivation, _, _ = read_header(read_sidecar(path))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     return {
-        "kind": "decoder",
+        "kind": "sealed decoder",
         "path": str(path),
         "bytes": path.stat().st_size,
-        "secrets": len(saved.secrets),
-        "mask": ",".join(saved.decoder.shape.mask),
-        "parameters": sum(parameter.numel() for parameter in saved.decoder.parameters()),
         "key_derivation": {
             "function": "Argon2id",
-            "memory_kib": saved.derivation.memory_kib,
-            "time_cost": saved.derivation.time_cost,
-            "parallelism": saved.derivation.parallelism,
+            "memory_kib": derivation.memory_kib,
+            "time_cost": derivation.time_cost,
+            "parallelism": derivation.parallelism,
         },
     }
 
@@ -379,6 +391,26 @@ def _width(scene: Scene) -> int:
     return scene.train[0].camera.width
 
 
+def _open(stego: Gaussians, key: str, sidecar: PathLike | bytes | None) -> HiddenSecret:
+    """See `open_secret`. Errors name the sidecar's file."""
+    if sidecar is None or isinstance(sidecar, bytes):
+        return open_secret(stego, key, sidecar)
+    try:
+        return open_secret(stego, key, read_sidecar(Path(sidecar)))
+    except InputError as error:
+        raise InputError(f"{sidecar}: {error}") from error
+
+
+def _sidecar_beside(stego: Path) -> Path | None:
+    path = stego.with_name(SIDECAR)
+    return path if path.exists() else None
+
+
+def _fingerprint(secret: HiddenSecret) -> str:
+    """By which `evaluate` knows whose key it was given; says nothing without the secret."""
+    return hashlib.sha256(pack_secret(secret)).hexdigest()[:16]
+
+
 def _plain_names(secrets: int) -> list[str]:
     return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
 
@@ -390,6 +422,10 @@ def _picture_name(camera: Camera) -> str:
 
 def _ply_writer(gaussians: Gaussians) -> Callable[[Path], None]:
     return lambda path: write_ply(path, gaussians)
+
+
+def _bytes_writer(data: bytes) -> Callable[[Path], None]:
+    return lambda path: write_bytes(path, data)
 
 
 def _png_writer(image: Tensor) -> Callable[[Path], None]:

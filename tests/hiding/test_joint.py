@@ -18,9 +18,10 @@ from keyss.fitting.loop import Interrupted, Silent
 from keyss.hiding.config import HideConfig
 from keyss.hiding.joint import combine_densification
 from keyss.hiding.pipeline import Hidden, hide_scenes
-from keyss.hiding.revealing import reveal_gaussians
+from keyss.hiding.revealing import decode, open_secret, reveal_gaussians
 from keyss.hiding.targets import CombinedPoses, PlacedScene
 from keyss.rendering import render
+from keyss.seal import random_embeddings
 from tiny_scenes import random_gaussians, tiny_scene
 
 CONFIG = HideConfig(
@@ -68,7 +69,7 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     scenes, models = _scenes()
-    return hide_scenes(scenes, KEYS, CONFIG, plains=models)
+    return hide_scenes(scenes, KEYS, CONFIG, plains=models, sidecar=True)
 
 
 def test_the_published_model_shows_the_cover(hidden: Hidden) -> None:
@@ -81,41 +82,67 @@ def test_the_published_model_shows_the_cover(hidden: Hidden) -> None:
 @pytest.mark.parametrize("secret", [1, 2])
 def test_each_key_opens_its_secret_in_its_own_frame(hidden: Hidden, secret: int) -> None:
     scenes, _ = _scenes()
-    revealed = reveal_gaussians(hidden.stego, hidden.decoder, KEYS[secret - 1])
+    revealed = reveal_gaussians(hidden.stego, hidden.secrets[secret - 1])
     assert _psnr(revealed, scenes[secret]) > 26
     assert _psnr(revealed, scenes[secret]) > _psnr(hidden.stego, scenes[secret]) + 10
 
 
 def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> None:
     scenes, _ = _scenes()
-    own = reveal_gaussians(hidden.stego, hidden.decoder, KEYS[0])
-    there = reveal_gaussians(hidden.stego, hidden.decoder, KEYS[0], frame="cover")
-    frame = hidden.decoder.secrets[0].frame
+    own = reveal_gaussians(hidden.stego, hidden.secrets[0])
+    there = reveal_gaussians(hidden.stego, hidden.secrets[0], frame="cover")
+    frame = hidden.secrets[0].frame
     assert frame.scale != pytest.approx(1, abs=0.1)
     camera = scenes[1].test[0].camera
     difference = render(own, camera) - render(there, frame.apply_camera(camera))
     assert difference.abs().max() < 2e-3
 
 
-def test_a_wrong_key_opens_nothing_and_its_decoy_is_the_cover(hidden: Hidden) -> None:
-    scenes, _ = _scenes()
+def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:
+    for key, secret in zip(KEYS, hidden.secrets, strict=True):
+        opened = open_secret(hidden.stego, key, hidden.sidecar)
+        assert torch.equal(opened.embedding, secret.embedding)
     for key in ("First key", "other"):
         with pytest.raises(WrongKeyError):
-            reveal_gaussians(hidden.stego, hidden.decoder, key)
-        decoy = reveal_gaussians(hidden.stego, hidden.decoder, key, decoy=True)
+            open_secret(hidden.stego, key, hidden.sidecar)
+
+
+def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
+    scenes, _ = _scenes()
+    for embedding in random_embeddings(2, torch.Generator().manual_seed(5)):
+        decoy = decode(hidden.stego, hidden.secrets[0], embedding)
         assert _psnr(decoy, scenes[0]) > 26
         assert _psnr(decoy, scenes[2]) < _psnr(hidden.stego, scenes[2]) + 1
+
+
+def test_a_model_too_small_for_its_low_bits_is_refused_before_any_work() -> None:
+    with pytest.raises(UsageError, match=r"too small.*--max-gaussians.*--sidecar"):
+        hide_scenes(_scenes()[0], KEYS, CONFIG)
+
+
+def test_a_model_large_enough_carries_its_secrets() -> None:
+    scenes = _scenes()[0]
+    fit = replace(CONFIG.fit, iterations=30, max_gaussians=2600, grow_every=10, grow_start=0.1)
+    config = replace(CONFIG, fit=fit, distil_steps=30, hidden=8, branch=4, frequencies=1)
+    many = [random_gaussians(2600, seed=7), None, None]
+    hidden = hide_scenes(scenes, KEYS, config, plains=many)
+    assert hidden.sidecar is None
+    assert len(hidden.stego) > 1500
+    for key, secret in zip(KEYS, hidden.secrets, strict=True):
+        opened = open_secret(hidden.stego, key)
+        assert torch.equal(opened.embedding, secret.embedding)
+        assert _same(reveal_gaussians(hidden.stego, opened), reveal_gaussians(hidden.stego, secret))
 
 
 def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: Hidden) -> None:
     scenes, _ = _scenes()
     chosen = torch.randperm(len(hidden.stego), generator=torch.Generator().manual_seed(0))
-    shuffled = reveal_gaussians(hidden.stego[chosen], hidden.decoder, KEYS[1])
+    shuffled = reveal_gaussians(hidden.stego[chosen], hidden.secrets[1])
     assert _psnr(shuffled, scenes[2]) > 26
-    reveal_gaussians(hidden.stego[chosen[:200]], hidden.decoder, KEYS[1])
+    reveal_gaussians(hidden.stego[chosen[:200]], hidden.secrets[1])
     with pytest.raises(InputError, match="another model"):
-        reveal_gaussians(random_gaussians(seed=9), hidden.decoder, KEYS[1])
-    reveal_gaussians(random_gaussians(seed=9), hidden.decoder, KEYS[1], force=True)
+        reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1])
+    reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1], force=True)
 
 
 class _InterruptAt(Silent):
@@ -141,20 +168,20 @@ def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, 
     )
 
     def run(resume: bool, reporter: Silent | None = None) -> Hidden:
-        return hide_scenes(scenes, KEYS[:1], config, checkpoints=tmp_path, resume=resume, reporter=reporter)
+        return hide_scenes(
+            scenes, KEYS[:1], config, sidecar=True, checkpoints=tmp_path, resume=resume, reporter=reporter
+        )
 
-    whole = hide_scenes(scenes, KEYS[:1], config)
+    whole = hide_scenes(scenes, KEYS[:1], config, sidecar=True)
     with pytest.raises(Interrupted):
         run(False, _InterruptAt("plain model of the secret", 17))
     with pytest.raises(Interrupted):
         run(True, _InterruptAt("hide", 23))
     resumed = run(True)
     assert _same(resumed.stego, whole.stego)
-    for name, value in whole.decoder.decoder.state_dict().items():
-        assert torch.equal(resumed.decoder.decoder.state_dict()[name], value)
-    assert torch.equal(resumed.decoder.anchors, whole.decoder.anchors)
+    assert resumed.sidecar == whole.sidecar
     with pytest.raises(InputError, match="other settings"):
-        hide_scenes(scenes, ["another key"], config, checkpoints=tmp_path, resume=True)
+        hide_scenes(scenes, ["another key"], config, sidecar=True, checkpoints=tmp_path, resume=True)
 
 
 def test_keys_must_be_one_per_secret_and_different() -> None:

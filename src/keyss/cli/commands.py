@@ -50,7 +50,10 @@ OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder f
 
 def keygen(
     *,
-    length: Annotated[int, arg(metavar="N", help="Number of characters, 5.95 bits each.")] = 16,
+    length: Annotated[
+        int | None, optional("N", "Number of characters, 5.95 bits each.", "16, or what --bits needs")
+    ] = None,
+    bits: Annotated[int | None, optional("N", "Strength in bits instead of a length.", "none")] = None,
     seed: Annotated[
         int | None, optional("N", "Refused: a key is drawn from the system's random source.", "none")
     ] = None,
@@ -61,10 +64,16 @@ def keygen(
     example: keyss keygen > key.txt
     """
     from keyss.core.errors import UsageError
-    from keyss.seal import generate_key
+    from keyss.seal import generate_key, length_for
 
+    if length is not None and bits is not None:
+        raise UsageError("give --length or --bits, not both")
+    if bits is not None and bits < 1:
+        raise UsageError(f"--bits: expected at least 1, got {bits}")
     if seed is not None:
         raise UsageError("keygen takes no --seed: a key that can be drawn again is no secret")
+    if length is None:
+        length = 16 if bits is None else length_for(bits)
     print(generate_key(length))
 
 
@@ -136,6 +145,9 @@ def hide(
         UseAppendAction[tuple[Path, ...]],
         optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
     ] = (),
+    sidecar: Annotated[
+        bool, arg(help="Write what a key opens to decoder.sealed, not into the low bits of stego.ply.")
+    ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -148,7 +160,7 @@ def hide(
     from dataclasses import replace
 
     from keyss import verbs
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import keys, warn_of_weak_keys
     from keyss.cli.tables import print_files, print_metrics
     from keyss.core.errors import UsageError
     from keyss.hiding.config import PRESETS
@@ -169,18 +181,16 @@ def hide(
         start=start or config.start,
     )
     models = secret_model or (None,) * len(secret)
+    chosen = keys(key_file, len(secret), confirm=True)
+    warn_of_weak_keys(chosen)
     verbs.hide(
         cover,
-        [
-            verbs.Secret(scene, key, model)
-            for scene, key, model in zip(
-                secret, keys(key_file, len(secret), confirm=True), models, strict=True
-            )
-        ],
+        [verbs.Secret(scene, key, model) for scene, key, model in zip(secret, chosen, models, strict=True)],
         config=config,
         width=width,
         background=background,
         cover_model=cover_model,
+        sidecar=sidecar,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -192,7 +202,7 @@ def hide(
         out,
         {
             "stego.ply": "the cover with the secret in it: this is what to publish",
-            "decoder.safetensors": "opens it together with the key: keep it from strangers",
+            "decoder.sealed": "what the keys open, encrypted: needed for revealing",
             "private": "plain models of all scenes: keep them to yourself",
             "metrics.json": "the numbers",
             "config.json": "what ran",
@@ -208,14 +218,13 @@ def reveal(
     ] = None,
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
     decoder: Annotated[
-        Path | None, optional("FILE", "The decoder.", "decoder.safetensors beside the .ply")
+        Path | None,
+        optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
     ] = None,
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
     ] = "secret",
-    decoy: Annotated[
-        bool, arg(help="With a wrong key, write what the method gives for it: the cover.")
-    ] = False,
+    decoy: Annotated[bool, arg(help="With a wrong key, write the cover instead of failing.")] = False,
     force: Annotated[bool, arg(help="Go on although the decoder was made for another .ply.")] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -305,14 +314,14 @@ def evaluate(
 
 def info(
     path: Annotated[
-        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a decoder or a result folder.")
+        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a sidecar or a result folder.")
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
     device: UnusedDevice = "auto",
     seed: UnusedSeed = 0,
 ) -> None:
-    """Tell what is in a model, a scene folder or a decoder.
+    """Tell what is in a model, a scene folder or a sidecar.
 
     example: keyss info runs/hidden/stego.ply
     """
@@ -350,7 +359,6 @@ def demo(
             "comparison.png": "all of it in one picture: look here first",
             "stego.ply": "what would be published: opens in any 3DGS viewer",
             "secret.ply": "what the key brought back from it",
-            "decoder.safetensors": "needed for that, beside the key",
             "key.txt": "the key of this demo, known to everybody",
             "scenes": "the photos",
             "metrics.json": "the numbers",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import os
+import stat
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,10 +36,30 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 
 
+def warn_of_weak_keys(chosen: Sequence[str]) -> None:
+    """Say on the standard error stream which of the keys can be guessed, without saying what they are."""
+    from keyss.seal import weakness
+
+    for number, key in enumerate(chosen, start=1):
+        problem = weakness(key)
+        if problem:
+            which = f"key {number}: " if len(chosen) > 1 else ""
+            print(f"keyss: warning: {which}{problem}", file=sys.stderr)
+
+
 def key_of_file(path: Path) -> str:
-    """The text of a key file without one newline at its end. Raises InputError."""
+    """The text of a key file without one newline at its end; warns of one that others may read.
+
+    Raises InputError for a file that holds no key.
+    """
     try:
         with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
+                print(
+                    f"keyss: warning: {path}: others can read this key file; `chmod 600` keeps it to you",
+                    file=sys.stderr,
+                )
             data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: the key file cannot be read: {error.strerror}") from error

@@ -1,16 +1,15 @@
 """The method: the key-conditioned decoder, the joint training, revealing."""
 
 from keyss.hiding.config import HideConfig
-from keyss.hiding.decoder_file import SavedDecoder, load_decoder, save_decoder
+from keyss.hiding.payload import HiddenSecret
 from keyss.hiding.pipeline import Hidden, hide_scenes
-from keyss.hiding.revealing import reveal_gaussians
+from keyss.hiding.revealing import open_secret, reveal_gaussians
 
 __all__ = [
     "Hidden",
+    "HiddenSecret",
     "HideConfig",
-    "SavedDecoder",
     "hide_scenes",
-    "load_decoder",
+    "open_secret",
     "reveal_gaussians",
-    "save_decoder",
 ]

@@ -63,16 +63,9 @@ class JointRun:
         self.strategy = CappedStrategy(config.fit, self._largest_opacity)
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
 
-        shape = DecoderShape(
-            mask=config.mask,
-            hidden=config.hidden,
-            branch=config.branch,
-            frequencies=config.frequencies,
-            sh_degree=config.fit.sh_degree,
-        )
         with torch.random.fork_rng():
             torch.manual_seed(config.fit.seed)
-            self.decoder = Decoder(shape).to(device)
+            self.decoder = Decoder(decoder_shape(config)).to(device)
         self.decoder.standardise(self.gaussians())
         self.decoder_optimizer = torch.optim.AdamW(
             self.decoder.parameters(), lr=config.decoder_rate, weight_decay=config.weight_decay
@@ -215,6 +208,17 @@ class JointRun:
             shuffle.load(tensors[f"order.{i}"])
         self.generator.set_state(tensors["generator"])
         self.iteration = int(meta["iteration"])
+
+
+def decoder_shape(config: HideConfig) -> DecoderShape:
+    """The sizes of the decoder that `config` asks for."""
+    return DecoderShape(
+        mask=config.mask,
+        hidden=config.hidden,
+        branch=config.branch,
+        frequencies=config.frequencies,
+        sh_degree=config.fit.sh_degree,
+    )
 
 
 def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:

@@ -17,18 +17,22 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.loop import Reporter, train
 from keyss.fitting.plain import fit_scene
 from keyss.hiding.config import HideConfig
-from keyss.hiding.decoder_file import HiddenSecret, SavedDecoder, choose_anchors
-from keyss.hiding.joint import JointRun
+from keyss.hiding.decoder import Decoder
+from keyss.hiding.joint import JointRun, decoder_shape
+from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
 from keyss.hiding.targets import PlacedScene
-from keyss.seal.keys import SALT_BYTES, DerivedKey, KeyDerivation
+from keyss.seal import DerivedKey, KeyDerivation, embed, random_embeddings, seal_sidecar
+from keyss.seal.keys import SALT_BYTES
+from keyss.seal.plan import check_room
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """What hiding gives: what is published, what opens it, and what stays private."""
+    """What hiding gives: what is published, what the keys open, and what stays private."""
 
-    stego: Gaussians  # to be published
-    decoder: SavedDecoder
+    stego: Gaussians  # to be published; carries the sealed secrets in its low bits unless there is a sidecar
+    sidecar: bytes | None
+    secrets: tuple[HiddenSecret, ...]  # as they come out again with their keys
     plains: tuple[Gaussians, ...]  # plain models of the cover and the secrets, each in its own frame
     seconds: float  # of all training, that before a resume included
 
@@ -39,6 +43,7 @@ def hide_scenes(
     config: HideConfig,
     *,
     plains: Sequence[Gaussians | None] | None = None,
+    sidecar: bool = False,
     device: torch.device | str = "cpu",
     checkpoints: Path | None = None,
     resume: bool = False,
@@ -46,9 +51,11 @@ def hide_scenes(
 ) -> Hidden:
     """Hide `scenes[1:]` in `scenes[0]`, each to be opened by its key.
 
-    `plains`: existing plain models, None for those to be fitted. With `checkpoints` (a folder) the state
-    of every stage is kept there, and `resume` goes on from it. Raises UsageError for keys that are equal
-    or not one per secret, Interrupted on Ctrl-C, InputError for checkpoints of another run.
+    `plains`: existing plain models, None for those to be fitted. `sidecar`: the sealed secrets go into a
+    file of their own and not into the low bits of the stego model. With `checkpoints` (a folder) the state
+    of every stage is kept there, and `resume` goes on from it. Raises UsageError for keys that are equal or
+    not one per secret and for a model too small for what it has to carry, Interrupted on Ctrl-C, InputError
+    for checkpoints of another run.
     """
     if len(keys) != len(scenes) - 1 or not keys:
         raise UsageError(f"expected one key for each of {len(scenes) - 1} secret(s), got {len(keys)}")
@@ -57,6 +64,8 @@ def hide_scenes(
     derived = [DerivedKey(key, derivation) for key in keys]
     if len({key.verifier() for key in derived}) != len(derived):
         raise UsageError("two secrets have the same key: each needs its own")
+    if not sidecar:
+        check_room(_largest_payload(config), config.fit.max_gaussians, len(keys), config.fit.sh_degree)
 
     models, seconds = [], 0.0
     for index, (scene, given) in enumerate(zip(scenes, plains or [None] * len(scenes), strict=True)):
@@ -99,16 +108,31 @@ def hide_scenes(
         reporter=reporter,
     )
     stego = run.gaussians().to("cpu")
-    generator = torch.Generator().manual_seed(config.fit.seed)
-    saved = SavedDecoder(
-        decoder=run.decoder.to("cpu").requires_grad_(False),
-        derivation=derivation,
-        secrets=tuple(
-            HiddenSecret(key.verifier(), frame) for key, frame in zip(derived, frames[1:], strict=True)
-        ),
-        anchors=choose_anchors(stego, generator),
-    )
-    return Hidden(stego, saved, tuple(models), seconds)
+    decoder = run.decoder.to("cpu").requires_grad_(False)
+    anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
+    packed = [
+        pack_secret(HiddenSecret(decoder, key.embedding(), frame, anchors))
+        for key, frame in zip(derived, frames[1:], strict=True)
+    ]
+    sealed = None
+    if sidecar:
+        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(decoder))
+    else:
+        stego = embed(stego, list(zip(keys, packed, strict=True)))
+    return Hidden(stego, sealed, tuple(map(unpack_secret, packed)), tuple(models), seconds)
+
+
+def _largest_payload(config: HideConfig) -> int:
+    """Bytes of a secret whose decoder cannot be compressed."""
+    decoder = Decoder(decoder_shape(config))
+    embedding = random_embeddings(1, torch.Generator())[0]
+    return len(pack_secret(HiddenSecret(decoder, embedding, Similarity.identity(), torch.zeros(64, 3))))
+
+
+def _discarded(decoder: Decoder) -> bytes:
+    """32 bytes that only who trained this decoder can know: the digits that are rounded away when packed."""
+    weights = b"".join(value.float().numpy().tobytes() for value in decoder.state_dict().values())
+    return hashlib.sha256(b"keyss/v1/discarded" + weights).digest()
 
 
 def _salt(cover: Scene, seed: int) -> bytes:

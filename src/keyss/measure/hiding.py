@@ -12,16 +12,15 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import Quality, mean_psnr, quality
-from keyss.hiding.decoder_file import SavedDecoder
+from keyss.hiding.payload import HiddenSecret
 from keyss.hiding.revealing import decode, reveal_gaussians
-from keyss.seal.keys import DerivedKey, random_embeddings
+from keyss.seal import random_embeddings
 
 
 def measure_hiding(
     stego: Gaussians,
-    saved: SavedDecoder,
-    scenes: Sequence[Scene],  # the cover, then the secrets, each in its own frame
-    keys: Sequence[str],  # one for each secret, in any order
+    opened: Sequence[HiddenSecret],
+    scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     bounds: Sequence[Gaussians],  # plain models of the scenes, each in its own frame
     *,
     wrong_keys: int = 32,
@@ -29,32 +28,26 @@ def measure_hiding(
 ) -> dict[str, Any]:
     """Qualities of cover and secrets, their bounds, and what wrong keys show.
 
-    `bound`: the plain models. `wrong_key`: PSNR of what wrong keys give (embeddings drawn as those of
-    random keys fall), against the cover's photos and, seen from the secrets' own cameras, against theirs;
-    `floor` is the stego cover itself against the secrets' photos, which a wrong key should look like.
-    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
+    `bound`: the plain models. `wrong_key`: PSNR of what the decoders make of wrong embeddings (drawn as those
+    of random keys fall), against the cover's photos and, seen from the secrets' own cameras, against theirs;
+    only somebody who has a decoder but not its key would see that. `floor` is the stego cover itself against
+    the secrets' photos, which a wrong key should look like.
+    Raises UsageError for no wrong keys at all.
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     cover, secrets = scenes[0], scenes[1:]
-    key_of: dict[int, str] = {}
-    for key in keys:
-        found = saved.find(DerivedKey(key, saved.derivation))
-        key_of[saved.secrets.index(found)] = key
-    if sorted(key_of) != list(range(len(secrets))):
-        raise UsageError(f"expected the keys of all {len(secrets)} secret(s), got {len(key_of)} of them")
-
-    revealed = [
-        reveal_gaussians(stego, saved, key_of[index]).to(stego.device) for index in range(len(secrets))
-    ]
-    frames = [saved.secrets[index].frame for index in range(len(secrets))]
+    revealed = [reveal_gaussians(stego, each).to(stego.device) for each in opened]
+    frames = [each.frame for each in opened]
     against_cover: list[float] = []
     against_secrets: list[list[float]] = [[] for _ in secrets]
     for embedding in random_embeddings(wrong_keys, torch.Generator().manual_seed(seed)):
-        decoy = decode(stego, saved, embedding)
-        against_cover.append(mean_psnr(decoy, cover.test, _background(cover, stego)))
-        for index, secret in enumerate(secrets):
+        shown = 0.0
+        for index, (each, secret) in enumerate(zip(opened, secrets, strict=True)):
+            decoy = decode(stego, each, embedding)
+            shown += mean_psnr(decoy, cover.test, _background(cover, stego)) / len(opened)
             against_secrets[index].append(_psnr_in(secret, frames[index].inverse().apply_gaussians(decoy)))
+        against_cover.append(shown)
     return {
         "cover": _quality(cover, stego),
         "secrets": [_quality(secret, model) for secret, model in zip(secrets, revealed, strict=True)],

@@ -8,6 +8,7 @@ another. Keys are text, normalised to NFKC, so that one key typed on two systems
 from __future__ import annotations
 
 import hmac
+import math
 import secrets
 import string
 import unicodedata
@@ -16,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from argon2.low_level import Type, hash_secret_raw
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 from scipy.special import ndtri
@@ -25,15 +28,24 @@ from keyss.core.errors import InputError, UsageError
 
 ALPHABET = string.ascii_letters + string.digits
 SALT_BYTES = 16
+MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
 MAX_KEY_BYTES = 4096
 
 
 def generate_key(length: int = 16) -> str:
-    """A random alphanumeric key from the system's random source: 5.95 bits a character."""
+    """A random alphanumeric key from the system's random source: 5.95 bits a character.
+
+    Raises UsageError for a length outside 1 to 1024.
+    """
     if not 1 <= length <= 1024:
         raise UsageError(f"a key has 1 to 1024 characters, not {length}")
     return "".join(secrets.choice(ALPHABET) for _ in range(length))
+
+
+def length_for(bits: int) -> int:
+    """The number of characters with which `generate_key` reaches `bits`."""
+    return math.ceil(bits / math.log2(len(ALPHABET)))
 
 
 @dataclass(frozen=True)
@@ -63,8 +75,23 @@ class KeyDerivation:
         return KeyDerivation(salt=secrets.token_bytes(SALT_BYTES))
 
 
+def expand(secret: bytes, label: str, length: int) -> bytes:
+    """`length` bytes for one use of a uniformly random `secret`: HKDF-Expand with SHA-256 (RFC 5869)."""
+    return HKDFExpand(SHA256(), length, f"keyss/v1/{label}".encode()).derive(secret)
+
+
+def stream(secret: bytes, label: str, length: int) -> bytes:
+    """The same for more bytes than HKDF gives: the key stream of ChaCha20 (RFC 8439) under a derived key."""
+    cipher = Cipher(ChaCha20(expand(secret, label, 32), bytes(16)), mode=None)
+    return cipher.encryptor().update(bytes(length))
+
+
 class DerivedKey:
-    """What a key becomes under one `KeyDerivation`."""
+    """What a key becomes under one `KeyDerivation`.
+
+    The labels in use: "embedding" (what conditions the decoder), "verifier" (tells keys apart while hiding),
+    "seal" (wraps the sidecar's data key), "cells/header" (carries the data key in a model's low bits).
+    """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:
         """Takes about 0.1 s. Raises UsageError for an empty or overlong key."""
@@ -79,16 +106,26 @@ class DerivedKey:
             time_cost=derivation.time_cost,
             memory_cost=derivation.memory_kib,
             parallelism=derivation.parallelism,
-            hash_len=32,
+            hash_len=MASTER_BYTES,
             type=Type.ID,
         )
 
-    def _expand(self, label: str, length: int) -> bytes:
-        return HKDFExpand(SHA256(), length, f"keyss/v1/{label}".encode()).derive(self._master)
+    @staticmethod
+    def of_master(master: bytes) -> DerivedKey:
+        """The key whose Argon2id output is `master` (32 bytes): for tests that try thousands of keys."""
+        if len(master) != MASTER_BYTES:
+            raise ValueError(f"expected {MASTER_BYTES} bytes, got {len(master)}")
+        derived = object.__new__(DerivedKey)
+        derived._master = master
+        return derived
+
+    def expand(self, label: str, length: int) -> bytes:
+        """`length` bytes for the use that `label` names."""
+        return expand(self._master, label, length)
 
     def verifier(self) -> bytes:
         """32 bytes that recognise the key and say nothing of its embedding."""
-        return self._expand("verifier", 32)
+        return self.expand("verifier", 32)
 
     def matches(self, verifier: bytes) -> bool:
         """Whether `verifier` is this key's, in constant time."""
@@ -96,7 +133,7 @@ class DerivedKey:
 
     def embedding(self) -> Tensor:
         """[64] float32 unit vector, uniform on the sphere over keys: what the decoder is conditioned on."""
-        words = np.frombuffer(self._expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
+        words = np.frombuffer(self.expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
         uniform = (words.astype(np.float64) + 0.5) / 2.0**64
         return unit_vector(torch.from_numpy(ndtri(uniform.clip(1e-16, 1 - 1e-16))))
 

@@ -1,0 +1,140 @@
+"""A secret as bytes: what is sealed under its key. safetensors with a JSON header, nothing executable.
+
+It holds the decoder (weights in half precision: the constants of its inputs stay whole), the embedding that
+conditions it, the similarity that leads back to the secret's own frame, and *anchors*: positions of some
+Gaussians of the stego model, which are there in any order and, mostly, after pruning, and tell whether a
+sidecar belongs to a model. A secret's bytes say nothing of other secrets.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.hiding.decoder import Decoder, DecoderShape
+from keyss.hiding.mask import parse_mask
+from keyss.seal.keys import EMBEDDING_SIZE
+
+FORMAT = "keyss-secret"
+VERSION = 1
+ANCHORS = 64
+ANCHORS_NEEDED = 0.25  # share that must be found again
+ANCHOR_TOLERANCE = 1e-6  # of the model's size
+_WEIGHTS = "decoder."
+# What reading a damaged header or damaged weights can raise.
+_DAMAGE = (
+    safetensors.SafetensorError,
+    KeyError,
+    TypeError,
+    ValueError,
+    RuntimeError,
+    AttributeError,
+    RecursionError,
+    UsageError,
+)
+
+
+@dataclass(frozen=True)
+class HiddenSecret:
+    """All that revealing one secret needs besides the stego model."""
+
+    decoder: Decoder
+    embedding: Tensor  # [64] what its key conditions the decoder with
+    frame: Similarity  # from the secret's own frame into the cover's
+    anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        """Raise InputError unless enough anchors are Gaussians of `stego`."""
+        means = stego.means.detach().double().cpu().numpy()
+        size = float(np.ptp(means, axis=0).max())
+        distances, _ = cKDTree(means).query(self.anchors.double().numpy())
+        found = float((distances <= ANCHOR_TOLERANCE * size).mean())
+        if found < ANCHORS_NEEDED:
+            raise InputError(
+                f"this decoder was made for another model: {found:.0%} of its anchors are in this PLY, "
+                f"at least {ANCHORS_NEEDED:.0%} expected "
+                "(quantising the positions does that too: --force tries all the same)"
+            )
+
+
+def choose_anchors(stego: Gaussians, generator: torch.Generator) -> Tensor:
+    """[A, 3] positions of randomly chosen Gaussians."""
+    return stego.means[torch.randperm(len(stego), generator=generator)[:ANCHORS]].detach().cpu()
+
+
+def pack_secret(secret: HiddenSecret) -> bytes:
+    """The bytes of a secret; the same secret gives the same bytes."""
+    decoder = secret.decoder
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "shape": {**asdict(decoder.shape), "mask": ",".join(decoder.shape.mask)},
+        "frame": secret.frame.to_json(),
+    }
+    halved = {name for name, _ in decoder.named_parameters()}
+    tensors = {
+        _WEIGHTS + name: (value.half() if name in halved else value).detach().cpu().contiguous()
+        for name, value in decoder.state_dict().items()
+    }
+    tensors |= {"embedding": secret.embedding.cpu().contiguous(), "anchors": secret.anchors.contiguous()}
+    return safetensors.torch.save(tensors, {"keyss": json.dumps(header)})
+
+
+def unpack_secret(data: bytes) -> HiddenSecret:
+    """The secret of `pack_secret`. Raises InputError for anything else, for damage, and another version."""
+    try:
+        tensors = safetensors.torch.load(data)
+        header = json.loads(_metadata(data).get("keyss", "null"))
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise InputError("what the key opens is no secret of keyss")
+        if header.get("version") != VERSION:
+            raise InputError(
+                f"secret of version {header.get('version')!r}; this program reads version {VERSION}"
+            )
+        return _from_parts(header, tensors)
+    except _DAMAGE as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"what the key opens is no secret of keyss, or damaged: {reason}") from error
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    """The text that safetensors carries; `safetensors.torch.load` has checked the sizes."""
+    size = int.from_bytes(data[:8], "little")
+    metadata = json.loads(data[8 : 8 + size]).get("__metadata__") or {}
+    if not isinstance(metadata, dict):
+        raise TypeError("metadata: expected an object")
+    return metadata
+
+
+def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSecret:
+    shape = dict(header["shape"])
+    sizes = {name: int(shape[name]) for name in ("hidden", "branch", "frequencies", "sh_degree")}
+    if not (0 <= sizes["sh_degree"] <= 3 and 0 <= sizes["frequencies"] <= 16):
+        raise InputError(f"decoder shape out of range: {sizes}")
+    if not all(1 <= sizes[name] <= 4096 for name in ("hidden", "branch")):
+        raise InputError(f"decoder shape out of range: {sizes}")
+    if not all(
+        value.dtype in (torch.float16, torch.float32) and value.isfinite().all() for value in tensors.values()
+    ):
+        raise InputError("weights: expected finite numbers of half or single precision")
+    anchors, embedding = tensors.pop("anchors").float(), tensors.pop("embedding").float()
+    if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
+        raise InputError(f"anchors: expected up to {ANCHORS} positions, got shape {list(anchors.shape)}")
+    if embedding.shape != (EMBEDDING_SIZE,):
+        raise InputError(f"embedding: expected {EMBEDDING_SIZE} numbers, got shape {list(embedding.shape)}")
+    decoder = Decoder(DecoderShape(mask=parse_mask(str(shape["mask"])), **sizes))
+    decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
+    return HiddenSecret(
+        decoder.requires_grad_(False), embedding, Similarity.from_json(header["frame"]), anchors
+    )

@@ -1,0 +1,107 @@
+"""Reed-Solomon over GF(256) for erasures: any k of n chunks give the data back.
+
+A systematic code of length n <= 255 with the generator polynomial (x - 1)(x - a)...(x - a^(n-k-1)), a = 2,
+over the field of the polynomial x^8 + x^4 + x^3 + x^2 + 1: the same codewords, byte for byte, as `reedsolo`
+makes. That library works on one codeword of bytes at a time and takes minutes for what lies in a model; here
+a chunk is a row of an array, all its bytes are coded at once, and lost rows are found by solving a linear
+system. Which rows are lost is known (every chunk carries its number and a tag), so there are no errors to
+locate.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+MAX_CHUNKS = 255  # of one codeword
+_POLYNOMIAL = 0x11D
+
+Bytes = npt.NDArray[np.uint8]
+
+
+def _tables() -> tuple[Bytes, list[int], list[int]]:
+    """[256, 256] products; exponentials of 2; logarithms."""
+    powers, logarithms = [0] * 510, [0] * 256
+    value = 1
+    for exponent in range(255):
+        powers[exponent] = powers[exponent + 255] = value
+        logarithms[value] = exponent
+        value = value << 1 ^ (_POLYNOMIAL if value & 128 else 0)
+    product = np.zeros((256, 256), np.uint8)
+    for a in range(1, 256):
+        product[a, 1:] = [powers[logarithms[a] + logarithms[b]] for b in range(1, 256)]
+    return product, powers, logarithms
+
+
+_PRODUCT, _POWERS, _LOGARITHMS = _tables()
+
+
+def encode(data: Bytes, n: int) -> Bytes:
+    """[n, width] of data [k, width]: the k rows, then n - k rows of parity. 1 <= k <= n <= 255."""
+    k = len(data)
+    if not 1 <= k <= n <= MAX_CHUNKS:
+        raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
+    return np.concatenate([data, _times(_parity_matrix(k, n), data)])
+
+
+def decode(rows: dict[int, Bytes], k: int, n: int) -> Bytes | None:
+    """The data [k, width] from any k rows of a codeword of n, by their number; None if there are fewer."""
+    if len(rows) < k:
+        return None
+    width = len(next(iter(rows.values())))
+    data = np.zeros((k, width), np.uint8)
+    known = [index for index in range(k) if index in rows]
+    lost = [index for index in range(k) if index not in rows]
+    for index in known:
+        data[index] = rows[index]
+    if not lost:
+        return data
+    parity = [index for index in sorted(rows) if index >= k][: len(lost)]
+    matrix = _parity_matrix(k, n)[[index - k for index in parity]]
+    right = np.stack([rows[index] for index in parity]) ^ _times(matrix[:, known], data[known])
+    data[lost] = _solve(matrix[:, lost], right)
+    return data
+
+
+@lru_cache(maxsize=8)
+def _parity_matrix(k: int, n: int) -> Bytes:
+    """[n - k, k] so that parity = matrix x data: column i is x^(n-1-i) modulo the generator polynomial."""
+    size = n - k
+    generator = np.zeros(size + 1, np.uint8)  # of the highest power first
+    generator[0] = 1
+    for exponent in range(size):
+        generator[1:] ^= _PRODUCT[_POWERS[exponent]][generator[:-1]]
+    matrix = np.zeros((size, k), np.uint8)
+    if size == 0:
+        return matrix
+    remainder = generator[1:].copy()  # x^size modulo the generator
+    for column in range(k - 1, -1, -1):
+        matrix[:, column] = remainder
+        lead = remainder[0]
+        remainder = np.append(remainder[1:], np.uint8(0)) ^ _PRODUCT[lead][generator[1:]]
+    return matrix
+
+
+def _times(matrix: Bytes, rows: Bytes) -> Bytes:
+    """The matrix product [a, b] x [b, width] over the field."""
+    result = np.zeros((len(matrix), rows.shape[1]), np.uint8)
+    for index in range(matrix.shape[1]):
+        result ^= _PRODUCT[matrix[:, index, None], rows[index]]
+    return result
+
+
+def _solve(matrix: Bytes, right: Bytes) -> Bytes:
+    """x of matrix x = right for an invertible square matrix: Gauss-Jordan elimination."""
+    size = len(matrix)
+    work = np.concatenate([matrix, right], axis=1)
+    for column in range(size):
+        pivot = column + int(np.flatnonzero(work[column:, column])[0])
+        work[[column, pivot]] = work[[pivot, column]]
+        inverse = _POWERS[255 - _LOGARITHMS[work[column, column]]]
+        work[column] = _PRODUCT[inverse][work[column]]
+        factors = work[:, column].copy()
+        factors[column] = 0
+        work ^= _PRODUCT[factors[:, None], work[column]]
+    return work[:, size:]

@@ -1,0 +1,114 @@
+"""A secret's bytes: whole round trips, and damage that ends in InputError."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from keyss.core import InputError
+from keyss.core.similarity import Similarity
+from keyss.hiding.decoder import Decoder, DecoderShape
+from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.seal import random_embeddings
+from tiny_scenes import random_gaussians
+
+FRAME = Similarity(2.0, torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+
+
+def _secret() -> HiddenSecret:
+    torch.manual_seed(0)
+    stego = random_gaussians()
+    decoder = Decoder(DecoderShape(hidden=16, branch=8))
+    decoder.standardise(stego)
+    embedding = random_embeddings(1, torch.Generator().manual_seed(0))[0]
+    return HiddenSecret(decoder, embedding, FRAME, choose_anchors(stego, torch.Generator().manual_seed(0)))
+
+
+PACKED = pack_secret(_secret())
+
+
+def _with_header(**changes: object) -> bytes:
+    """The same with another JSON header, keeping the tensors."""
+    (size,) = struct.unpack("<Q", PACKED[:8])
+    outer = json.loads(PACKED[8 : 8 + size])
+    inner = json.loads(outer["__metadata__"]["keyss"])
+    inner.update(changes)
+    outer["__metadata__"]["keyss"] = json.dumps(inner)
+    header = json.dumps(outer).encode()
+    header += b" " * (-len(header) % 8)
+    return struct.pack("<Q", len(header)) + header + PACKED[8 + size :]
+
+
+def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
+    secret, opened = _secret(), unpack_secret(PACKED)
+    assert opened.decoder.shape == secret.decoder.shape
+    assert torch.equal(opened.embedding, secret.embedding)
+    assert torch.equal(opened.frame.translation, FRAME.translation)
+    assert torch.equal(opened.anchors, secret.anchors)
+    for name, value in secret.decoder.state_dict().items():
+        exact = opened.decoder.state_dict()[name]
+        halved = name in dict(secret.decoder.named_parameters())
+        assert torch.equal(exact, value.half().float() if halved else value), name
+    assert pack_secret(opened) == PACKED
+
+
+def test_another_version_is_refused_by_number() -> None:
+    with pytest.raises(InputError, match=r"version 2.*version 1"):
+        unpack_secret(_with_header(version=2))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format": "other"},
+        {"shape": None},
+        {"shape": {"mask": "op", "hidden": 10**9, "branch": 8, "frequencies": 6, "sh_degree": 3}},
+        {"shape": {"mask": "op", "hidden": 16, "branch": 8, "frequencies": 6, "sh_degree": 3}},
+        {"frame": {"scale": -1}},
+        {"frame": 3},
+    ],
+)
+def test_hostile_headers_are_input_errors(changes: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        unpack_secret(_with_header(**changes))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, len(PACKED) - 1), st.integers(0, 7), st.integers(0, len(PACKED)))
+def test_truncated_and_mutated_bytes_are_input_errors_or_secrets(at: int, bit: int, size: int) -> None:
+    broken = bytearray(PACKED)
+    broken[at] ^= 1 << bit
+    for data in (bytes(broken), PACKED[:size], bytes(broken[:size])):
+        with contextlib.suppress(InputError):
+            unpack_secret(data)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=300))
+def test_any_bytes_are_input_errors(data: bytes) -> None:
+    with pytest.raises(InputError):
+        unpack_secret(data)
+
+
+def test_weights_that_are_not_finite_are_refused() -> None:
+    secret = _secret()
+    secret.decoder.first.bias.data[0] = float("nan")
+    with pytest.raises(InputError, match="finite"):
+        unpack_secret(pack_secret(secret))
+
+
+def test_belonging_survives_order_and_pruning_but_not_another_model() -> None:
+    secret, stego = _secret(), random_gaussians()
+    secret.check_belongs_to(stego)
+    secret.check_belongs_to(stego[torch.randperm(len(stego))[: len(stego) // 2]])
+    with pytest.raises(InputError, match="another model"):
+        secret.check_belongs_to(random_gaussians(seed=1))
+    with pytest.raises(InputError, match="another model"):
+        secret.check_belongs_to(replace(stego, means=stego.means * 1.001))

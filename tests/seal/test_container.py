@@ -1,0 +1,249 @@
+"""Payloads in a model's low bits: what they survive, who can read them, and what can be seen of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+
+from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
+from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
+from keyss.files.ply import read_ply, write_ply
+from keyss.rendering import render
+from keyss.seal import DerivedKey, capacity, embed, extract
+from keyss.seal.container import embed_derived, extract_derived, smallest
+from keyss.seal.low_bits import identities, is_random, read_low_bits
+from keyss.seal.plan import cells_for, check_room, plan
+from seal.trained_like import keys, trained_like
+from tiny_scenes import ring_cameras
+
+__all__ = ["splat_transform"]  # a fixture
+
+PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
+KEY = "the right key"
+
+
+@pytest.fixture(scope="module")
+def plain() -> Gaussians:
+    return trained_like(1500)
+
+
+@pytest.fixture(scope="module")
+def stego(plain: Gaussians) -> Gaussians:
+    return embed(plain, [(KEY, PAYLOAD)])
+
+
+def test_round_trip(stego: Gaussians) -> None:
+    assert extract(stego, KEY) == PAYLOAD
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_round_trip_of_lower_degrees(degree: int) -> None:
+    model = trained_like(4000, sh_degree=degree)
+    own = keys()
+    stego = embed_derived(model, [(own, PAYLOAD[:1500])])
+    assert extract_derived(stego, own[0]) == PAYLOAD[:1500]
+
+
+def test_the_same_again_gives_the_same_bits_and_other_payloads_others(plain: Gaussians) -> None:
+    own = keys()
+    stego = embed_derived(plain, [(own, PAYLOAD)])
+    assert_same_bits(embed_derived(plain, [(own, PAYLOAD)]), stego)
+    other = embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")])
+    same = (read_low_bits(other) == read_low_bits(stego)).mean()
+    assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
+
+
+def test_only_low_bits_of_some_fields_change(plain: Gaussians, stego: Gaussians) -> None:
+    assert torch.equal(plain.means, stego.means)
+    assert torch.equal(plain.sh[:, 0], stego.sh[:, 0])
+    for name, bits in (("log_scales", 9), ("quats", 9), ("opacity_logits", 9), ("sh", 13)):
+        before, after = (getattr(model, name).contiguous().view(torch.int32) for model in (plain, stego))
+        assert not torch.equal(before, after)
+        assert torch.equal(before >> bits, after >> bits), name
+        assert torch.equal(before & 1, after & 1), name
+    assert identities(plain) == identities(stego)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: int) -> None:
+    order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
+    own = keys()
+    kept = embed_derived(stego, [(own, PAYLOAD)])[order[: len(stego) * 3 // 4]]
+    salt = smallest(identities(stego)).index(smallest(identities(kept))[0])
+    assert extract_derived(kept, own[salt]) == PAYLOAD
+    if seed == 0:
+        assert extract(stego[order[: len(stego) * 3 // 4]], KEY) == PAYLOAD
+
+
+def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
+    model = trained_like(4000)
+    own, other = keys(), keys(1)
+    room = capacity(4000)
+    stego = embed_derived(model, [(own, os.urandom(room * 9 // 10))])
+    order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
+    names = identities(stego)
+    first = smallest(names)[0]
+    rest = stego[torch.cat([torch.tensor([names.index(first)]), order[:1500]])]
+    with pytest.raises(InputError, match="too much of the model"):
+        extract_derived(rest, own[0])
+    with pytest.raises(WrongKeyError):
+        extract_derived(rest, other[0])
+
+
+def test_survives_files_without_normals_with_more_properties_and_in_other_orders(
+    stego: Gaussians, tmp_path: Path
+) -> None:
+    columns = columns_of(stego)
+    bare = {name: values for name, values in columns.items() if name not in ("nx", "ny", "nz")}
+    more = {"label": np.ones(len(stego), np.float32)} | dict(reversed(columns.items()))
+    doubles = dict.fromkeys(columns, "double")
+    for index, data in enumerate(
+        (
+            ply_bytes(bare),
+            ply_bytes(more),
+            ply_bytes(columns, form="binary_big_endian"),
+            ply_bytes(columns, kinds=doubles),
+            ply_bytes(bare, form="ascii"),
+        )
+    ):
+        path = tmp_path / f"{index}.ply"
+        path.write_bytes(data)
+        assert_same_bits(read_ply(path), stego)
+    assert extract(read_ply(tmp_path / "1.ply"), KEY) == PAYLOAD
+
+
+def test_survives_our_writer_and_gsply(stego: Gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "ours.ply", stego)
+    gsply.plywrite(tmp_path / "theirs.ply", gsply.plyread(tmp_path / "ours.ply"))
+    for name in ("ours", "theirs"):
+        assert extract(read_ply(tmp_path / f"{name}.ply"), KEY) == PAYLOAD
+
+
+def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "in.ply", stego)
+    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_ply(copy), KEY) == PAYLOAD
+
+
+def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:
+    model, first, second = trained_like(3000, seed=5), keys(1), keys(2)
+    stego = embed_derived(model, [(first, b"first"), (second, PAYLOAD)])
+    assert extract_derived(stego, first[0]) == b"first"
+    assert extract_derived(stego, second[0]) == PAYLOAD
+    with pytest.raises(WrongKeyError):
+        extract_derived(stego, keys(3)[0])
+    with pytest.raises(UsageError, match="same key"):
+        embed_derived(model, [(first, b"a"), (first, b"b")])
+
+
+def test_the_holder_of_a_key_sees_the_same_whether_there_is_another_secret_or_not() -> None:
+    """As many own cells, as much of the rest changed, and that rest as random."""
+    model, own, other = trained_like(4000, seed=6), keys(1), keys(2)
+    before = read_low_bits(model)
+    stegos = [
+        embed_derived(model, [(own, PAYLOAD)]),
+        embed_derived(model, [(own, PAYLOAD), (other, os.urandom(20_000))]),
+    ]
+    seen = [_opened(stego, own[0]) for stego in stegos]
+    assert len(seen[0]) == len(seen[1])  # header cells; the data cells follow from the same plan
+    changed = [(read_low_bits(stego) != before).any(axis=1).mean() for stego in stegos]
+    assert changed[0] == changed[1] == is_random(model).mean()
+    for stego in stegos:
+        counts = np.bincount(read_low_bits(stego).ravel(), minlength=256)
+        expected = counts.sum() / 256
+        assert ((counts - expected) ** 2).sum() / expected < 255 + 6 * (2 * 255) ** 0.5
+
+
+def _opened(stego: Gaussians, key: DerivedKey) -> list[tuple[int, bytes]]:
+    from keyss.seal.container import _header_cipher
+
+    return list(_header_cipher(key).open_all(identities(stego), [r.tobytes() for r in read_low_bits(stego)]))
+
+
+def test_keys_that_are_not_the_right_one_open_nothing() -> None:
+    """1,000 random keys at the level below Argon2id, whose output is replaced: it is what keys differ in."""
+    model, own = trained_like(600, seed=3), keys()
+    stego = embed_derived(model, [(own, b"x")])
+    names = identities(stego)
+    assert extract_derived(stego, own[0], names) == b"x"
+    for number in range(1000):
+        with pytest.raises(WrongKeyError):
+            extract_derived(stego, DerivedKey.of_master(number.to_bytes(32, "big")), names)
+
+
+def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain, KEY)
+    with pytest.raises(WrongKeyError):
+        extract(trained_like(50, sh_degree=0), KEY)
+
+
+def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
+    with pytest.raises(UsageError, match=r"too small.*Gaussians \(--max-gaussians\) would do.*--sidecar"):
+        embed_derived(trained_like(300), [(keys(), PAYLOAD)])
+    with pytest.raises(UsageError, match="spherical harmonics"):
+        check_room(100, 10_000, 1, sh_degree=0)
+    with pytest.raises(UsageError, match="for each of 2 secrets"):
+        check_room(126_000, 5_000, 2, sh_degree=3)
+    check_room(126_000, 10_000, 1, sh_degree=3)  # the demo
+
+
+def test_capacity_grows_with_the_model_and_its_plan_is_kept_to() -> None:
+    sizes = [capacity(cells) for cells in (100, 500, 1000, 5000, 20_000, 200_000)]
+    assert sizes == sorted(sizes)
+    assert sizes[0] == 0
+    assert sizes[-1] / 200_000 > 18
+    assert capacity(20_000, 2) == capacity(20_000, 1) > 1.9 * capacity(20_000, 3)
+    for size in (4096, 131_072):
+        need = cells_for(size, 1, 3)
+        assert capacity(need) >= size > capacity(need - 1)
+        assert plan(need, 1, 3, size) is not None
+        assert plan(need - 1, 1, 3, size) is None
+
+
+def _half_precision(model: Gaussians) -> Gaussians:
+    return model.map(lambda values: values.half().float())
+
+
+def _eight_bits(model: Gaussians) -> Gaussians:
+    return model.map(lambda values: (values * 16).round() / 16 * 1.1)
+
+
+def _moved(model: Gaussians) -> Gaussians:
+    return replace(model, log_scales=model.log_scales * 2**-14 + 3.0)
+
+
+@pytest.mark.parametrize("change", [_half_precision, _eight_bits, _moved])
+def test_models_without_random_low_bits_are_refused(change: object, plain: Gaussians) -> None:
+    with pytest.raises(InputError, match=r"low bits.*--sidecar"):
+        embed_derived(change(plain), [(keys(), b"x")])  # type: ignore[operator]
+
+
+def test_values_that_are_not_random_stay_as_they_are() -> None:
+    model = trained_like(1500, seed=8)
+    model.quats[:100] = torch.tensor([1.0, 0, 0, 0])
+    model.sh[100:200, 4:] = 0
+    model.opacity_logits[200:230] = 0.1234567
+    twice = Gaussians.cat([model, model[300:310]])
+    usable = is_random(twice)
+    assert not usable[:230].any()
+    assert not usable[300:310].any()
+    assert not usable[-10:].any()
+    assert usable[310:1500].mean() > 0.99
+    stego = embed_derived(twice, [(keys(), b"x")])
+    assert_same_bits(stego[torch.from_numpy(~usable)], twice[torch.from_numpy(~usable)])
+
+
+def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
+    model = trained_like(1500, seed=9)
+    model = replace(model, means=model.means / 4, log_scales=model.log_scales + 1, sh=model.sh * 2)
+    stego = embed_derived(model, [(keys(), PAYLOAD)])
+    for camera in ring_cameras(4):
+        error = (render(model, camera) - render(stego, camera)).square().mean()
+        assert -10 * torch.log10(error) > 70

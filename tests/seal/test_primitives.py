@@ -1,0 +1,117 @@
+"""The primitives that are called agree with the documents that define them."""
+
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+import reedsolo
+from argon2.low_level import Type, hash_secret_raw
+from argon2.low_level import core as argon2_core
+from argon2.low_level import ffi as argon2_ffi
+from argon2.low_level import lib as argon2_lib
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
+from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
+
+
+def test_argon2id_rfc_9106_section_5_3() -> None:
+    """With the secret and the associated data of the vector, through the library's low-level interface."""
+    buffers = [bytes([value]) * size for value, size in ((1, 32), (2, 16), (3, 8), (4, 12))]
+    password, salt, secret, associated = (argon2_ffi.new("uint8_t[]", data) for data in buffers)
+    out = argon2_ffi.new("uint8_t[]", 32)
+    null = argon2_ffi.NULL
+    context = argon2_ffi.new(
+        "argon2_context *",
+        {
+            "version": 0x13,
+            "out": out,
+            "outlen": 32,
+            "pwd": password,
+            "pwdlen": 32,
+            "salt": salt,
+            "saltlen": 16,
+            "secret": secret,
+            "secretlen": 8,
+            "ad": associated,
+            "adlen": 12,
+            "t_cost": 3,
+            "m_cost": 32,
+            "lanes": 4,
+            "threads": 4,
+            "allocate_cbk": null,
+            "free_cbk": null,
+            "flags": argon2_lib.ARGON2_DEFAULT_FLAGS,
+        },
+    )
+    assert argon2_core(context, Type.ID.value) == argon2_lib.ARGON2_OK
+    expected = "0d640df58d78766c08c037a34a8b53c9d01ef0452d75b65eb52520e96b01e659"
+    assert bytes(argon2_ffi.buffer(out)).hex() == expected
+
+
+def test_argon2id_reference_implementation() -> None:
+    """From the test suite of the reference implementation (phc-winner-argon2, test.c, version 0x13)."""
+    got = hash_secret_raw(b"password", b"somesalt", 2, 65536, 1, 32, Type.ID)
+    assert got.hex() == "09316115d5cf24ed5a15a31a3ba326e5cf32edc24702987c02b6566f61913cf7"
+
+
+def test_hkdf_expand_rfc_5869_case_1() -> None:
+    prk = bytes.fromhex("077709362c2e32df0ddc3f0dc47bba6390b6c73bb50f9c3122ec844ad7c2b3e5")
+    okm = "3cb25f25faacd57a90434f64d0362f2a2d2d0a90cf1a5a4c5db02d56ecc4c5bf34007208d5b887185865"
+    assert HKDFExpand(SHA256(), 42, bytes.fromhex("f0f1f2f3f4f5f6f7f8f9")).derive(prk).hex() == okm
+
+
+def test_chacha20_poly1305_rfc_8439_section_2_8_2() -> None:
+    key, nonce = bytes(range(0x80, 0xA0)), bytes.fromhex("070000004041424344454647")
+    associated = bytes.fromhex("50515253c0c1c2c3c4c5c6c7")
+    text = (
+        b"Ladies and Gentlemen of the class of '99: If I could offer you only one tip for the future, "
+        b"sunscreen would be it."
+    )
+    sealed = ChaCha20Poly1305(key).encrypt(nonce, text, associated)
+    assert sealed[-16:].hex() == "1ae10b594f09e26a7e902ecbd0600691"
+    assert sealed[:16].hex() == "d31a8d34648e60db7b86afbc53ef7ec2"
+    for forged in (sealed[:-1], sealed[:-1] + b"\0", bytes([sealed[0] ^ 1]) + sealed[1:], b""):
+        with pytest.raises((InvalidTag, ValueError)):
+            ChaCha20Poly1305(key).decrypt(nonce, forged, associated)
+    with pytest.raises(InvalidTag):
+        ChaCha20Poly1305(key).decrypt(nonce, sealed, associated + b"\0")
+
+
+def test_chacha20_rfc_8439_section_2_4_2() -> None:
+    cipher = Cipher(ChaCha20(bytes(range(32)), bytes.fromhex("01000000000000000000004a00000000")), mode=None)
+    stream = cipher.encryptor().update(b"Ladies and Gentl")
+    assert stream.hex() == "6e2e359a2568f98041ba0728dd0d6981"
+
+
+def test_key_wrap_rfc_3394_section_4_6() -> None:
+    wrapping, key = bytes(range(32)), bytes.fromhex("00112233445566778899aabbccddeeff") + bytes(range(16))
+    wrapped = bytes.fromhex(
+        "28c9f404c4b810f4cbccb35cfb87f8263f5786e2d80ed326cbc7f0e71a99f43bfb988b9b7a02dd21"
+    )
+    assert aes_key_wrap(wrapping, key) == wrapped
+    assert aes_key_unwrap(wrapping, wrapped) == key
+    with pytest.raises(InvalidUnwrap):
+        aes_key_unwrap(wrapping, wrapped[:-1] + b"\0")
+
+
+def test_blake2b_rfc_7693_appendix_a() -> None:
+    expected = (
+        "ba80a53f981c4d0d6a2797b69f12f6e94c212f14685ac4b74b12bb6fdbffa2d1"
+        "7d87c5392aab792dc252d5de4533cc9518d38aa8dbf1925ab92386edd4009923"
+    )
+    assert hashlib.blake2b(b"abc").hexdigest() == expected
+
+
+def test_keyed_blake2b_of_the_reference_implementation() -> None:
+    """The first of the known answers of blake2b (blake2-kat): the empty message, key 00 to 3f."""
+    got = hashlib.blake2b(b"", key=bytes(range(64))).hexdigest()
+    assert got.startswith("10ebb67700b1868efb4417987acf4690ae9d972fb7a590c2f02871799aaa4786")
+
+
+def test_reedsolo_uses_the_field_that_ours_is_compared_in() -> None:
+    assert bytes(reedsolo.RSCodec(4).encode(b"\1"))[0] == 1

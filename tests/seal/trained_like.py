@@ -1,0 +1,32 @@
+"""Models whose values look as after training, made in milliseconds."""
+
+from __future__ import annotations
+
+import torch
+
+from keyss.core import Gaussians
+from keyss.seal import DerivedKey
+from keyss.seal.plan import SALTS
+
+
+def trained_like(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
+    """Normal numbers of the magnitudes that training gives, every bit of their mantissas random."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int, mean: float = 0.0, spread: float = 1.0) -> torch.Tensor:
+        return (mean + spread * torch.randn(*shape, generator=generator, dtype=torch.float64)).float()
+
+    return Gaussians(
+        means=normal(count, 3, spread=2.0),
+        quats=normal(count, 4),
+        log_scales=normal(count, 3, mean=-4.0),
+        opacity_logits=normal(count, spread=2.0),
+        sh=normal(count, (sh_degree + 1) ** 2, 3, spread=0.1),
+    )
+
+
+def keys(seed: int = 0) -> list[DerivedKey]:
+    """A key under every salt, without Argon2id: its output is replaced by random bytes."""
+    generator = torch.Generator().manual_seed(10_000 + seed)
+    numbers = torch.randint(256, (SALTS, 32), generator=generator, dtype=torch.uint8)
+    return [DerivedKey.of_master(row.numpy().tobytes()) for row in numbers]
