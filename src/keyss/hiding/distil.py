@@ -7,8 +7,6 @@ starts from pictures that are nearly right instead of destroying the plain model
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -24,12 +22,12 @@ BATCH = 4096
 def distil(
     decoder: Decoder,
     gaussians: Gaussians,
-    embeddings: Sequence[Tensor],
-    opacity_logits: Sequence[Tensor],
+    embedding: Tensor,  # [64]
+    opacity_logits: Tensor,  # [N]
     config: HideConfig,
     generator: torch.Generator,
 ) -> None:
-    """Train `decoder` so that the key with embeddings[s] [64] gives opacity_logits[s] [N], others nothing.
+    """Train `decoder` so that the key with `embedding` gives `opacity_logits`, and others change nothing.
 
     All other attributes are held where they are.
     """
@@ -44,8 +42,8 @@ def distil(
         description = decoder.describe(part)
         wrong = random_embeddings(1, generator)[0].to(device)
         loss = _distance(decoder(part, wrong, description), part, part.opacity_logits, decoder)
-        for embedding, logits in zip(embeddings, opacity_logits, strict=True):
-            loss = loss + _distance(decoder(part, embedding, description), part, logits[batch], decoder)
+        right = decoder(part, embedding, description)
+        loss = loss + _distance(right, part, opacity_logits[batch], decoder)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

@@ -65,10 +65,13 @@ class JointRun:
 
         with torch.random.fork_rng():
             torch.manual_seed(config.fit.seed)
-            self.decoder = Decoder(decoder_shape(config)).to(device)
-        self.decoder.standardise(self.gaussians())
+            # One for each secret: who opens one of them holds no network that knows another.
+            self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
+        for decoder in self.decoders:
+            decoder.standardise(self.gaussians())
+        self._all_decoders = torch.nn.ModuleList(self.decoders)
         self.decoder_optimizer = torch.optim.AdamW(
-            self.decoder.parameters(), lr=config.decoder_rate, weight_decay=config.weight_decay
+            self._all_decoders.parameters(), lr=config.decoder_rate, weight_decay=config.weight_decay
         )
 
     def __len__(self) -> int:
@@ -77,8 +80,11 @@ class JointRun:
     def prepare(self) -> None:
         """What a fresh run does before its first step, and a resumed one has behind it."""
         if self.opacity_logits is not None:
-            logits = [logits.to(self.device) for logits in self.opacity_logits]
-            distil(self.decoder, self.gaussians(), self.embeddings, logits, self.config, self.generator)
+            gaussians = self.gaussians()
+            for decoder, embedding, logits in zip(
+                self.decoders, self.embeddings, self.opacity_logits, strict=True
+            ):
+                distil(decoder, gaussians, embedding, logits.to(self.device), self.config, self.generator)
 
     def step(self) -> None:
         config = self.config
@@ -104,18 +110,19 @@ class JointRun:
 
         seen = self._possibly_seen(cover, camera)
         part = cover[seen]
-        description = self.decoder.describe(part)
-        for secret, embedding in enumerate(self.embeddings, start=1):
-            decoded = self.decoder(part, embedding, description)
+        description = self.decoders[0].describe(part)  # the same for all
+        for secret, (decoder, embedding) in enumerate(self._keyed_decoders(), start=1):
+            decoded = decoder(part, embedding, description)
             loss, meta = loss_of(decoded, secret, self.poses.target(secret, owner, index))
             total = total + config.secret_weight * loss
             drawn.append((meta, seen, config.secret_weight))
         if config.incorrect_weight > 0 and self.iteration % config.incorrect_every == 0:
-            # The cover is right already: only the decoder is to learn from wrong keys.
+            # The cover is right already: only the decoders are to learn from wrong keys, in turns.
+            turn = self.iteration // config.incorrect_every % len(self.decoders)
             wrong = random_embeddings(1, self.generator)[0].to(self.device)
-            decoded = self.decoder(part.detach(), wrong, description.detach())
+            decoded = self.decoders[turn](part.detach(), wrong, description.detach())
             loss, _ = loss_of(decoded, 0, cover_target)
-            total = total + config.incorrect_weight * config.incorrect_every * loss
+            total = total + config.incorrect_weight * config.incorrect_every * len(self.decoders) * loss
 
         for meta, _, _ in drawn:
             meta["means2d"].retain_grad()
@@ -128,6 +135,10 @@ class JointRun:
         self.strategy.step_post_backward(
             self.parameters, self.optimizers, self.density, self.iteration, combined
         )
+
+    def _keyed_decoders(self) -> list[tuple[Decoder, Tensor]]:
+        """Each secret's decoder and what its key becomes."""
+        return list(zip(self.decoders, self.embeddings, strict=True))
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
@@ -164,7 +175,9 @@ class JointRun:
         """[N] the largest opacity over the cover and all secrets."""
         gaussians = self.gaussians()
         opacities = [gaussians.opacities]
-        opacities += [self.decoder(gaussians, embedding).opacities for embedding in self.embeddings]
+        opacities += [
+            decoder(gaussians, embedding).opacities for decoder, embedding in self._keyed_decoders()
+        ]
         return torch.stack(opacities).amax(0)
 
     def gaussians(self) -> Gaussians:
@@ -175,15 +188,15 @@ class JointRun:
     def evaluate(self) -> dict[str, float]:
         gaussians = self.gaussians()
         numbers = {"cover": mean_psnr(gaussians, self.watched[0], self.backgrounds[0])}
-        for secret, embedding in enumerate(self.embeddings, start=1):
+        for secret, (decoder, embedding) in enumerate(self._keyed_decoders(), start=1):
             name = "secret" if len(self.embeddings) == 1 else f"secret {secret}"
-            decoded = self.decoder(gaussians, embedding)
+            decoded = decoder(gaussians, embedding)
             numbers[name] = mean_psnr(decoded, self.watched[secret], self.backgrounds[secret])
         return numbers
 
     def state(self) -> tuple[State, dict[str, Any]]:
         tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
-        tensors |= {f"decoder.{name}": value for name, value in self.decoder.state_dict().items()}
+        tensors |= {f"decoders.{name}": value for name, value in self._all_decoders.state_dict().items()}
         for index, moments in self.decoder_optimizer.state_dict()["state"].items():
             tensors |= {f"decoder_adam.{index}.{name}": value for name, value in moments.items()}
         tensors |= {"owners": self.owners.state(), "generator": self.generator.get_state()}
@@ -193,8 +206,8 @@ class JointRun:
     def load(self, tensors: State, meta: dict[str, Any]) -> None:
         unpack_optimizers(tensors, self.parameters, self.optimizers)
         unpack_density(tensors, self.density, self.device)
-        prefix = "decoder."
-        self.decoder.load_state_dict(
+        prefix = "decoders."
+        self._all_decoders.load_state_dict(
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         )
         adam = self.decoder_optimizer.state_dict()

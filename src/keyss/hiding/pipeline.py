@@ -108,15 +108,15 @@ def hide_scenes(
         reporter=reporter,
     )
     stego = run.gaussians().to("cpu")
-    decoder = run.decoder.to("cpu").requires_grad_(False)
+    decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
     anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
     packed = [
         pack_secret(HiddenSecret(decoder, key.embedding(), frame, anchors))
-        for key, frame in zip(derived, frames[1:], strict=True)
+        for decoder, key, frame in zip(decoders, derived, frames[1:], strict=True)
     ]
     sealed = None
     if sidecar:
-        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(decoder))
+        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(decoders))
     else:
         stego = embed(stego, list(zip(keys, packed, strict=True)))
     return Hidden(stego, sealed, tuple(map(unpack_secret, packed)), tuple(models), seconds)
@@ -129,9 +129,11 @@ def _largest_payload(config: HideConfig) -> int:
     return len(pack_secret(HiddenSecret(decoder, embedding, Similarity.identity(), torch.zeros(64, 3))))
 
 
-def _discarded(decoder: Decoder) -> bytes:
-    """32 bytes that only who trained this decoder can know: the digits that are rounded away when packed."""
-    weights = b"".join(value.float().numpy().tobytes() for value in decoder.state_dict().values())
+def _discarded(decoders: Sequence[Decoder]) -> bytes:
+    """32 bytes that only who trained the decoders can know: the digits that are rounded away when packed."""
+    weights = b"".join(
+        value.float().numpy().tobytes() for decoder in decoders for value in decoder.state_dict().values()
+    )
     return hashlib.sha256(b"keyss/v1/discarded" + weights).digest()
 
 

@@ -1,0 +1,54 @@
+"""What somebody finds who holds a decoder without its key: the search for an embedding by gradient.
+
+In the published scheme the key is a vector that enters the decoder's first layers. Whoever has the network
+can look for the vector under which it exchanges most, and needs no key, no cover and no idea of the secret.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.hiding.decoder import Decoder
+from keyss.seal import random_embeddings
+
+
+def search_embeddings(
+    decoder: Decoder,
+    stego: Gaussians,
+    *,
+    restarts: int = 8,
+    steps: int = 150,
+    sample: int = 4000,
+    seed: int = 0,
+) -> Tensor:
+    """[restarts, 64] unit vectors under which the decoder seems to show another scene, the best first.
+
+    Gradient ascent from random starts on the mean change of the opacities of up to `sample` Gaussians, less
+    twice the change of their mean: what makes some visible and as much of others invisible is a scene in
+    place of a scene, while what only adds or only removes is not.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(len(stego), generator=generator)[:sample]
+    part = stego.detach()[chosen.to(stego.device)]
+    description = decoder.describe(part).detach()
+
+    def exchanged(direction: Tensor) -> Tensor:
+        change = decoder(part, F.normalize(direction, dim=0), description).opacities - part.opacities
+        score: Tensor = change.abs().mean() - 2 * change.mean().abs()
+        return score
+
+    found = []
+    for start in random_embeddings(restarts, generator):
+        direction = start.to(stego.device).requires_grad_()
+        optimizer = torch.optim.Adam([direction], lr=0.02)
+        for _ in range(steps):
+            optimizer.zero_grad()
+            (-exchanged(direction)).backward()
+            optimizer.step()
+        with torch.no_grad():
+            found.append((float(exchanged(direction)), F.normalize(direction.detach(), dim=0).cpu()))
+    found.sort(key=lambda pair: -pair[0])
+    return torch.stack([embedding for _, embedding in found])

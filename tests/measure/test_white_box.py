@@ -1,0 +1,48 @@
+"""The attack by gradient opens what is not sealed, and one secret's decoder does not help towards another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from hiding.test_joint import CONFIG, KEYS, _psnr, _scenes
+from keyss.core import Gaussians
+from keyss.hiding.pipeline import Hidden, hide_scenes
+from keyss.hiding.revealing import decode
+from keyss.measure.white_box import search_embeddings
+
+RESTARTS = 4
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    scenes, models = _scenes()
+    config = replace(CONFIG.with_fit(iterations=120), distil_steps=600)
+    return hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
+
+
+def _gain(hidden: Hidden, decoder_of: int, shown: int) -> list[float]:
+    """How many dB better than the cover the embeddings found on one decoder show a secret, best score first."""
+    scenes, _ = _scenes()
+    owner, target = hidden.secrets[decoder_of], hidden.secrets[shown]
+
+    def psnr(model: Gaussians) -> float:
+        return _psnr(target.frame.inverse().apply_gaussians(model), scenes[shown + 1])
+
+    found = search_embeddings(owner.decoder, hidden.stego, restarts=RESTARTS)
+    return [psnr(decode(hidden.stego, owner, embedding)) - psnr(hidden.stego) for embedding in found]
+
+
+@pytest.mark.parametrize("secret", [0, 1])
+def test_whoever_holds_a_decoder_opens_its_secret_without_the_key(hidden: Hidden, secret: int) -> None:
+    """The control: an attack that failed here would show nothing where it fails below.
+
+    The attacker takes what scores best, without knowing the secret.
+    """
+    assert _gain(hidden, secret, secret)[0] > 8
+
+
+@pytest.mark.parametrize(("owner", "other"), [(0, 1), (1, 0)])
+def test_the_decoder_of_one_secret_does_not_show_another(hidden: Hidden, owner: int, other: int) -> None:
+    assert max(_gain(hidden, owner, other)) < 1
