@@ -256,7 +256,8 @@ class TestArguments:
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
         assert config.mask == ("sc", "xyz")
         assert config.start == "points"
-        assert config.distil_steps == HIDE_PRESETS["quick"].distil_steps
+        assert config.decoder == "network"
+        assert config.fit.evaluate_every == HIDE_PRESETS["quick"].fit.evaluate_every
         assert options.pop("reporter") is not None
         assert options == {
             "width": 10,
@@ -274,7 +275,7 @@ class TestArguments:
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
-        assert hidden[0][1]["config"] == HIDE_PRESETS["default"]
+        assert hidden[0][1]["config"] == HIDE_PRESETS["best"]
 
     @pytest.mark.parametrize(
         ("extra", "words"),

@@ -18,7 +18,7 @@ from keyss.fitting.loop import Interrupted
 from keyss.hiding.config import HideConfig
 
 SMALL: dict[str, Any] = {
-    "config": HideConfig(fit=FitConfig(iterations=30, max_gaussians=300), distil_steps=50),
+    "config": HideConfig(fit=FitConfig(iterations=30, max_gaussians=300)),
     "views": 16,
     "width": 32,
     "height": 24,

@@ -20,8 +20,6 @@ from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = HideConfig(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
-    distil_steps=120,
-    hidden=32,
 )
 
 
@@ -154,7 +152,7 @@ def test_a_sidecar_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> 
 def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
     """Without a sidecar the published model carries what the key opens, and looks like any other."""
     fit = replace(CONFIG.fit, iterations=20, max_gaussians=1500, grow_every=10)
-    config = replace(CONFIG, fit=fit, distil_steps=20, hidden=8, branch=4, frequencies=1)
+    config = replace(CONFIG, fit=fit)
     models = [random_gaussians(1500, seed=seed) for seed in (0, 1)]
     secret = Secret(folders[1], "the key", model=models[1])
     out = tmp_path / "run"

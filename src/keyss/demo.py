@@ -29,9 +29,7 @@ from keyss.rendering import Backend
 
 COVER, SECRET = "tea-table", "golden-knot"
 VIEWS, WIDTH, HEIGHT = 48, 160, 120
-CONFIG = HideConfig(
-    fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400), distil_steps=400
-)
+CONFIG = HideConfig(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
 _RESULTS = (

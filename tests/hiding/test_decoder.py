@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 import torch
@@ -14,28 +15,31 @@ from tiny_scenes import random_gaussians
 FIELD_OF = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}
 
 
-def _trained(mask: str = "op,ro,sc,xyz,sh", seed: int = 0) -> Decoder:
-    """A decoder whose last layers are not zero any more."""
-    torch.manual_seed(seed)
-    decoder = Decoder(DecoderShape(mask=parse_mask(mask)))
-    decoder.standardise(random_gaussians())
-    for branch in decoder.branches.values():
-        torch.nn.init.normal_(branch[-1].weight)
-    return decoder.requires_grad_(False)
-
-
 def _embedding(seed: int = 0) -> torch.Tensor:
     return random_embeddings(1, torch.Generator().manual_seed(seed))[0]
+
+
+def _trained(mask: str = "op,ro,sc,xyz,sh", **shape: Any) -> Decoder:
+    """A network whose last layers are not zero any more, for the embedding of seed 0."""
+    torch.manual_seed(0)
+    decoder = Decoder(DecoderShape(mask=parse_mask(mask), kind="network", **shape))
+    decoder.prepare(random_gaussians(), _embedding())
+    assert decoder.network is not None
+    for branch in decoder.network.branches.values():
+        torch.nn.init.normal_(branch[-1].weight)
+    return decoder.requires_grad_(False)
 
 
 def _distance(a: Gaussians, b: Gaussians, name: str) -> float:
     return (getattr(a, name) - getattr(b, name)).abs().max().item()
 
 
-def test_a_new_decoder_changes_nothing_for_any_key() -> None:
+@pytest.mark.parametrize("kind", ["curve", "network"])
+@pytest.mark.parametrize("conditioning", ["gate", "bias"])
+def test_a_new_decoder_changes_nothing_for_any_key(kind: Any, conditioning: Any) -> None:
     gaussians = random_gaussians()
-    decoder = Decoder(DecoderShape(mask=ATTRIBUTES))
-    decoder.standardise(gaussians)
+    decoder = Decoder(DecoderShape(mask=ATTRIBUTES, kind=kind, conditioning=conditioning))
+    decoder.prepare(gaussians, _embedding())
     for seed in range(3):
         decoded = decoder(gaussians, _embedding(seed))
         assert all(_distance(decoded, gaussians, f.name) == 0 for f in fields(Gaussians))
@@ -50,12 +54,51 @@ def test_a_mask_updates_its_attribute_and_no_other(attribute: str) -> None:
         assert changed == (name == attribute), name
 
 
-def test_residuals_have_either_sign() -> None:
+@pytest.mark.parametrize("residuals", ["signed", "one-sided"])
+def test_residuals_have_either_sign_unless_they_are_as_published(residuals: Any) -> None:
     gaussians = random_gaussians()
-    decoded = _trained()(gaussians, _embedding())
-    for field in FIELD_OF.values():
+    decoded = _trained(residuals=residuals)(gaussians, _embedding())
+    for name, field in FIELD_OF.items():
         residual = getattr(decoded, field) - getattr(gaussians, field)
-        assert residual.min() < 0 < residual.max(), field
+        assert residual.max() > 0, field
+        assert (residual.min() < 0) == (residuals == "signed" or name == "op"), field
+
+
+def test_the_curve_goes_through_its_knots_and_on_beyond_them() -> None:
+    gaussians = replace(random_gaussians(8), opacity_logits=torch.tensor([-9.0, -4, -3, -1, 0, 1, 2, 9]))
+    decoder = Decoder(DecoderShape())
+    decoder.prepare(gaussians, _embedding())
+    decoder.set_curve([-5, -3, -1, 0, 1, 2], [2, 0, 4, 4, 5, 4])
+    decoded = decoder(gaussians, _embedding())
+    expected = torch.tensor([-9.0 + 6, -4 + 1, -3, -1 + 4, 4, 1 + 5, 2 + 4, 9 - 3])
+    torch.testing.assert_close(decoded.opacity_logits, expected)
+    assert all(_distance(decoded, gaussians, f) == 0 for f in FIELD_OF.values() if f != "opacity_logits")
+
+
+@pytest.mark.parametrize("kind", ["curve", "network"])
+def test_the_gate_lets_one_key_through_and_no_other(kind: Any) -> None:
+    gaussians, decoder = random_gaussians(), _trained("op") if kind == "network" else None
+    if decoder is None:
+        decoder = Decoder(DecoderShape())
+        decoder.prepare(gaussians, _embedding())
+    decoder.set_curve([-5, -3, -1, 0, 1, 2], [7, 7, 7, 7, 7, 7])
+    own = _embedding()
+    assert _distance(decoder(gaussians, own), gaussians, "opacity_logits") > 5
+    # Half precision of the key is near enough; wrong keys are nowhere near.
+    assert _distance(decoder(gaussians, own.half().float()), decoder(gaussians, own), "opacity_logits") == 0
+    for wrong in random_embeddings(1000, torch.Generator().manual_seed(1)):
+        assert _distance(decoder(gaussians, wrong), gaussians, "opacity_logits") == 0
+
+
+def test_the_published_network_sees_lengths_of_one_over_the_whole_model() -> None:
+    """Opacities are normalised over all Gaussians, everything else of each by itself."""
+    gaussians = random_gaussians()
+    network = _trained(design="published", frequencies=0).network
+    assert network is not None
+    whole = network.describe(gaussians, gaussians)
+    torch.testing.assert_close(whole[:, :3].norm(dim=1), torch.ones(len(gaussians)))
+    torch.testing.assert_close(whole[:, 3].norm(), torch.ones(()))
+    assert torch.equal(network.describe(gaussians[:10], gaussians), whole[:10])
 
 
 def test_every_gaussian_is_decoded_alone() -> None:
@@ -69,7 +112,7 @@ def test_every_gaussian_is_decoded_alone() -> None:
 
 
 def test_keys_and_positions_and_colours_all_reach_the_result() -> None:
-    gaussians, decoder = random_gaussians(), _trained()
+    gaussians, decoder = random_gaussians(), _trained(conditioning="bias")
     decoded = decoder(gaussians, _embedding(0))
     assert _distance(decoded, decoder(gaussians, _embedding(1)), "opacity_logits") > 1e-3
     for field in FIELD_OF.values():
@@ -78,18 +121,6 @@ def test_keys_and_positions_and_colours_all_reach_the_result() -> None:
         changed = decoder(Gaussians(**values), _embedding(0))
         other = "opacity_logits" if field != "opacity_logits" else "log_scales"
         assert _distance(changed, decoded, other) > 1e-4, field
-
-
-def test_a_description_can_be_shared_between_keys() -> None:
-    gaussians, decoder = random_gaussians(), _trained()
-    description = decoder.describe(gaussians)
-    assert description.shape == (len(gaussians), decoder.shape.inputs)
-    for seed in range(2):
-        shared, fresh = (
-            decoder(gaussians, _embedding(seed), description),
-            decoder(gaussians, _embedding(seed)),
-        )
-        assert _distance(shared, fresh, "means") == 0
 
 
 def test_far_positions_stay_within_the_encoding() -> None:
@@ -101,7 +132,8 @@ def test_far_positions_stay_within_the_encoding() -> None:
         gaussians.opacity_logits,
         gaussians.sh,
     )
-    assert decoder._contracted(far.means).norm(dim=1).max() <= 2.0001
+    assert decoder.network is not None
+    assert decoder.network._contracted(far.means).norm(dim=1).max() <= 2.0001
 
 
 def test_masks_are_read_in_any_order_and_refused_by_name() -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,8 +16,8 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, Silent
-from keyss.hiding.config import HideConfig
-from keyss.hiding.joint import combine_densification
+from keyss.hiding.config import PRESETS, HideConfig
+from keyss.hiding.joint import JointRun, combine_densification
 from keyss.hiding.pipeline import Hidden, hide_scenes
 from keyss.hiding.revealing import decode, open_secret, reveal_gaussians
 from keyss.hiding.targets import CombinedPoses, PlacedScene
@@ -26,8 +27,10 @@ from tiny_scenes import random_gaussians, tiny_scene
 
 CONFIG = HideConfig(
     fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0),
-    distil_steps=300,
-    hidden=48,
+)
+# What the paper has, small.
+PAPER = replace(
+    PRESETS["paper"], fit=replace(CONFIG.fit, iterations=60), design="standardised", decoder_rate=3e-3
 )
 KEYS = ("first key", "second key")
 
@@ -116,14 +119,15 @@ def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
 
 
 def test_a_model_too_small_for_its_low_bits_is_refused_before_any_work() -> None:
+    large = replace(CONFIG, decoder="network", hidden=(128, 128))
     with pytest.raises(UsageError, match=r"too small.*--max-gaussians.*--sidecar"):
-        hide_scenes(_scenes()[0], KEYS, CONFIG)
+        hide_scenes(_scenes()[0], KEYS, large)
 
 
 def test_a_model_large_enough_carries_its_secrets() -> None:
     scenes = _scenes()[0]
     fit = replace(CONFIG.fit, iterations=30, max_gaussians=2600, grow_every=10, grow_start=0.1)
-    config = replace(CONFIG, fit=fit, distil_steps=30, hidden=8, branch=4, frequencies=1)
+    config = replace(CONFIG, fit=fit)
     many = [random_gaussians(2600, seed=7), None, None]
     hidden = hide_scenes(scenes, KEYS, config, plains=many)
     assert hidden.sidecar is None
@@ -160,12 +164,10 @@ class _InterruptAt(Silent):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("start", ["warm", "points"])
-def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, start: str) -> None:
+@pytest.mark.parametrize("base", [CONFIG, replace(CONFIG, decoder="network"), PAPER])
+def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, base: HideConfig) -> None:
     scenes = _scenes()[0][:2]
-    config = replace(
-        CONFIG, start=start, distil_steps=20, fit=replace(CONFIG.fit, iterations=40, grow_every=5)
-    )
+    config = replace(base, fit=replace(CONFIG.fit, iterations=40, grow_every=5))
 
     def run(resume: bool, reporter: Silent | None = None) -> Hidden:
         return hide_scenes(
@@ -226,7 +228,43 @@ def test_combined_densification_scatters_and_unweights() -> None:
     assert combined["radii"].tolist() == [[[1, 1], [0, 0], [2, 2]], [[0, 0], [3, 3], [0, 0]]]
 
 
-def test_a_warm_start_without_opacity_in_the_mask_is_refused_and_one_from_points_is_not() -> None:
+def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match="--start points"):
-        HideConfig(mask=("xyz",))
-    assert HideConfig(mask=("xyz",), start="points").mask == ("xyz",)
+        HideConfig(mask=("xyz",), decoder="network")
+    assert HideConfig(mask=("xyz",), start="points", decoder="network").mask == ("xyz",)
+    with pytest.raises(UsageError, match="network"):
+        HideConfig(start="points")
+    with pytest.raises(UsageError, match="network"):
+        HideConfig(mask=("op", "sh"))
+    with pytest.raises(UsageError, match="gate"):
+        HideConfig(conditioning="bias")
+
+
+@pytest.mark.parametrize("preset", ["paper", "released"])
+def test_the_published_presets_train(preset: str) -> None:
+    """Few steps from sparse points: everything they switch on runs, and what comes out is finite."""
+    scenes, models = _scenes()
+    base = PRESETS[preset]
+    config = replace(
+        base, fit=replace(CONFIG.fit, iterations=12, grow_every=4, ssim_weight=base.fit.ssim_weight)
+    )
+    hidden = hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
+    for secret in hidden.secrets:
+        revealed = reveal_gaussians(hidden.stego, secret)
+        assert len(revealed) == len(hidden.stego)
+        assert all(getattr(revealed, f.name).isfinite().all() for f in fields(Gaussians))
+
+
+@pytest.mark.parametrize("which", ["cover", "secret"])
+def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -> None:
+    scenes, models = _scenes()
+    fit = replace(CONFIG.fit, iterations=12, grow_every=4)
+    config = replace(PAPER, fit=fit, points=which, poses=which, densification=which)
+    placed = [
+        PlacedScene.of(scene, model, Similarity.identity())
+        for scene, model in zip(scenes, models, strict=True)
+    ]
+    run = JointRun(placed, list(random_embeddings(2, torch.Generator())), config, torch.device("cpu"))
+    owners = {pose[0] for _ in range(30) for pose in run._draw_poses()}
+    assert owners == ({0} if which == "cover" else {1, 2})
+    run.step()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import struct
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -25,13 +25,13 @@ FRAME = Similarity(2.0, torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2.
 def _secret() -> HiddenSecret:
     torch.manual_seed(0)
     stego = random_gaussians()
-    decoder = Decoder(DecoderShape(hidden=16, branch=8))
-    decoder.standardise(stego)
-    embedding = random_embeddings(1, torch.Generator().manual_seed(0))[0]
-    return HiddenSecret(decoder, embedding, FRAME, choose_anchors(stego, torch.Generator().manual_seed(0)))
+    decoder = Decoder(DecoderShape(mask=("op", "ro", "sc", "xyz"), kind="network", hidden=(16, 16), branch=8))
+    decoder.prepare(stego, random_embeddings(1, torch.Generator().manual_seed(0))[0])
+    return HiddenSecret(decoder, FRAME, choose_anchors(stego, torch.Generator().manual_seed(0)))
 
 
 PACKED = pack_secret(_secret())
+SHAPE = asdict(_secret().decoder.shape) | {"mask": "op,ro,sc,xyz"}
 
 
 def _with_header(**changes: object) -> bytes:
@@ -60,8 +60,8 @@ def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
 
 
 def test_another_version_is_refused_by_number() -> None:
-    with pytest.raises(InputError, match=r"version 2.*version 1"):
-        unpack_secret(_with_header(version=2))
+    with pytest.raises(InputError, match=r"version 1.*version 2"):
+        unpack_secret(_with_header(version=1))
 
 
 @pytest.mark.parametrize(
@@ -69,8 +69,13 @@ def test_another_version_is_refused_by_number() -> None:
     [
         {"format": "other"},
         {"shape": None},
-        {"shape": {"mask": "op", "hidden": 10**9, "branch": 8, "frequencies": 6, "sh_degree": 3}},
-        {"shape": {"mask": "op", "hidden": 16, "branch": 8, "frequencies": 6, "sh_degree": 3}},
+        {"shape": {"mask": "op"}},
+        {"shape": SHAPE | {"hidden": [10**9, 16]}},
+        {"shape": SHAPE | {"hidden": [16]}},
+        {"shape": SHAPE | {"branch": 8.0}},
+        {"shape": SHAPE | {"kind": "eval"}},
+        {"shape": SHAPE | {"mask": "op"}},  # fewer branches than there are weights for
+        {"shape": SHAPE | {"extra": 1}},
         {"frame": {"scale": -1}},
         {"frame": 3},
     ],
@@ -99,8 +104,16 @@ def test_any_bytes_are_input_errors(data: bytes) -> None:
 
 def test_weights_that_are_not_finite_are_refused() -> None:
     secret = _secret()
-    secret.decoder.first.bias.data[0] = float("nan")
+    assert secret.decoder.network is not None
+    secret.decoder.network.first.bias.data[0] = float("nan")
     with pytest.raises(InputError, match="finite"):
+        unpack_secret(pack_secret(secret))
+
+
+def test_a_curve_that_goes_back_is_refused() -> None:
+    secret = _secret()
+    secret.decoder.knots[2] = secret.decoder.knots[1]
+    with pytest.raises(InputError, match="ascending"):
         unpack_secret(pack_secret(secret))
 
 

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.hiding.config import HideConfig
+from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.start import _shares, make_start
 from keyss.hiding.targets import PlacedScene
 from tiny_scenes import random_gaussians, tiny_scene
@@ -37,19 +41,51 @@ def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
     config = HideConfig(fit=FitConfig(max_gaussians=330))
     start = make_start(_placed(3), config, torch.Generator())
     assert len(start.gaussians) == 330
-    assert start.opacity_logits is not None
-    first, second = (logits.sigmoid() for logits in start.opacity_logits)
+    assert start.curves is not None
+    decoded = []
+    for curve in start.curves:
+        decoder = Decoder(DecoderShape())
+        decoder.set_curve(*curve)
+        decoded.append(decoder(start.gaussians, decoder.key.fill_(1)).opacities)
+    first, second = decoded
     shown = start.gaussians.opacities > 1 / 255
     # Every Gaussian is visible in one scene at most, and the secrets' are not drawn in the cover.
     assert int(shown.sum()) < 330 / 2
-    assert not (shown & (first > 0.01)).any()
-    assert not ((first > 0.01) & (second > 0.01)).any()
+    assert not (shown & (first > 1 / 255)).any()
+    assert not ((first > 1 / 255) & (second > 1 / 255)).any()
     assert float(first.max()) > 0.5
     assert float(second.max()) > 0.5
 
 
+def test_the_key_brings_back_the_opacities_that_a_warm_start_hides() -> None:
+    config = HideConfig(fit=FitConfig(max_gaussians=10_000))
+    placed = _placed(3)
+    start = make_start(placed, config, torch.Generator())
+    assert start.curves is not None
+    for secret, curve in enumerate(start.curves, start=1):
+        decoder = Decoder(DecoderShape())
+        decoder.set_curve(*curve)
+        revealed = decoder(start.gaussians, decoder.key.fill_(1))
+        own = slice(200 * secret, 200 * (secret + 1))  # nothing had to be left out
+        torch.testing.assert_close(
+            revealed.opacity_logits[own], placed[secret].plain.opacity_logits, atol=1e-4, rtol=0
+        )
+
+
+def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
+    """Behind a wall, out of every view, transparent."""
+    placed = _placed(1)[0]
+    wall = replace(placed.plain, opacity_logits=torch.full((200,), 5.0))
+    useless = replace(wall, means=wall.means + 1000)
+    faint = replace(wall, opacity_logits=torch.full((200,), -9.0))
+    both = PlacedScene.of(placed.scene, Gaussians.cat([useless, wall, faint]), Similarity.identity())
+    start = make_start([both], HideConfig(fit=FitConfig(max_gaussians=150)), torch.Generator())
+    assert (start.gaussians.means.abs() < 100).all()
+    assert (start.gaussians.opacity_logits == 5).all()
+
+
 def test_start_from_points_divides_the_cap_between_the_scenes() -> None:
-    config = HideConfig(fit=FitConfig(max_gaussians=100), start="points")
+    config = HideConfig(fit=FitConfig(max_gaussians=100), start="points", decoder="network")
     start = make_start(_placed(2), config, torch.Generator().manual_seed(0))
     assert len(start.gaussians) == 100
-    assert start.opacity_logits is None
+    assert start.curves is None

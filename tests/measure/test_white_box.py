@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from torch import Tensor
 
-from hiding.test_joint import CONFIG, KEYS, _psnr, _scenes
+from hiding.test_joint import KEYS, PAPER, _psnr, _scenes
 from keyss.core import Gaussians
 from keyss.hiding.pipeline import Hidden, hide_scenes
 from keyss.hiding.revealing import decode
@@ -19,7 +17,7 @@ RESTARTS = 4
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     scenes, models = _scenes()
-    config = replace(CONFIG.with_fit(iterations=120), distil_steps=600)
+    config = PAPER.with_fit(iterations=600)
     return hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
 
 

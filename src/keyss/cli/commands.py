@@ -125,18 +125,25 @@ def hide(
     ],
     key_file: KeyFiles = (),
     out: OutFolder,
-    preset: Annotated[Literal["quick", "default"], arg(help="Size and length of the run.")] = "default",
+    preset: Annotated[
+        Literal["best", "quick", "paper", "released"],
+        arg(help="Size and kind of the run; paper and released: the publication, for comparison."),
+    ] = "best",
     iterations: Iterations = None,
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
     mask: Annotated[
         str | None,
-        optional("op,ro,sc,xyz,sh", "Attributes that the decoder changes, some of these.", "op,ro,sc,xyz"),
+        optional(
+            "op,ro,sc,xyz,sh",
+            "Attributes that the decoder changes, some of these; more than op take a network.",
+            "the preset's",
+        ),
     ] = None,
     start: Annotated[
         Literal["warm", "points"] | None,
-        optional("{warm,points}", "Start from plain models, or from sparse points (the paper).", "warm"),
+        optional("{warm,points}", "Start from plain models, or from sparse points.", "the preset's"),
     ] = None,
     cover_model: Annotated[
         Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
@@ -174,12 +181,8 @@ def hide(
             f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
         )
     config = PRESETS[preset]
-    config = replace(
-        config,
-        fit=_schedule(config.fit, iterations, max_gaussians, seed),
-        mask=config.mask if mask is None else parse_mask(mask),
-        start=start or config.start,
-    )
+    config = config.adapted(None if mask is None else parse_mask(mask), start)
+    config = replace(config, fit=_schedule(config.fit, iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     chosen = keys(key_file, len(secret), confirm=True)
     warn_of_weak_keys(chosen)

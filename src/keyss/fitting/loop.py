@@ -31,9 +31,6 @@ class Run(Protocol):
     iterations: int
     iteration: int  # steps done
 
-    def prepare(self) -> None:
-        """What a fresh run does before its first step, and a resumed one has behind it."""
-
     def step(self) -> None:
         """One optimisation step; increases `iteration`."""
 
@@ -109,8 +106,6 @@ def train(
                 spent = float(meta["seconds"])
             except KeyError as error:
                 raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
-        else:
-            run.prepare()
         started = saved = time.monotonic()
         numbers: dict[str, float] = {}
         reporter.start(title, run.iterations, run.iteration)

@@ -60,9 +60,6 @@ class PlainRun:
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
-    def prepare(self) -> None:
-        """Nothing is to be done before the first step."""
-
     def step(self) -> None:
         config = self.config
         view = self.views[self.shuffle.draw()]

@@ -1,17 +1,21 @@
-"""The key-conditioned decoder: turns the cover's Gaussians into a secret's, one Gaussian at a time.
+"""The decoder: turns the cover's Gaussians into a secret's, one Gaussian at a time, for one key.
 
-KeySS, section 3.2 and appendix: a common branch over all attributes of a Gaussian and the key, then a
-branch of two layers per updated attribute whose output is added to the raw attribute. Corrections to
-the published code: residuals are plain sums of either sign; every input comes from the one Gaussian
-alone, standardised with constants that are fixed at the start and kept with the weights, so that
+KeySS, section 3.2 and appendix: attribute* = attribute + residual, on raw attributes. There are two sources
+of residuals. The *curve* looks at a Gaussian's opacity alone: it knows the band of opacities, too small to be
+drawn, in which a secret's Gaussians lie (`keyss.hiding.start`). The *network* is the paper's: a common branch
+over all attributes of a Gaussian, then a branch of two layers per updated attribute.
+
+Corrections to the published code: residuals are plain sums of either sign; every input comes from the one
+Gaussian alone, standardised with constants that are fixed at the start and kept with the weights, so that
 pruning or re-ordering the model changes nothing for the Gaussians that stay.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -26,20 +30,29 @@ CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
 # logarithms of scale, scene extents, SH coefficients.
 RESIDUAL_UNITS = {"op": 5.0, "ro": 1.0, "sc": 1.0, "xyz": 0.1, "sh": 0.5}
 KEY_GAIN = 3.0  # lets a unit vector move the first layer as much as the attributes do
+# Cosines between an embedding and the decoder's own: the gate is shut below the first, open above the second.
+# Two random unit vectors of 64 numbers come that near once in 10^10 times.
+GATE_SHUT, GATE_OPEN = 0.7, 0.9
+KNOTS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
 class DecoderShape:
-    """Sizes of a decoder."""
+    """Kind and sizes of a decoder."""
 
-    mask: Mask = ("op", "ro", "sc", "xyz")
-    hidden: int = 128  # width of the two layers of the common branch
+    mask: Mask = ("op",)
+    kind: Literal["curve", "network"] = "curve"  # a network adds to the curve
+    conditioning: Literal["gate", "bias"] = "gate"  # how the key enters; bias: the paper's
+    # What follows is for networks.
+    hidden: tuple[int, int] = (64, 64)  # widths of the two layers of the common branch
     branch: int = 32  # width of each attribute's branch
     frequencies: int = 6  # octaves of sines and cosines of the position
     sh_degree: int = 3
+    design: Literal["standardised", "published"] = "standardised"  # published: see `Network`
+    residuals: Literal["signed", "one-sided"] = "signed"  # one-sided: ReLU on all but the opacity's
 
     @property
-    def inputs(self) -> int:
+    def inputs_size(self) -> int:
         """Numbers that describe one Gaussian: 11 + 3 K attributes and 6 per octave."""
         return 11 + 3 * (self.sh_degree + 1) ** 2 + 6 * self.frequencies
 
@@ -53,6 +66,72 @@ class Decoder(nn.Module):
     A new decoder changes nothing, whatever the key.
     """
 
+    key: Tensor  # [64] the embedding that it belongs to
+    knots: Tensor  # [KNOTS] opacity logits, ascending: where the curve's pieces meet
+    values: Tensor  # [KNOTS] its residuals there
+
+    def __init__(self, shape: DecoderShape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.register_buffer("key", torch.zeros(EMBEDDING_SIZE))
+        self.register_buffer("knots", torch.linspace(-40, 40, KNOTS))
+        self.register_buffer("values", torch.zeros(KNOTS))
+        self.network = Network(shape) if shape.kind == "network" else None
+
+    @torch.no_grad()
+    def prepare(self, gaussians: Gaussians, embedding: Tensor) -> None:
+        """Fix the key and the constants of the inputs, from the model that training starts with."""
+        self.key.copy_(embedding)
+        if self.network is not None:
+            self.network.prepare(gaussians)
+
+    def set_curve(self, knots: Sequence[float], values: Sequence[float]) -> None:
+        """Let the curve go through these points, KNOTS of them; outside it goes on as it ends."""
+        self.knots.copy_(torch.tensor(knots))
+        self.values.copy_(torch.tensor(values))
+
+    def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
+        """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
+        gate = self._gate(embedding)
+        if gate == 0:
+            return gaussians
+        residuals: dict[str, Tensor] = {}
+        extent = gaussians.means.new_ones(())
+        if self.network is not None:
+            extent = self.network.extent
+            residuals = self.network(gaussians, embedding, whole or gaussians)
+        if "op" in self.shape.mask:
+            curve = self._curve(gaussians.opacity_logits)[:, None]
+            residuals["op"] = curve + residuals["op"] if "op" in residuals else curve
+        if gate < 1:
+            residuals = {name: gate * residual for name, residual in residuals.items()}
+        return add_residuals(gaussians, residuals, extent)
+
+    def _curve(self, logits: Tensor) -> Tensor:
+        right = torch.searchsorted(self.knots, logits.detach()).clamp(1, KNOTS - 1)
+        start, end = self.knots[right - 1], self.knots[right]
+        return torch.lerp(self.values[right - 1], self.values[right], (logits - start) / (end - start))
+
+    def _gate(self, embedding: Tensor) -> float:
+        """1 for the decoder's own key, 0 for every other, whatever the weights are.
+
+        This keeps honest mistakes from showing anything, at no cost. It protects nothing by itself: who holds
+        the decoder holds `key`. What protects is that the decoder is sealed. A decoder conditioned by a bias
+        has learned the difference instead, which the white-box attack (`keyss.measure`) undoes.
+        """
+        if self.shape.conditioning == "bias":
+            return 1.0
+        cosine = float(F.cosine_similarity(embedding, self.key, dim=0))
+        return min(1.0, max(0.0, (cosine - GATE_SHUT) / (GATE_OPEN - GATE_SHUT)))
+
+
+class Network(nn.Module):
+    """Residuals of the attributes in the mask, from all attributes of a Gaussian (KeySS, eq. 8 and 9).
+
+    The "published" design is the authors': inputs scaled to length 1, residuals without units that are not
+    zero at first. Ours changes nothing at first and sees standardised inputs and where a Gaussian is.
+    """
+
     center: Tensor  # [3] world position that the encoding is centred on
     extent: Tensor  # [] world units of one step of position
     offset: Tensor  # [11 + 3 K] mean of the attributes at the start
@@ -61,25 +140,30 @@ class Decoder(nn.Module):
     def __init__(self, shape: DecoderShape) -> None:
         super().__init__()
         self.shape = shape
-        attributes = shape.inputs - 6 * shape.frequencies
+        attributes = shape.inputs_size - 6 * shape.frequencies
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("extent", torch.ones(()))
         self.register_buffer("offset", torch.zeros(attributes))
         self.register_buffer("spread", torch.ones(attributes))
-        self.first = nn.Linear(shape.inputs, shape.hidden)
-        self.second = nn.Linear(shape.hidden, shape.hidden)
-        self.first_key = nn.Linear(EMBEDDING_SIZE, shape.hidden, bias=False)
-        self.second_key = nn.Linear(EMBEDDING_SIZE, shape.hidden, bias=False)
+        self.first = nn.Linear(shape.inputs_size, shape.hidden[0])
+        self.second = nn.Linear(*shape.hidden)
+        if shape.conditioning == "bias":
+            self.first_key = nn.Linear(EMBEDDING_SIZE, shape.hidden[0], bias=False)
         self.branches = nn.ModuleDict()
         for attribute in shape.mask:
             last = nn.Linear(shape.branch, shape.channels(attribute))
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
-            self.branches[attribute] = nn.Sequential(nn.Linear(shape.hidden, shape.branch), nn.ReLU(), last)
+            if shape.design == "standardised":
+                nn.init.zeros_(last.weight)
+                nn.init.zeros_(last.bias)
+            self.branches[attribute] = nn.Sequential(
+                nn.Linear(shape.hidden[1], shape.branch), nn.ReLU(), last
+            )
 
     @torch.no_grad()
-    def standardise(self, gaussians: Gaussians) -> None:
-        """Fix the constants of the inputs from the model that training starts with."""
+    def prepare(self, gaussians: Gaussians) -> None:
+        """Fix the constants of the inputs."""
+        if self.shape.design == "published":
+            return
         self.center.copy_(gaussians.means.median(0).values)
         distance = (gaussians.means - self.center).norm(dim=1).median()
         self.extent.copy_(distance.clamp_min(1e-6))
@@ -87,6 +171,30 @@ class Decoder(nn.Module):
         self.offset.copy_(attributes.mean(0))
         # SH of a fresh model are zeros: a floor keeps them from being blown up later.
         self.spread.copy_(attributes.std(0, correction=0).clamp_min(0.1))
+
+    def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians) -> dict[str, Tensor]:
+        published = self.shape.design == "published"
+        hidden = self.first(self.describe(gaussians, whole))
+        if self.shape.conditioning == "bias":
+            hidden = hidden + (1 if published else KEY_GAIN) * self.first_key(embedding)
+        hidden = F.relu(self.second(F.relu(hidden)))
+        residuals = {}
+        for name, branch in self.branches.items():
+            residual = branch(hidden) * (1 if published else RESIDUAL_UNITS[name])
+            one_sided = self.shape.residuals == "one-sided" and name != "op"
+            residuals[name] = F.relu(residual) if one_sided else residual
+        return residuals
+
+    def describe(self, gaussians: Gaussians, whole: Gaussians) -> Tensor:
+        """[N, inputs] what the network sees of each Gaussian."""
+        if self.shape.design == "published":
+            return _normalised(gaussians, whole)
+        attributes = self._attributes(gaussians)
+        position = attributes[:, :3]
+        octaves = 2.0 ** torch.arange(self.shape.frequencies, device=position.device) * (math.pi / 2)
+        angles = (position[:, :, None] * octaves).flatten(1)
+        standardised = (attributes - self.offset) / self.spread
+        return torch.cat([standardised, angles.sin(), angles.cos()], dim=1)
 
     def _attributes(self, gaussians: Gaussians) -> Tensor:
         position = self._contracted(gaussians.means)
@@ -101,25 +209,22 @@ class Decoder(nn.Module):
         distance = position.norm(dim=1, keepdim=True).clamp_min(1e-9)
         return torch.where(distance <= 1, position, (2 - 1 / distance) * position / distance)
 
-    def describe(self, gaussians: Gaussians) -> Tensor:
-        """[N, inputs] what the decoder sees of each Gaussian; the same for every key."""
-        attributes = self._attributes(gaussians)
-        position = attributes[:, :3]
-        octaves = 2.0 ** torch.arange(self.shape.frequencies, device=position.device) * (math.pi / 2)
-        angles = (position[:, :, None] * octaves).flatten(1)
-        standardised = (attributes - self.offset) / self.spread
-        return torch.cat([standardised, angles.sin(), angles.cos()], dim=1)
 
-    def forward(
-        self, gaussians: Gaussians, embedding: Tensor, description: Tensor | None = None
-    ) -> Gaussians:
-        """Decode with the embedding [64]; `description` saves computing `describe(gaussians)` again."""
-        if description is None:
-            description = self.describe(gaussians)
-        hidden = F.relu(self.first(description) + KEY_GAIN * self.first_key(embedding))
-        hidden = F.relu(self.second(hidden) + KEY_GAIN * self.second_key(embedding))
-        residuals = {name: self.branches[name](hidden) * RESIDUAL_UNITS[name] for name in self.shape.mask}
-        return add_residuals(gaussians, residuals, self.extent)
+def _normalised(gaussians: Gaussians, whole: Gaussians) -> Tensor:
+    """[N, 11 + 3 K] attributes scaled to length 1, as the authors' code has them (KeySS, appendix).
+
+    The opacities are one vector over the whole model; of every other attribute each Gaussian's is one.
+    """
+    return torch.cat(
+        [
+            F.normalize(gaussians.means, dim=1),
+            (gaussians.opacity_logits / whole.opacity_logits.norm())[:, None],
+            F.normalize(gaussians.quats, dim=1),
+            F.normalize(gaussians.log_scales, dim=1),
+            F.normalize(gaussians.sh.flatten(1), dim=1),
+        ],
+        dim=1,
+    )
 
 
 def add_residuals(gaussians: Gaussians, residuals: Mapping[str, Tensor], extent: Tensor) -> Gaussians:

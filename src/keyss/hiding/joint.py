@@ -9,20 +9,21 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.density import CappedStrategy
 from keyss.fitting.image_metrics import mean_psnr, thin
-from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
-from keyss.hiding.config import HideConfig
+from keyss.hiding.config import HideConfig, chosen_scenes
 from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.distil import distil
 from keyss.hiding.start import make_start
 from keyss.hiding.targets import CombinedPoses, PlacedScene
+from keyss.hiding.visibility import contributions, possibly_seen
 from keyss.rendering import render_with_meta
 from keyss.seal.keys import random_embeddings
+
+MERIT_VIEWS = 12
 
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
@@ -48,93 +49,102 @@ class JointRun:
         self.poses = CombinedPoses(scenes, device)
         self.watched = [thin(placed.scene.test, 8) for placed in scenes]
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
-        self.owners = Shuffle(len(scenes), self.generator)
+        self.owners = chosen_scenes(config.poses, len(scenes))
+        self.owner_order = Shuffle(len(self.owners), self.generator)
         self.shuffles = [Shuffle(len(placed.scene.train), self.generator) for placed in scenes]
         self.extent = scenes[0].scene.extent
 
         start = make_start(scenes, config, self.generator)
-        self.opacity_logits = start.opacity_logits
+        self.warm = start.curves is not None
         self.parameters = to_parameters(start.gaussians, device)
-        rate = config.warm_rate if start.opacity_logits is not None else 1.0
+        rate = config.warm_rate if self.warm else 1.0
         self.optimizers = make_optimizers(self.parameters, config.fit, self.extent)
         for optimizer in self.optimizers.values():
             optimizer.param_groups[0]["lr"] *= rate
         self.means_rate = self.optimizers["means"].param_groups[0]["lr"]
-        self.strategy = CappedStrategy(config.fit, self._largest_opacity)
+        self.strategy = CappedStrategy(
+            config.fit,
+            self._largest_opacity if config.prune_by == "all" else None,
+            merit=self._merit if config.at_cap == "merit" else None,
+            turnover=config.turnover,
+            freeze=config.at_cap == "freeze",
+        )
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
 
         with torch.random.fork_rng():
             torch.manual_seed(config.fit.seed)
             # One for each secret: who opens one of them holds no network that knows another.
             self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
-        for decoder in self.decoders:
-            decoder.standardise(self.gaussians())
+        for decoder, embedding in self._keyed_decoders():
+            decoder.prepare(self.gaussians(), embedding)
+        for decoder, curve in zip(self.decoders, start.curves or (), strict=False):
+            decoder.set_curve(*curve)
         self._all_decoders = torch.nn.ModuleList(self.decoders)
-        self.decoder_optimizer = torch.optim.AdamW(
-            self._all_decoders.parameters(), lr=config.decoder_rate, weight_decay=config.weight_decay
+        weights = list(self._all_decoders.parameters())  # none for curves
+        self.decoder_optimizer = (
+            torch.optim.AdamW(weights, lr=config.decoder_rate, weight_decay=config.weight_decay)
+            if weights
+            else None
         )
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
-    def prepare(self) -> None:
-        """What a fresh run does before its first step, and a resumed one has behind it."""
-        if self.opacity_logits is not None:
-            gaussians = self.gaussians()
-            for decoder, embedding, logits in zip(
-                self.decoders, self.embeddings, self.opacity_logits, strict=True
-            ):
-                distil(decoder, gaussians, embedding, logits.to(self.device), self.config, self.generator)
-
     def step(self) -> None:
         config = self.config
-        owner = self.owners.draw()
-        index = self.shuffles[owner].draw()
-        camera = self.poses.camera(owner, index)
         self.iteration += 1
-        degree = (
-            config.fit.sh_degree
-            if self.opacity_logits is not None
-            else config.fit.sh_degree_at(self.iteration)
-        )
+        degree = config.fit.sh_degree if self.warm else config.fit.sh_degree_at(self.iteration)
+        poses = self._draw_poses()
 
-        def loss_of(drawn: Gaussians, scene: int, target: Target) -> tuple[Tensor, dict[str, Any]]:
-            image, meta = render_with_meta(drawn, camera, self.backgrounds[scene], sh_degree=degree)
+        def loss_of(drawn: Gaussians, scene: int) -> tuple[Tensor, dict[str, Any]]:
+            background, target = self.backgrounds[scene], self.poses.target(scene, *poses[scene])
+            image, meta = render_with_meta(
+                drawn, self.poses.camera(*poses[scene]), background, sh_degree=degree
+            )
             return photometric_loss(image, target, config.fit.ssim_weight), meta
 
         cover = to_gaussians(self.parameters)
-        cover_target = self.poses.target(0, owner, index)
-        cover_loss, meta = loss_of(cover, 0, cover_target)
+        cover_loss, meta = loss_of(cover, 0)
         total = config.cover_weight * cover_loss
         drawn: list[Drawn] = [(meta, None, config.cover_weight)]
-
-        seen = self._possibly_seen(cover, camera)
-        part = cover[seen]
-        description = self.decoders[0].describe(part)  # the same for all
-        for secret, (decoder, embedding) in enumerate(self._keyed_decoders(), start=1):
-            decoded = decoder(part, embedding, description)
-            loss, meta = loss_of(decoded, secret, self.poses.target(secret, owner, index))
+        for scene, (decoder, embedding) in enumerate(self._keyed_decoders(), start=1):
+            seen = possibly_seen(cover, self.poses.camera(*poses[scene]), 0.02 * self.extent)
+            loss, meta = loss_of(decoder(cover[seen], embedding, cover), scene)
             total = total + config.secret_weight * loss
             drawn.append((meta, seen, config.secret_weight))
-        if config.incorrect_weight > 0 and self.iteration % config.incorrect_every == 0:
-            # The cover is right already: only the decoders are to learn from wrong keys, in turns.
-            turn = self.iteration // config.incorrect_every % len(self.decoders)
-            wrong = random_embeddings(1, self.generator)[0].to(self.device)
-            decoded = self.decoders[turn](part.detach(), wrong, description.detach())
-            loss, _ = loss_of(decoded, 0, cover_target)
-            total = total + config.incorrect_weight * config.incorrect_every * len(self.decoders) * loss
+        if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
+            total = total + self._incorrect_loss(cover.detach(), poses[0], loss_of)
 
         for meta, _, _ in drawn:
             meta["means2d"].retain_grad()
         total.backward()
         self._set_rates()
         for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        combined = combine_densification(drawn, len(self))
+            if optimizer is not None:
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+        asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
+        combined = combine_densification(asking, len(self))
         self.strategy.step_post_backward(
             self.parameters, self.optimizers, self.density, self.iteration, combined
         )
+
+    def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], loss_of: Any) -> Tensor:
+        """The cover is right already: only the decoders are to learn from wrong keys, in turns."""
+        config = self.config
+        decoder = self.decoders[self.iteration // config.incorrect_every % len(self.decoders)]
+        wrong = random_embeddings(1, self.generator)[0].to(self.device)
+        part = cover[possibly_seen(cover, self.poses.camera(*pose), 0.02 * self.extent)]
+        loss: Tensor = loss_of(decoder(part, wrong, cover), 0)[0]
+        return config.incorrect_weight * config.incorrect_every * len(self.decoders) * loss
+
+    def _draw_poses(self) -> list[tuple[int, int]]:
+        """For each scene whose training pose it is drawn from, and which one."""
+        count = len(self.scenes)
+        if float(torch.rand((), generator=self.generator)) < self.config.common_poses:
+            owner = self.owners[self.owner_order.draw()]
+            return [(owner, self.shuffles[owner].draw())] * count
+        return [(scene, self.shuffles[scene].draw()) for scene in range(count)]
 
     def _keyed_decoders(self) -> list[tuple[Decoder, Tensor]]:
         """Each secret's decoder and what its key becomes."""
@@ -143,42 +153,33 @@ class JointRun:
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
         self.optimizers["means"].param_groups[0]["lr"] = self.means_rate * 0.01**progress
-        warm_up = min(1.0, self.iteration / 100)
-        self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress
-
-    @torch.no_grad()
-    def _possibly_seen(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """Indices of the Gaussians that may touch the view once decoded: only they are worth decoding.
-
-        A Gaussian is left out when a ball of 3 standard deviations around it, widened by what the decoder
-        moves things by, lies outside the frustum (widened by a tenth).
-        """
-        viewmat, intrinsics = camera.viewmat.to(self.device), camera.K.to(self.device)
-        x, y, z = (gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
-        radius = 3 * gaussians.scales.amax(1) + 0.02 * self.extent
-        depth = z + radius
-        half_width = max(float(intrinsics[0, 2]), camera.width - float(intrinsics[0, 2])) / float(
-            intrinsics[0, 0]
-        )
-        half_height = max(float(intrinsics[1, 2]), camera.height - float(intrinsics[1, 2])) / float(
-            intrinsics[1, 1]
-        )
-        seen = (
-            (depth > 0.01)
-            & (x.abs() - radius < 1.1 * half_width * depth)
-            & (y.abs() - radius < 1.1 * half_height * depth)
-        )
-        return seen.nonzero()[:, 0]
+        if self.decoder_optimizer is not None:
+            warm_up = min(1.0, self.iteration / 100)
+            self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress
 
     @torch.no_grad()
     def _largest_opacity(self) -> Tensor:
         """[N] the largest opacity over the cover and all secrets."""
         gaussians = self.gaussians()
         opacities = [gaussians.opacities]
-        opacities += [
-            decoder(gaussians, embedding).opacities for decoder, embedding in self._keyed_decoders()
-        ]
+        opacities += [self._decoded(secret, gaussians).opacities for secret in range(len(self.decoders))]
         return torch.stack(opacities).amax(0)
+
+    def _merit(self) -> Tensor:
+        """[N] the most that each Gaussian adds to any scene: its share of what some random views show."""
+        gaussians, shares = self.gaussians(), []
+        for scene, placed in enumerate(self.scenes):
+            drawn = torch.randint(len(placed.scene.train), (MERIT_VIEWS,), generator=self.generator)
+            cameras = [placed.scene.train[index].camera for index in drawn.tolist()]
+            with torch.no_grad():
+                shown = gaussians if scene == 0 else self._decoded(scene - 1, gaussians)
+            added = contributions(shown, cameras)
+            shares.append(added / added.sum().clamp_min(1e-12))
+        return torch.stack(shares).amax(0)
+
+    def _decoded(self, secret: int, gaussians: Gaussians) -> Gaussians:
+        decoded: Gaussians = self.decoders[secret](gaussians, self.embeddings[secret])
+        return decoded
 
     def gaussians(self) -> Gaussians:
         """The model as it would be published."""
@@ -188,18 +189,19 @@ class JointRun:
     def evaluate(self) -> dict[str, float]:
         gaussians = self.gaussians()
         numbers = {"cover": mean_psnr(gaussians, self.watched[0], self.backgrounds[0])}
-        for secret, (decoder, embedding) in enumerate(self._keyed_decoders(), start=1):
+        for secret in range(1, len(self.scenes)):
             name = "secret" if len(self.embeddings) == 1 else f"secret {secret}"
-            decoded = decoder(gaussians, embedding)
+            decoded = self._decoded(secret - 1, gaussians)
             numbers[name] = mean_psnr(decoded, self.watched[secret], self.backgrounds[secret])
         return numbers
 
     def state(self) -> tuple[State, dict[str, Any]]:
         tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
         tensors |= {f"decoders.{name}": value for name, value in self._all_decoders.state_dict().items()}
-        for index, moments in self.decoder_optimizer.state_dict()["state"].items():
+        adam = self.decoder_optimizer.state_dict()["state"] if self.decoder_optimizer is not None else {}
+        for index, moments in adam.items():
             tensors |= {f"decoder_adam.{index}.{name}": value for name, value in moments.items()}
-        tensors |= {"owners": self.owners.state(), "generator": self.generator.get_state()}
+        tensors |= {"owners": self.owner_order.state(), "generator": self.generator.get_state()}
         tensors |= {f"order.{i}": shuffle.state() for i, shuffle in enumerate(self.shuffles)}
         return tensors, {"iteration": self.iteration}
 
@@ -210,13 +212,14 @@ class JointRun:
         self._all_decoders.load_state_dict(
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         )
-        adam = self.decoder_optimizer.state_dict()
-        for name, value in tensors.items():
-            if name.startswith("decoder_adam."):
-                _, index, key = name.split(".")
-                adam["state"].setdefault(int(index), {})[key] = value
-        self.decoder_optimizer.load_state_dict(adam)
-        self.owners.load(tensors["owners"])
+        if self.decoder_optimizer is not None:
+            adam = self.decoder_optimizer.state_dict()
+            for name, value in tensors.items():
+                if name.startswith("decoder_adam."):
+                    _, index, key = name.split(".")
+                    adam["state"].setdefault(int(index), {})[key] = value
+            self.decoder_optimizer.load_state_dict(adam)
+        self.owner_order.load(tensors["owners"])
         for i, shuffle in enumerate(self.shuffles):
             shuffle.load(tensors[f"order.{i}"])
         self.generator.set_state(tensors["generator"])
@@ -227,10 +230,14 @@ def decoder_shape(config: HideConfig) -> DecoderShape:
     """The sizes of the decoder that `config` asks for."""
     return DecoderShape(
         mask=config.mask,
+        kind=config.decoder,
         hidden=config.hidden,
         branch=config.branch,
         frequencies=config.frequencies,
         sh_degree=config.fit.sh_degree,
+        design=config.design,
+        residuals=config.residuals,
+        conditioning=config.conditioning,
     )
 
 
@@ -244,13 +251,14 @@ def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
     device = drawn[0][0]["means2d"].device
     gradients = torch.zeros(len(drawn), count, 2, device=device)
     radii = torch.zeros(len(drawn), count, 2, device=device)
+    width, height = drawn[0][0]["width"], drawn[0][0]["height"]
     for row, (meta, indices, weight) in enumerate(drawn):
         where = slice(None) if indices is None else indices
-        gradients[row, where] = meta["means2d"].grad[0] / weight
+        size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
+        gradients[row, where] = meta["means2d"].grad[0] * (size / weight)
         radii[row, where] = meta["radii"][0].float()
     means2d = torch.zeros_like(gradients)
     means2d.grad = gradients
-    width, height = drawn[0][0]["width"], drawn[0][0]["height"]
     return {
         "means2d": means2d,
         "radii": radii,

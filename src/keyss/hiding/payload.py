@@ -1,7 +1,7 @@
 """A secret as bytes: what is sealed under its key. safetensors with a JSON header, nothing executable.
 
-It holds the decoder (weights in half precision: the constants of its inputs stay whole), the embedding that
-conditions it, the similarity that leads back to the secret's own frame, and *anchors*: positions of some
+It holds the decoder (a network's weights in half precision, all constants whole) with the embedding that
+it belongs to, the similarity that leads back to the secret's own frame, and *anchors*: positions of some
 Gaussians of the stego model, which are there in any order and, mostly, after pruning, and tell whether a
 sidecar belongs to a model. A secret's bytes say nothing of other secrets.
 """
@@ -9,8 +9,8 @@ sidecar belongs to a model. A secret's bytes say nothing of other secrets.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, fields
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import safetensors
@@ -24,10 +24,9 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.mask import parse_mask
-from keyss.seal.keys import EMBEDDING_SIZE
 
 FORMAT = "keyss-secret"
-VERSION = 1
+VERSION = 2
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
@@ -50,9 +49,13 @@ class HiddenSecret:
     """All that revealing one secret needs besides the stego model."""
 
     decoder: Decoder
-    embedding: Tensor  # [64] what its key conditions the decoder with
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
+
+    @property
+    def embedding(self) -> Tensor:
+        """[64] what its key is to the decoder."""
+        return self.decoder.key
 
     def check_belongs_to(self, stego: Gaussians) -> None:
         """Raise InputError unless enough anchors are Gaussians of `stego`."""
@@ -87,7 +90,7 @@ def pack_secret(secret: HiddenSecret) -> bytes:
         _WEIGHTS + name: (value.half() if name in halved else value).detach().cpu().contiguous()
         for name, value in decoder.state_dict().items()
     }
-    tensors |= {"embedding": secret.embedding.cpu().contiguous(), "anchors": secret.anchors.contiguous()}
+    tensors["anchors"] = secret.anchors.contiguous()
     return safetensors.torch.save(tensors, {"keyss": json.dumps(header)})
 
 
@@ -118,23 +121,36 @@ def _metadata(data: bytes) -> dict[str, str]:
 
 
 def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSecret:
-    shape = dict(header["shape"])
-    sizes = {name: int(shape[name]) for name in ("hidden", "branch", "frequencies", "sh_degree")}
-    if not (0 <= sizes["sh_degree"] <= 3 and 0 <= sizes["frequencies"] <= 16):
-        raise InputError(f"decoder shape out of range: {sizes}")
-    if not all(1 <= sizes[name] <= 4096 for name in ("hidden", "branch")):
-        raise InputError(f"decoder shape out of range: {sizes}")
+    shape = _shape(dict(header["shape"]))
     if not all(
         value.dtype in (torch.float16, torch.float32) and value.isfinite().all() for value in tensors.values()
     ):
         raise InputError("weights: expected finite numbers of half or single precision")
-    anchors, embedding = tensors.pop("anchors").float(), tensors.pop("embedding").float()
+    anchors = tensors.pop("anchors").float()
     if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
         raise InputError(f"anchors: expected up to {ANCHORS} positions, got shape {list(anchors.shape)}")
-    if embedding.shape != (EMBEDDING_SIZE,):
-        raise InputError(f"embedding: expected {EMBEDDING_SIZE} numbers, got shape {list(embedding.shape)}")
-    decoder = Decoder(DecoderShape(mask=parse_mask(str(shape["mask"])), **sizes))
+    decoder = Decoder(shape)
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
-    return HiddenSecret(
-        decoder.requires_grad_(False), embedding, Similarity.from_json(header["frame"]), anchors
-    )
+    if not (decoder.knots.diff() > 0).all():
+        raise InputError("opacity curve: expected ascending knots")
+    return HiddenSecret(decoder.requires_grad_(False), Similarity.from_json(header["frame"]), anchors)
+
+
+def _shape(given: dict[str, Any]) -> DecoderShape:
+    """The shape that a header states, held to bounds. Raises InputError, and what `_DAMAGE` lists."""
+    expected = {field.name for field in fields(DecoderShape)}
+    if set(given) != expected:
+        raise InputError(f"decoder shape: expected {sorted(expected)}, got {sorted(given)}")
+    first, second = given["hidden"]
+    bounds = {"branch": (1, 4096), "frequencies": (0, 16), "sh_degree": (0, 3)}
+    sizes = [(first, 1, 4096), (second, 1, 4096), *((given[name], *span) for name, span in bounds.items())]
+    names = [
+        (given[name], get_args(get_type_hints(DecoderShape)[name]))
+        for name in ("kind", "conditioning", "design", "residuals")
+    ]
+    if not (
+        all(type(value) is int and low <= value <= high for value, low, high in sizes)
+        and all(value in allowed for value, allowed in names)
+    ):
+        raise InputError(f"decoder shape out of range: {given}")
+    return DecoderShape(**{**given, "mask": parse_mask(str(given["mask"])), "hidden": (first, second)})

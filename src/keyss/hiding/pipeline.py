@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,9 +20,9 @@ from keyss.fitting.plain import fit_scene
 from keyss.hiding.config import HideConfig
 from keyss.hiding.decoder import Decoder
 from keyss.hiding.joint import JointRun, decoder_shape
-from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.hiding.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
 from keyss.hiding.targets import PlacedScene
-from keyss.seal import DerivedKey, KeyDerivation, embed, random_embeddings, seal_sidecar
+from keyss.seal import DerivedKey, KeyDerivation, embed, seal_sidecar
 from keyss.seal.keys import SALT_BYTES
 from keyss.seal.plan import check_room
 
@@ -97,7 +98,7 @@ def hide_scenes(
             "scenes": [scene.digest() for scene in scenes],
             "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
             "keys": [hashlib.sha256(key.verifier()).hexdigest() for key in derived],
-            "config": _jsonable(config),
+            "config": json.loads(json.dumps(asdict(config))),  # tuples as they are read back
             "device": device.type,
         },
         seed=config.fit.seed,
@@ -111,12 +112,12 @@ def hide_scenes(
     decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
     anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
     packed = [
-        pack_secret(HiddenSecret(decoder, key.embedding(), frame, anchors))
-        for decoder, key, frame in zip(decoders, derived, frames[1:], strict=True)
+        pack_secret(HiddenSecret(decoder, frame, anchors))
+        for decoder, frame in zip(decoders, frames[1:], strict=True)
     ]
     sealed = None
     if sidecar:
-        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(decoders))
+        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(run, derived))
     else:
         stego = embed(stego, list(zip(keys, packed, strict=True)))
     return Hidden(stego, sealed, tuple(map(unpack_secret, packed)), tuple(models), seconds)
@@ -125,16 +126,16 @@ def hide_scenes(
 def _largest_payload(config: HideConfig) -> int:
     """Bytes of a secret whose decoder cannot be compressed."""
     decoder = Decoder(decoder_shape(config))
-    embedding = random_embeddings(1, torch.Generator())[0]
-    return len(pack_secret(HiddenSecret(decoder, embedding, Similarity.identity(), torch.zeros(64, 3))))
+    return len(pack_secret(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3))))
 
 
-def _discarded(decoders: Sequence[Decoder]) -> bytes:
-    """32 bytes that only who trained the decoders can know: the digits that are rounded away when packed."""
-    weights = b"".join(
-        value.float().numpy().tobytes() for decoder in decoders for value in decoder.state_dict().values()
-    )
-    return hashlib.sha256(b"keyss/v1/discarded" + weights).digest()
+def _discarded(run: JointRun, keys: Sequence[DerivedKey]) -> bytes:
+    """32 bytes that only who trained with these keys can know: the optimiser's state is thrown away."""
+    tensors, _ = run.state()
+    state = hashlib.sha256(b"keyss/v1/discarded" + b"".join(key.expand("writer", 32) for key in keys))
+    for name in sorted(tensors):
+        state.update(tensors[name].cpu().contiguous().numpy().tobytes())
+    return state.digest()
 
 
 def _salt(cover: Scene, seed: int) -> bytes:
@@ -143,9 +144,3 @@ def _salt(cover: Scene, seed: int) -> bytes:
     A salt must be unique rather than secret; taking it from public things makes runs repeatable.
     """
     return hashlib.sha256(f"keyss/v1/salt {seed} {cover.digest()}".encode()).digest()[:SALT_BYTES]
-
-
-def _jsonable(config: HideConfig) -> dict[str, object]:
-    values = asdict(config)
-    values["mask"] = list(config.mask)
-    return values

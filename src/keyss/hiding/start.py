@@ -9,16 +9,20 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
+from keyss.fitting.image_metrics import thin
 from keyss.fitting.parameters import initial_gaussians, initial_points
-from keyss.hiding.config import HideConfig
+from keyss.hiding.config import HideConfig, chosen_scenes
 from keyss.hiding.targets import PlacedScene
+from keyss.hiding.visibility import contributions
 
 # Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts there, a little
-# higher the more opaque it will be: the cover's opacity then tells the decoder the secret's.
-HIDDEN_LOGIT = -6.5
+# higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
+# band of logits of its own.
+HIDDEN_LOGIT, HIDDEN_STEP = -7.2, -3.5
 HIDDEN_SLOPE = 0.25
 SHOWN_LOGITS = (-4.0, 6.0)
 TRANSPARENT_LOGIT = -8.0
+SELECTION_VIEWS = 64
 
 
 @dataclass(frozen=True)
@@ -26,8 +30,8 @@ class Start:
     """Initial Gaussians of the published model."""
 
     gaussians: Gaussians
-    # For each secret the opacity logits [N] that its key should give at first, or nothing known yet.
-    opacity_logits: tuple[Tensor, ...] | None
+    # For each secret the knots and values that its decoder's opacity curve starts with, or nothing known yet.
+    curves: tuple[tuple[list[float], list[float]], ...] | None
 
 
 def make_start(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
@@ -40,7 +44,8 @@ def make_start(scenes: Sequence[PlacedScene], config: HideConfig, generator: tor
 def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
     """Combined SfM points: an equal share of the cap for every scene, what one leaves goes to the others."""
     fit = config.fit
-    clouds = [initial_points(placed.scene, fit.max_gaussians, generator) for placed in scenes]
+    chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
+    clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in chosen]
     shares = _shares([len(points) for points, _ in clouds], [1.0] * len(clouds), fit.max_gaussians)
     parts = [
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
@@ -50,21 +55,32 @@ def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: t
 
 
 def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
-    """The most visible Gaussians of every plain model; those of the secrets transparent in the cover."""
+    """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     weights = [1.0] + [config.secret_share] * (len(scenes) - 1)
     shares = _shares([len(plain) for plain in plains], weights, config.fit.max_gaussians)
-    chosen = [_most_visible(plain, share) for plain, share in zip(plains, shares, strict=True)]
+    chosen = [_most_contributing(*each) for each in zip(plains, scenes, shares, strict=True)]
     parts = chosen[:1] + [
-        replace(part, opacity_logits=HIDDEN_LOGIT + HIDDEN_SLOPE * part.opacity_logits.clamp(*SHOWN_LOGITS))
-        for part in chosen[1:]
+        replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
+        for secret, part in enumerate(chosen[1:])
     ]
-    opacity_logits = []
-    for secret in range(1, len(chosen)):
-        logits = [torch.full((len(part),), TRANSPARENT_LOGIT) for part in chosen]
-        logits[secret] = chosen[secret].opacity_logits
-        opacity_logits.append(torch.cat(logits))
-    return Start(Gaussians.cat(parts), tuple(opacity_logits))
+    return Start(Gaussians.cat(parts), tuple(_curve(secret) for secret in range(len(chosen) - 1)))
+
+
+def hidden_logits(logits: Tensor, secret: int) -> Tensor:
+    """[N] what the opacity logits [N] of a secret (0, 1, ...) are in the cover."""
+    return HIDDEN_LOGIT + HIDDEN_STEP * secret + HIDDEN_SLOPE * logits.clamp(*SHOWN_LOGITS)
+
+
+def _curve(secret: int) -> tuple[list[float], list[float]]:
+    """Knots and values of the opacity curve that undoes `hidden_logits` and makes all others transparent."""
+    middle = HIDDEN_LOGIT + HIDDEN_STEP * secret
+    low, high = (middle + HIDDEN_SLOPE * logit for logit in SHOWN_LOGITS)
+    knots = [-40.0, low - 0.5, low - 0.1, high + 0.4, high + 0.5, 40.0]
+    shown = (
+        [TRANSPARENT_LOGIT] * 2 + [(x - middle) / HIDDEN_SLOPE for x in knots[2:4]] + [TRANSPARENT_LOGIT] * 2
+    )
+    return knots, [y - x for x, y in zip(knots, shown, strict=True)]
 
 
 def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
@@ -81,15 +97,9 @@ def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> l
     return shares
 
 
-def _most_visible(gaussians: Gaussians, count: int) -> Gaussians:
-    """The `count` Gaussians with the largest opacity times cross-section, in their order.
-
-    The cross-section counts with its square root, and no more than that of a typical large Gaussian:
-    else a few huge faint ones would go before all detail.
-    """
-    if count >= len(gaussians):
-        return gaussians
-    cross_section = gaussians.log_scales.sort(dim=1).values[:, 1:].sum(1)  # log of the larger two axes
-    size = (cross_section / 2).clamp_max(float((cross_section / 2).quantile(0.9)))
-    visibility = gaussians.opacities * size.exp()
-    return gaussians[visibility.topk(count).indices.sort().values]
+def _most_contributing(plain: Gaussians, placed: PlacedScene, count: int) -> Gaussians:
+    """The `count` Gaussians that add most to what the training views show, in their order."""
+    if count >= len(plain):
+        return plain
+    cameras = [view.camera for view in thin(placed.scene.train, SELECTION_VIEWS)]
+    return plain[contributions(plain, cameras).topk(count).indices.sort().values]

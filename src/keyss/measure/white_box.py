@@ -33,10 +33,9 @@ def search_embeddings(
     generator = torch.Generator().manual_seed(seed)
     chosen = torch.randperm(len(stego), generator=generator)[:sample]
     part = stego.detach()[chosen.to(stego.device)]
-    description = decoder.describe(part).detach()
 
     def exchanged(direction: Tensor) -> Tensor:
-        change = decoder(part, F.normalize(direction, dim=0), description).opacities - part.opacities
+        change = decoder(part, F.normalize(direction, dim=0)).opacities - part.opacities
         score: Tensor = change.abs().mean() - 2 * change.mean().abs()
         return score
 
