@@ -29,6 +29,7 @@ from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.hiding.config import HideConfig
+from keyss.hiding.from_models import is_model, scene_of_model
 from keyss.hiding.payload import HiddenSecret, pack_secret
 from keyss.hiding.pipeline import hide_scenes
 from keyss.hiding.revealing import Frame, open_secret, read_sidecar, reveal_gaussians
@@ -142,9 +143,10 @@ def hide(
 ) -> HideResult:
     """Hide every secret in the cover, and measure the result on the test photos.
 
-    Plain models of all scenes come first unless they are given. What a key opens lies sealed in the low bits
-    of `stego.ply`, or with `sidecar` in a file `decoder.sealed`. `out` (a folder) gets these, `config.json`,
-    `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which `resume` goes
+    Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
+    come first unless they are given. What a key opens lies sealed in the low bits of `stego.ply`, or with
+    `sidecar` in a file `decoder.sealed`. `out` (a folder) gets these, `config.json`, `metrics.json` and
+    `private/` with the plain models; while it runs, checkpoints from which `resume` goes
     on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or HideConfig()
@@ -154,6 +156,10 @@ def hide(
     folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
     sources = [cover, *(secret.scene for secret in secrets)]
     given = [cover_model, *(secret.model for secret in secrets)]
+    given = [
+        source if model is None and not isinstance(source, Scene) and is_model(source) else model
+        for source, model in zip(sources, given, strict=True)
+    ]
     plains = [None if model is None else _model(model) for model in given]
     scenes = [_scene(source, width, background) for source in sources]
     keys = [secret.key for secret in secrets]
@@ -306,7 +312,7 @@ def evaluate(
     opened = {_fingerprint(secret): secret for secret in (_open(stego, key, beside) for key in keys)}
     if set(opened) != set(fingerprints):
         raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(opened)} of them")
-    scenes = [load_scene(source, width=width, background=background) for source in sources]
+    scenes = [_scene(source, width, background) for source in sources]
     bounds = [read_ply(folder / name) for name in _plain_names(len(scenes) - 1)]
     metrics = measure_hiding(
         stego.to(target),
@@ -375,7 +381,13 @@ def _describe_scene(scene: Scene) -> dict[str, Any]:
 
 
 def _scene(source: PathLike | Scene, width: int | None, background: Background) -> Scene:
-    return source if isinstance(source, Scene) else load_scene(source, width=width, background=background)
+    """A scene, the photos in a folder, or what the model in a `.ply` shows from all around."""
+    if isinstance(source, Scene):
+        return source
+    if not is_model(source):
+        return load_scene(source, width=width, background=background)
+    colour = None if background is None else torch.as_tensor(background, dtype=torch.float32)
+    return scene_of_model(read_ply(source), Path(source).stem, size=width, background=colour)
 
 
 def _model(source: PathLike | Gaussians) -> Gaussians:

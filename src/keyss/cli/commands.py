@@ -119,9 +119,10 @@ def fit(
 
 def hide(
     *,
-    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see.")],
+    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see, or a .ply model.")],
     secret: Annotated[
-        UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE", help="Scene to hide in it; at least one.")
+        UseAppendAction[tuple[Path, ...]],
+        arg(metavar="SCENE", help="Scene or .ply model to hide in it; at least one."),
     ],
     key_file: KeyFiles = (),
     out: OutFolder,
@@ -163,6 +164,7 @@ def hide(
     """Hide secret scenes in a cover scene, each under its own key.
 
     example: keyss hide --cover SCENE_A --secret SCENE_B --key-file key.txt -o runs/hidden
+    example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
     """
     from dataclasses import replace
 
@@ -170,7 +172,9 @@ def hide(
     from keyss.cli.keys import keys, warn_of_weak_keys
     from keyss.cli.tables import print_files, print_metrics
     from keyss.core.errors import UsageError
+    from keyss.files.ply import read_ply
     from keyss.hiding.config import PRESETS
+    from keyss.hiding.from_models import is_model, room_for_models
     from keyss.hiding.mask import parse_mask
     from keyss.progress import reporter
 
@@ -182,6 +186,8 @@ def hide(
         )
     config = PRESETS[preset]
     config = config.adapted(None if mask is None else parse_mask(mask), start)
+    if max_gaussians is None and all(map(is_model, (cover, *secret))):
+        config = room_for_models(config, [read_ply(path) for path in (cover, *secret)])
     config = replace(config, fit=_schedule(config.fit, iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     chosen = keys(key_file, len(secret), confirm=True)

@@ -20,9 +20,8 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     Where more Gaussians ask to be cloned or split than there is room for, those with the largest
     screen-space gradients go first. Pruning goes on at the cap, so that it always makes room again.
     `opacity_for_pruning` says how visible a Gaussian is ([N] in [0, 1]; by default its own opacity): in
-    hiding it is the largest opacity over all scenes, so that none loses what only it needs. `merit` ([N]): at
-    the cap, those with the least of it make room for what wants to grow, up to the share `turnover` of all at
-    a time. `freeze`: at the cap nothing is pruned either.
+    hiding it is the largest opacity over all scenes, so that none loses what only it needs. `freeze`: at
+    the cap nothing is pruned either.
     """
 
     def __init__(
@@ -30,8 +29,6 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         config: FitConfig,
         opacity_for_pruning: Callable[[], Tensor] | None = None,
         *,
-        merit: Callable[[], Tensor] | None = None,
-        turnover: float = 0.02,
         freeze: bool = False,
     ) -> None:
         super().__init__(
@@ -44,8 +41,6 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         )
         self.max_gaussians = config.max_gaussians
         self.opacity_for_pruning = opacity_for_pruning
-        self.merit = merit
-        self.turnover = turnover
         self.freeze = freeze
 
     @torch.no_grad()
@@ -55,29 +50,12 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         gradients = state["grad2d"] / state["count"].clamp_min(1)
         wanting = gradients > self.grow_grad2d
         room = max(0, self.max_gaussians - len(gradients))
-        if self.merit is not None and int(wanting.sum()) > room:
-            self._make_room(params, optimizers, state, wanting, int(wanting.sum()) - room)
-            gradients = state["grad2d"] / state["count"].clamp_min(1)
-            wanting = gradients > self.grow_grad2d
-            room = max(0, self.max_gaussians - len(gradients))
         if int(wanting.sum()) > room:
             refused = torch.ones_like(wanting)
             refused[gradients.topk(room).indices] = False
             state["grad2d"][refused] = 0
         counts: tuple[int, int] = super()._grow_gs(params, optimizers, state, step)
         return counts
-
-    def _make_room(
-        self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], wanting: Tensor, count: int
-    ) -> None:
-        """Remove up to `count` of the Gaussians of least merit that do not ask to grow."""
-        assert self.merit is not None
-        merit = self.merit().masked_fill(wanting, float("inf"))
-        count = min(count, int(self.turnover * len(merit)), int((~wanting).sum()))
-        removed = torch.zeros_like(wanting)
-        removed[merit.topk(count, largest=False).indices] = True
-        if count:
-            remove(params=params, optimizers=optimizers, state=state, mask=removed)
 
     @torch.no_grad()
     def _prune_gs(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> int:

@@ -26,7 +26,7 @@ class HideConfig:
     densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
     # Steps at which all scenes are drawn from one pose, photo or plain model's render; at the others each is
     # drawn from a pose of its own and compared with its photo. The paper has the first kind only.
-    common_poses: float = 0.25
+    common_poses: float = 0.1
 
     mask: Mask = ("op",)  # theta: the attributes that the decoder updates
     decoder: Literal["curve", "network"] = "curve"  # see keyss.hiding.decoder; the paper's is a network
@@ -46,10 +46,8 @@ class HideConfig:
 
     secret_share: float = 1.0  # warm start: Gaussians of each secret for one of the cover
     warm_rate: float = 1.0  # warm start: factor on the rates of the Gaussians, which are nearly right
-    # At the cap, what asks to grow takes the place of what adds least to any scene (merit), waits until
-    # something is pruned (wait), or nothing is pruned any more either (freeze: the authors' code).
-    at_cap: Literal["merit", "wait", "freeze"] = "merit"
-    turnover: float = 0.02  # the share of the Gaussians that merit may replace at a time
+    # At the cap, what asks to grow waits until something is pruned; freeze: nothing is (the authors' code).
+    at_cap: Literal["wait", "freeze"] = "wait"
     prune_by: Literal["all", "cover"] = "all"  # whose opacities spare a Gaussian; cover: the authors' code
 
     def __post_init__(self) -> None:
@@ -102,7 +100,6 @@ _PAPER = HideConfig(
     decoder_rate=5e-5,
     incorrect_weight=0.01,
     incorrect_every=1,
-    at_cap="wait",
 )
 
 PRESETS: dict[str, HideConfig] = {

@@ -19,11 +19,9 @@ from keyss.hiding.config import HideConfig, chosen_scenes
 from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.start import make_start
 from keyss.hiding.targets import CombinedPoses, PlacedScene
-from keyss.hiding.visibility import contributions, possibly_seen
+from keyss.hiding.visibility import possibly_seen
 from keyss.rendering import render_with_meta
 from keyss.seal.keys import random_embeddings
-
-MERIT_VIEWS = 12
 
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
@@ -65,8 +63,6 @@ class JointRun:
         self.strategy = CappedStrategy(
             config.fit,
             self._largest_opacity if config.prune_by == "all" else None,
-            merit=self._merit if config.at_cap == "merit" else None,
-            turnover=config.turnover,
             freeze=config.at_cap == "freeze",
         )
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
@@ -115,19 +111,21 @@ class JointRun:
         if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
             total = total + self._incorrect_loss(cover.detach(), poses[0], loss_of)
 
-        for meta, _, _ in drawn:
-            meta["means2d"].retain_grad()
+        if not self.warm:
+            for meta, _, _ in drawn:
+                meta["means2d"].retain_grad()
         total.backward()
         self._set_rates()
         for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
             if optimizer is not None:
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
-        asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
-        combined = combine_densification(asking, len(self))
-        self.strategy.step_post_backward(
-            self.parameters, self.optimizers, self.density, self.iteration, combined
-        )
+        if not self.warm:  # what a warm start chose from whole models, growth would only make worse
+            asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
+            combined = combine_densification(asking, len(self))
+            self.strategy.step_post_backward(
+                self.parameters, self.optimizers, self.density, self.iteration, combined
+            )
 
     def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], loss_of: Any) -> Tensor:
         """The cover is right already: only the decoders are to learn from wrong keys, in turns."""
@@ -164,18 +162,6 @@ class JointRun:
         opacities = [gaussians.opacities]
         opacities += [self._decoded(secret, gaussians).opacities for secret in range(len(self.decoders))]
         return torch.stack(opacities).amax(0)
-
-    def _merit(self) -> Tensor:
-        """[N] the most that each Gaussian adds to any scene: its share of what some random views show."""
-        gaussians, shares = self.gaussians(), []
-        for scene, placed in enumerate(self.scenes):
-            drawn = torch.randint(len(placed.scene.train), (MERIT_VIEWS,), generator=self.generator)
-            cameras = [placed.scene.train[index].camera for index in drawn.tolist()]
-            with torch.no_grad():
-                shown = gaussians if scene == 0 else self._decoded(scene - 1, gaussians)
-            added = contributions(shown, cameras)
-            shares.append(added / added.sum().clamp_min(1e-12))
-        return torch.stack(shares).amax(0)
 
     def _decoded(self, secret: int, gaussians: Gaussians) -> Gaussians:
         decoded: Gaussians = self.decoders[secret](gaussians, self.embeddings[secret])

@@ -61,7 +61,7 @@ def hide_scenes(
     if len(keys) != len(scenes) - 1 or not keys:
         raise UsageError(f"expected one key for each of {len(scenes) - 1} secret(s), got {len(keys)}")
     device = torch.device(device)
-    derivation = KeyDerivation(salt=_salt(scenes[0], config.fit.seed))
+    derivation = KeyDerivation(salt=training_salt(scenes[0], config.fit.seed))
     derived = [DerivedKey(key, derivation) for key in keys]
     if len({key.verifier() for key in derived}) != len(derived):
         raise UsageError("two secrets have the same key: each needs its own")
@@ -138,7 +138,7 @@ def _discarded(run: JointRun, keys: Sequence[DerivedKey]) -> bytes:
     return state.digest()
 
 
-def _salt(cover: Scene, seed: int) -> bytes:
+def training_salt(cover: Scene, seed: int) -> bytes:
     """A salt that is the same when a run is repeated and differs between covers and between seeds.
 
     A salt must be unique rather than secret; taking it from public things makes runs repeatable.

@@ -9,16 +9,18 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import thin
 from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.hiding.config import HideConfig, chosen_scenes
 from keyss.hiding.targets import PlacedScene
 from keyss.hiding.visibility import contributions
 
-# Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts there, a little
+# Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
 # higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
 # band of logits of its own.
-HIDDEN_LOGIT, HIDDEN_STEP = -7.2, -3.5
+DRAWN_LOGIT = -5.54
+HIDDEN_LOGIT, HIDDEN_STEP = -9.0, -3.5
 HIDDEN_SLOPE = 0.25
 SHOWN_LOGITS = (-4.0, 6.0)
 TRANSPARENT_LOGIT = -8.0
@@ -57,9 +59,14 @@ def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: t
 def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
     """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
+    # What is never drawn would lie among the hidden.
+    plains = [plain[plain.opacity_logits > DRAWN_LOGIT] for plain in plains]
     weights = [1.0] + [config.secret_share] * (len(scenes) - 1)
     shares = _shares([len(plain) for plain in plains], weights, config.fit.max_gaussians)
-    chosen = [_most_contributing(*each) for each in zip(plains, scenes, shares, strict=True)]
+    chosen = [
+        _most_contributing(plain, placed.scene, share)
+        for plain, placed, share in zip(plains, scenes, shares, strict=True)
+    ]
     parts = chosen[:1] + [
         replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
         for secret, part in enumerate(chosen[1:])
@@ -97,9 +104,9 @@ def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> l
     return shares
 
 
-def _most_contributing(plain: Gaussians, placed: PlacedScene, count: int) -> Gaussians:
+def _most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
     """The `count` Gaussians that add most to what the training views show, in their order."""
     if count >= len(plain):
         return plain
-    cameras = [view.camera for view in thin(placed.scene.train, SELECTION_VIEWS)]
+    cameras = [view.camera for view in thin(scene.train, SELECTION_VIEWS)]
     return plain[contributions(plain, cameras).topk(count).indices.sort().values]
