@@ -201,8 +201,22 @@ class TestTheWholePath:
         arguments = ["reveal", world / "hidden" / "stego.ply", "--key-file", world / "wrong.txt", "-o", out]
         assert_refused(keyss(*arguments), 3, "opens nothing")
         assert listing(tmp_path) == {}
-        assert keyss(*arguments, "--decoy").status == 0
-        assert out.exists()
+
+    def test_a_decoy_looks_like_a_success(
+        self, keyss: Callable[..., Said], world: Path, tmp_path: Path
+    ) -> None:
+        (tmp_path / "a.txt").write_text((world / "key.txt").read_text())
+        (tmp_path / "b.txt").write_text((world / "wrong.txt").read_text())
+        said = []
+        for name in "ab":
+            (tmp_path / f"{name}.txt").chmod(0o600)
+            key, out = tmp_path / f"{name}.txt", tmp_path / f"{name}.ply"
+            stego = world / "hidden" / "stego.ply"
+            said.append(keyss("reveal", stego, "--key-file", key, "--decoy", "-o", out))
+        right, wrong = said
+        assert right.status == 0
+        assert wrong == Said(0, right.out.replace("a.ply", "b.ply"), right.err)
+        assert len((tmp_path / "a.ply").read_bytes()) == len((tmp_path / "b.ply").read_bytes())
 
 
 class TestArguments:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from keyss._version import __version__
-from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.files.atomic import write_bytes
@@ -222,22 +222,16 @@ def reveal(
 
     `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
     lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
-    opens nothing (with `decoy` the cover comes instead), InputError for files that are not what they should
-    be or do not belong together.
+    opens nothing (with `decoy` the cover comes instead, see `decoy_secret`), InputError for files that are
+    not what they should be or do not belong together.
     """
     target = resolve_device(device)
     path = None if out is None else check_output_file(out, overwrite)
     model = _model(stego)
     if decoder is None and not isinstance(stego, Gaussians):
         decoder = _sidecar_beside(Path(stego))
-    try:
-        secret = _open(model, key, decoder)
-    except WrongKeyError:
-        if not decoy:
-            raise
-        revealed = model
-    else:
-        revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
+    secret = _open(model, key, decoder, decoy=decoy)
+    revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
     if path is not None:
         write_ply(path, revealed)
     return revealed
@@ -391,12 +385,14 @@ def _width(scene: Scene) -> int:
     return scene.train[0].camera.width
 
 
-def _open(stego: Gaussians, key: str, sidecar: PathLike | bytes | None) -> HiddenSecret:
+def _open(
+    stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False
+) -> HiddenSecret:
     """See `open_secret`. Errors name the sidecar's file."""
     if sidecar is None or isinstance(sidecar, bytes):
-        return open_secret(stego, key, sidecar)
+        return open_secret(stego, key, sidecar, decoy=decoy)
     try:
-        return open_secret(stego, key, read_sidecar(Path(sidecar)))
+        return open_secret(stego, key, read_sidecar(Path(sidecar)), decoy=decoy)
     except InputError as error:
         raise InputError(f"{sidecar}: {error}") from error
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gsply
 import numpy as np
@@ -31,6 +34,7 @@ __all__ = ["splat_transform"]  # a fixture
 PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
 KEY = "the right key"
 GENERATED = "q7Rv2LxT9bWm4KzD"
+SMALLEST = 540  # Gaussians that carry a byte
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +196,7 @@ def _neighbours(key: str) -> list[str]:
 
 def test_a_thousand_random_keys_open_nothing() -> None:
     """Below Argon2id, whose output is replaced: it is what keys differ in."""
-    model, own = trained_like(600, seed=3), keys()
+    model, own = trained_like(SMALLEST, seed=3), keys()
     stego = embed_derived(model, [(own, b"x")])
     names = identities(stego)
     assert extract_derived(stego, own[0], names) == b"x"
@@ -211,7 +215,7 @@ def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPat
         return hash_secret_raw(secret, salt, 1, 64, 1, 32, Type.ID)
 
     monkeypatch.setattr("keyss.seal.keys.hash_secret_raw", cheap)
-    stego = embed(trained_like(600, seed=3), [(GENERATED, b"x")])
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
     assert extract(stego, GENERATED) == b"x"
     neighbours = _neighbours(GENERATED)
     assert len(neighbours) == 16 * 61 + 3
@@ -223,11 +227,38 @@ def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPat
 @pytest.mark.slow
 def test_wrong_keys_at_full_cost() -> None:
     """1,000 random keys and all one-character neighbours, as a person would try them; 3 to 10 minutes."""
-    stego = embed(trained_like(600, seed=3), [(GENERATED, b"x")])
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
     assert extract(stego, GENERATED) == b"x"
     for wrong in [*_neighbours(GENERATED), *(generate_key() for _ in range(1000))]:
         with pytest.raises(WrongKeyError):
             extract(stego, wrong)
+
+
+def test_a_wrong_key_makes_the_same_work_as_a_right_one(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the decryption, counting what takes long; in seconds: benchmarks/attempts.py."""
+    work: Counter[str] = Counter()
+
+    def count(where: str) -> None:
+        module, name = where.rsplit(".", 1)
+        real = getattr(importlib.import_module(module), name)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            work[name] += 1
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(where, counted)
+
+    for where in ("keys.hash_secret_raw", "container.identities", "container.read_low_bits", "cells.blake2b"):
+        count(f"keyss.seal.{where}")
+    assert extract(stego, KEY) == PAYLOAD
+    right = work.copy()
+    work.clear()
+    with pytest.raises(WrongKeyError):
+        extract(stego, "The right key")
+    assert right["hash_secret_raw"] == work["hash_secret_raw"] == 1
+    assert right == work
 
 
 def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:

@@ -8,21 +8,58 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
 from keyss.files.reading import read_file
-from keyss.hiding.payload import HiddenSecret, unpack_secret
-from keyss.seal import extract, unseal_sidecar
+from keyss.hiding.decoder import Decoder, DecoderShape
+from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.seal import DerivedKey
+from keyss.seal.container import extract_derived, key_for
+from keyss.seal.low_bits import identities
+from keyss.seal.sidecar import open_slots, read_header
 
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
+_DECOY_STRENGTH = 0.003  # standard deviation of a decoy's last weights: renders stay within some 50 dB
 
 
-def open_secret(stego: Gaussians, key: str, sidecar: bytes | None = None) -> HiddenSecret:
+def open_secret(
+    stego: Gaussians, key: str, sidecar: bytes | None = None, *, decoy: bool = False
+) -> HiddenSecret:
     """What `key` opens, in the low bits of `stego` or in the bytes of a `sidecar`.
 
-    Raises WrongKeyError when it opens nothing, InputError when what is there is damaged.
+    `decoy`: a key that opens nothing gets a secret that shows the cover, see `decoy_secret`. Otherwise raises
+    WrongKeyError for it. Raises InputError when what is there is damaged.
     """
-    return unpack_secret(extract(stego, key) if sidecar is None else unseal_sidecar(sidecar, key))
+    names = identities(stego) if sidecar is None else []
+    derived = key_for(names, key) if sidecar is None else DerivedKey(key, read_header(sidecar)[0])
+    try:
+        packed = extract_derived(stego, derived, names) if sidecar is None else open_slots(sidecar, derived)
+    except WrongKeyError:
+        if not decoy:
+            raise
+        packed = pack_secret(decoy_secret(stego, derived))
+    return unpack_secret(packed)
+
+
+def decoy_secret(stego: Gaussians, key: DerivedKey) -> HiddenSecret:
+    """A secret that is the cover: what a wrong key opens for whoever looks on.
+
+    Its decoder has the default shape and random weights, and changes values by too little to be seen. So a
+    reveal does the same work as with a right key, and gives neither the bytes of `stego` nor, for who does
+    not have the key, bytes that can be computed.
+    """
+    seed = int.from_bytes(key.expand("decoy", 8), "little") >> 1
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))
+        for weight in decoder.parameters():
+            if not weight.any():  # those of the last layers, for a new decoder changes nothing
+                torch.nn.init.normal_(weight, std=_DECOY_STRENGTH)
+    decoder.standardise(stego)
+    anchors = choose_anchors(stego, torch.Generator().manual_seed(seed))
+    return HiddenSecret(decoder.requires_grad_(False), key.embedding(), Similarity.identity(), anchors)
 
 
 def read_sidecar(path: Path) -> bytes:
