@@ -225,7 +225,9 @@ def reveal(
         Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
     ] = "secret",
     decoy: Annotated[bool, arg(help="With a wrong key, write the cover instead of failing.")] = False,
-    force: Annotated[bool, arg(help="Go on although the decoder was made for another .ply.")] = False,
+    force: Annotated[
+        bool, arg(help="For a .ply that was quantised: skip the check that the decoder belongs to it.")
+    ] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: UnusedSeed = 0,

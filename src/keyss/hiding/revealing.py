@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +22,8 @@ from keyss.seal.sidecar import open_slots, read_header
 
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
+_ROUNDED_LOGIT = -12.0  # below it an opacity was rounded to zero: training leaves them above -10
+_FAINT_LOGIT = -6.5  # of Gaussians that the cover does not show, about
 _DECOY_STRENGTH = 0.003  # standard deviation of a decoy's last weights: renders stay within some 50 dB
 
 
@@ -74,10 +77,14 @@ def reveal_gaussians(
     """The secret as a model of its own that needs no decoder and no cover.
 
     `frame`: "secret" gives it in its own frame, so that its cameras fit it; "cover" leaves it where it was
-    hidden. `force` skips the check that the secret belongs to this model, for models whose positions were
-    quantised. Raises InputError for a secret of another model.
+    hidden. `force` is for models that were quantised: it skips the check that the secret belongs to this one,
+    and gives opacities that were rounded to zero, where the secret's Gaussians lie, the value that they
+    mostly had. Raises InputError for a secret of another model.
     """
-    if not force:
+    if force:
+        rounded = stego.opacity_logits < _ROUNDED_LOGIT
+        stego = replace(stego, opacity_logits=stego.opacity_logits.masked_fill(rounded, _FAINT_LOGIT))
+    else:
         secret.check_belongs_to(stego)
     decoded = decode(stego, secret, secret.embedding)
     if frame == "cover":
