@@ -277,6 +277,7 @@ class TestArguments:
             "background": (1.0, 0.5, 0.0),
             "cover_model": Path("m.ply"),
             "sidecar": False,
+            "encoder": None,
             "device": "cpu",
             "out": Path("out"),
             "overwrite": False,
@@ -386,6 +387,11 @@ def _empty_key(folder: Path) -> list[object]:
     return _hide(folder, key_file=folder / "empty.txt")
 
 
+def _without_clip(folder: Path) -> list[object]:
+    pytest.importorskip("transformers", reason="needs keyss[clip]")
+    return _hide(folder, key_encoder="clip", clip_model=folder / "a")
+
+
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden", "-o", f / "out"]),
@@ -437,6 +443,8 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     ),
     "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
     "info of another file": (4, "key.txt", lambda f: ["info", f / "key.txt"]),
+    "clip without a model": (6, "--clip-model", _without_clip),
+    "clip model without clip": (2, "--key-encoder", lambda f: _hide(f, clip_model=f)),
     "width of nothing": (2, "width", lambda f: ["fit", f / "a", "-o", f / "out", "--width", 0]),
     "background out of range": (
         2,

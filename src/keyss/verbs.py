@@ -134,6 +134,7 @@ def hide(
     background: Background = None,
     cover_model: PathLike | Gaussians | None = None,
     sidecar: bool = False,
+    encoder: Callable[[str], Tensor] | None = None,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -143,9 +144,10 @@ def hide(
     """Hide every secret in the cover, and measure the result on the test photos.
 
     Plain models of all scenes come first unless they are given. What a key opens lies sealed in the low bits
-    of `stego.ply`, or with `sidecar` in a file `decoder.sealed`. `out` (a folder) gets these, `config.json`,
-    `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which `resume` goes
-    on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+    of `stego.ply`, or with `sidecar` in a file `decoder.sealed`. `encoder`: from a key to the embedding [64]
+    that conditions the decoder, such as a `keyss.hiding.clip_keys.ClipKeys`; by default Argon2id's. `out` (a
+    folder) gets these, `config.json`, `metrics.json` and `private/` with the plain models; while it runs,
+    checkpoints from which `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or HideConfig()
     if not secrets:
@@ -163,6 +165,7 @@ def hide(
         config,
         plains=plains,
         sidecar=sidecar,
+        encoder=encoder,
         device=target,
         checkpoints=folder.checkpoints() if folder else None,
         resume=resume,
@@ -189,6 +192,7 @@ def hide(
             "models_given": [model is not None for model in given],
             "width": width,
             "background": None if background is None else [float(x) for x in background],
+            "key_encoder": "argon2" if encoder is None else type(encoder).__name__,
             "payloads": [_fingerprint(secret) for secret in hidden.secrets],
             "config": asdict(config),
             "version": __version__,

@@ -148,6 +148,12 @@ def hide(
     sidecar: Annotated[
         bool, arg(help="Write what a key opens to decoder.sealed, not into the low bits of stego.ply.")
     ] = False,
+    key_encoder: Annotated[
+        Literal["argon2", "clip"], arg(help="What conditions the decoder; the seal is always Argon2id's.")
+    ] = "argon2",
+    clip_model: Annotated[
+        Path | None, optional("FOLDER", "CLIP for --key-encoder clip.", "ViT-L/14 in the cache")
+    ] = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -180,6 +186,13 @@ def hide(
         mask=config.mask if mask is None else parse_mask(mask),
         start=start or config.start,
     )
+    if clip_model is not None and key_encoder != "clip":
+        raise UsageError("--clip-model is for --key-encoder clip")
+    encoder = None
+    if key_encoder == "clip":
+        from keyss.hiding.clip_keys import MODEL, ClipKeys
+
+        encoder = ClipKeys(clip_model or MODEL)
     models = secret_model or (None,) * len(secret)
     chosen = keys(key_file, len(secret), confirm=True)
     warn_of_weak_keys(chosen)
@@ -191,6 +204,7 @@ def hide(
         background=background,
         cover_model=cover_model,
         sidecar=sidecar,
+        encoder=encoder,
         device=device,
         out=out,
         overwrite=overwrite,
