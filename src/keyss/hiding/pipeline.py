@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 
 import torch
@@ -65,7 +66,7 @@ def hide_scenes(
     device = torch.device(device)
     derivation = KeyDerivation(salt=_salt(scenes[0], config.fit.seed))
     derived = [DerivedKey(key, derivation) for key in keys]
-    if len({key.verifier() for key in derived}) != len(derived):
+    if any(a.equals(b) for a, b in combinations(derived, 2)):
         raise UsageError("two secrets have the same key: each needs its own")
     embeddings = [key.embedding() for key in derived] if encoder is None else [encoder(key) for key in keys]
     if not sidecar:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -68,8 +69,7 @@ def embed(stego: Gaussians, secrets: Sequence[tuple[str, bytes]]) -> Gaussians:
 
 def embed_derived(stego: Gaussians, secrets: Sequence[tuple[Sequence[DerivedKey], bytes]]) -> Gaussians:
     """`embed` after key derivation: of every secret its key under each of the salts, and the payload."""
-    fingerprints = [keys[0].verifier() for keys, _ in secrets]
-    if len(set(fingerprints)) != len(secrets):
+    if any(a[0].equals(b[0]) for (a, _), (b, _) in combinations(secrets, 2)):
         raise UsageError("two secrets have the same key: each needs its own")
     degree, count = stego.sh_degree, len(secrets)
     usable = is_random(stego)
