@@ -64,7 +64,7 @@ def test_the_same_again_gives_the_same_bits_and_other_payloads_others(plain: Gau
     stego = embed_derived(plain, [(own, PAYLOAD)])
     assert_same_bits(embed_derived(plain, [(own, PAYLOAD)]), stego)
     other = embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")])
-    same = (read_low_bits(other) == read_low_bits(stego)).mean()
+    same = (read_low_bits(other) == read_low_bits(stego))[is_random(plain)].mean()
     assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
 
 
