@@ -4,7 +4,7 @@
 
 Each model is cut into up to four spatially disjoint parts of at least 1,000 Gaussians, and each part is
 embedded into. The classifiers learn from all scenes but one and are tried on that one; a scene is the name
-before the `=`, and there must be three or more.
+before the `=`, and there must be three or more. Standard errors are bootstrapped over whole models.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
+from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -21,30 +23,40 @@ from keyss.files.ply import read_ply
 from keyss.seal import DerivedKey
 from keyss.seal.container import embed_derived
 from keyss.seal.plan import SALTS
-from seal.steganalysis import features, held_out_auc, parts
+from seal.steganalysis import features, held_out_scores, parts, standard_error
+
+Labels = npt.NDArray[np.int64]
 
 
 def main(arguments: list[str]) -> None:
-    plain, embedded, scenes = [], [], []
-    for argument in arguments:
+    plain, embedded, scenes, models = [], [], [], []
+    for model, argument in enumerate(arguments):
         scene, path = argument.split("=", 1)
-        model = read_ply(path)
-        for part in parts(model, min(2, int(np.log2(len(model) / 1000)))):
+        whole = read_ply(path)
+        for part in parts(whole, min(2, int(np.log2(len(whole) / 1000)))):
             keys = [DerivedKey.of_master(os.urandom(32)) for _ in range(SALTS)]
             plain.append(features(part))
             embedded.append(features(embed_derived(part, [(keys, os.urandom(800))])))
             scenes.append(scene)
-    numbers = np.unique(scenes, return_inverse=True)[1]
+            models.append(model)
+    groups, owners = np.unique(scenes, return_inverse=True)[1], np.array(models)
     count = len(scenes)
-    pairs = held_out_auc(np.array(plain + embedded), np.repeat([0, 1], count), np.tile(numbers, 2))
-    print(f"{len(arguments)} models, {count} parts, each plain and embedded: {pairs}")
-    runs = []
-    for seed in range(6):
-        chosen = np.random.default_rng(seed).permutation(np.arange(count) % 2)
-        x = np.where(chosen[:, None] == 1, embedded, plain)
-        runs.append(held_out_auc(x, chosen, numbers))
-    means = {name: float(np.mean([run[name] for run in runs])) for name in runs[0]}
-    print(f"every part either plain or embedded, mean of {len(runs)} draws: {means}")
+    print(f"{len(arguments)} models of {groups.max() + 1} scenes in {count} parts")
+    print("every part both plain and embedded:")
+    x, y = np.array(plain + embedded), np.repeat([0, 1], count)
+    _report([(x, y)], np.tile(groups, 2), np.tile(owners, 2))
+    print("every part either plain or embedded, six draws:")
+    draws = [np.random.default_rng(seed).permutation(np.arange(count) % 2) for seed in range(6)]
+    _report([(np.where(y[:, None] == 1, embedded, plain), y) for y in draws], groups, owners)
+
+
+def _report(draws: list[tuple[npt.NDArray[np.float64], Labels]], groups: Labels, owners: Labels) -> None:
+    """Mean AUC over the draws and, of one draw, its standard error."""
+    found = [(held_out_scores(x, y, groups), y) for x, y in draws]
+    for name in found[0][0]:
+        auc = np.mean([roc_auc_score(y, scores[name]) for scores, y in found])
+        error = np.mean([standard_error(scores[name], y, owners) for scores, y in found])
+        print(f"  {name}: AUC {auc:.3f}, standard error {error:.3f}")
 
 
 if __name__ == "__main__":

@@ -201,8 +201,22 @@ class TestTheWholePath:
         arguments = ["reveal", world / "hidden" / "stego.ply", "--key-file", world / "wrong.txt", "-o", out]
         assert_refused(keyss(*arguments), 3, "opens nothing")
         assert listing(tmp_path) == {}
-        assert keyss(*arguments, "--decoy").status == 0
-        assert out.exists()
+
+    def test_a_decoy_looks_like_a_success(
+        self, keyss: Callable[..., Said], world: Path, tmp_path: Path
+    ) -> None:
+        (tmp_path / "a.txt").write_text((world / "key.txt").read_text())
+        (tmp_path / "b.txt").write_text((world / "wrong.txt").read_text())
+        said = []
+        for name in "ab":
+            (tmp_path / f"{name}.txt").chmod(0o600)
+            key, out = tmp_path / f"{name}.txt", tmp_path / f"{name}.ply"
+            stego = world / "hidden" / "stego.ply"
+            said.append(keyss("reveal", stego, "--key-file", key, "--decoy", "-o", out))
+        right, wrong = said
+        assert right.status == 0
+        assert wrong == Said(0, right.out.replace("a.ply", "b.ply"), right.err)
+        assert len((tmp_path / "a.ply").read_bytes()) == len((tmp_path / "b.ply").read_bytes())
 
 
 class TestArguments:
@@ -264,6 +278,7 @@ class TestArguments:
             "background": (1.0, 0.5, 0.0),
             "cover_model": Path("m.ply"),
             "sidecar": False,
+            "encoder": None,
             "device": "cpu",
             "out": Path("out"),
             "overwrite": False,
@@ -373,6 +388,11 @@ def _empty_key(folder: Path) -> list[object]:
     return _hide(folder, key_file=folder / "empty.txt")
 
 
+def _without_clip(folder: Path) -> list[object]:
+    pytest.importorskip("transformers", reason="needs keyss[clip]")
+    return _hide(folder, key_encoder="clip", clip_model=folder / "a")
+
+
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden", "-o", f / "out"]),
@@ -424,6 +444,8 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     ),
     "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
     "info of another file": (4, "key.txt", lambda f: ["info", f / "key.txt"]),
+    "clip without a model": (6, "--clip-model", _without_clip),
+    "clip model without clip": (2, "--key-encoder", lambda f: _hide(f, clip_model=f)),
     "width of nothing": (2, "width", lambda f: ["fit", f / "a", "-o", f / "out", "--width", 0]),
     "background out of range": (
         2,

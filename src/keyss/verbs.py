@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from keyss._version import __version__
-from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.files.atomic import write_bytes
@@ -135,6 +135,7 @@ def hide(
     background: Background = None,
     cover_model: PathLike | Gaussians | None = None,
     sidecar: bool = False,
+    encoder: Callable[[str], Tensor] | None = None,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -145,9 +146,10 @@ def hide(
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. What a key opens lies sealed in the low bits of `stego.ply`, or with
-    `sidecar` in a file `decoder.sealed`. `out` (a folder) gets these, `config.json`, `metrics.json` and
-    `private/` with the plain models; while it runs, checkpoints from which `resume` goes
-    on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+    `sidecar` in a file `decoder.sealed`. `encoder`: from a key to the embedding [64] that conditions the
+    decoder, such as a `keyss.hiding.clip_keys.ClipKeys`; by default Argon2id's. `out` (a folder) gets these,
+    `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which
+    `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or HideConfig()
     if not secrets:
@@ -169,6 +171,7 @@ def hide(
         config,
         plains=plains,
         sidecar=sidecar,
+        encoder=encoder,
         device=target,
         checkpoints=folder.checkpoints() if folder else None,
         resume=resume,
@@ -195,6 +198,7 @@ def hide(
             "models_given": [model is not None for model in given],
             "width": width,
             "background": None if background is None else [float(x) for x in background],
+            "key_encoder": "argon2" if encoder is None else type(encoder).__name__,
             "payloads": [_fingerprint(secret) for secret in hidden.secrets],
             "config": asdict(config),
             "version": __version__,
@@ -228,22 +232,16 @@ def reveal(
 
     `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
     lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
-    opens nothing (with `decoy` the cover comes instead), InputError for files that are not what they should
-    be or do not belong together.
+    opens nothing (with `decoy` the cover comes instead, see `decoy_secret`), InputError for files that are
+    not what they should be or do not belong together.
     """
     target = resolve_device(device)
     path = None if out is None else check_output_file(out, overwrite)
     model = _model(stego)
     if decoder is None and not isinstance(stego, Gaussians):
         decoder = _sidecar_beside(Path(stego))
-    try:
-        secret = _open(model, key, decoder)
-    except WrongKeyError:
-        if not decoy:
-            raise
-        revealed = model
-    else:
-        revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
+    secret = _open(model, key, decoder, decoy=decoy)
+    revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
     if path is not None:
         write_ply(path, revealed)
     return revealed
@@ -403,12 +401,14 @@ def _width(scene: Scene) -> int:
     return scene.train[0].camera.width
 
 
-def _open(stego: Gaussians, key: str, sidecar: PathLike | bytes | None) -> HiddenSecret:
+def _open(
+    stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False
+) -> HiddenSecret:
     """See `open_secret`. Errors name the sidecar's file."""
     if sidecar is None or isinstance(sidecar, bytes):
-        return open_secret(stego, key, sidecar)
+        return open_secret(stego, key, sidecar, decoy=decoy)
     try:
-        return open_secret(stego, key, read_sidecar(Path(sidecar)))
+        return open_secret(stego, key, read_sidecar(Path(sidecar)), decoy=decoy)
     except InputError as error:
         raise InputError(f"{sidecar}: {error}") from error
 

@@ -72,6 +72,13 @@ def parts(gaussians: Gaussians, depth: int) -> list[Gaussians]:
 
 def held_out_auc(x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64]) -> dict[str, float]:
     """AUC of two classifiers on groups (scenes) that they were not trained on."""
+    return {name: float(roc_auc_score(y, scores)) for name, scores in held_out_scores(x, y, groups).items()}
+
+
+def held_out_scores(
+    x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64]
+) -> dict[str, Numbers]:
+    """[N] probabilities of being embedded, from two classifiers trained on the other groups."""
     result = {}
     for name, make in (
         ("logistic", lambda: make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=2000))),
@@ -81,5 +88,19 @@ def held_out_auc(x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.in
         for group in np.unique(groups):
             test = groups == group
             scores[test] = make().fit(x[~test], y[~test]).predict_proba(x[test])[:, 1]
-        result[name] = float(roc_auc_score(y, scores))
+        result[name] = scores
     return result
+
+
+def standard_error(
+    scores: Numbers, y: npt.NDArray[np.int64], models: npt.NDArray[np.int64], draws: int = 1000
+) -> float:
+    """Of the AUC: whole models are drawn again (bootstrap), for parts of one are not independent."""
+    random = np.random.default_rng(0)
+    rows = [np.flatnonzero(models == model) for model in np.unique(models)]
+    aucs = []
+    while len(aucs) < draws:
+        drawn = np.concatenate([rows[model] for model in random.integers(len(rows), size=len(rows))])
+        if 0 < y[drawn].sum() < len(drawn):
+            aucs.append(roc_auc_score(y[drawn], scores[drawn]))
+    return float(np.std(aucs))

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gsply
 import numpy as np
+import plyfile
 import pytest
 import torch
+from argon2.low_level import Type, hash_secret_raw
 
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.rendering import render
-from keyss.seal import DerivedKey, capacity, embed, extract
+from keyss.seal import DerivedKey, capacity, embed, extract, generate_key
 from keyss.seal.container import embed_derived, extract_derived, smallest
+from keyss.seal.keys import ALPHABET
 from keyss.seal.low_bits import identities, is_random, read_low_bits
 from keyss.seal.plan import cells_for, check_room, plan
 from seal.trained_like import keys, trained_like
@@ -26,6 +33,8 @@ __all__ = ["splat_transform"]  # a fixture
 
 PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
 KEY = "the right key"
+GENERATED = "q7Rv2LxT9bWm4KzD"
+SMALLEST = 540  # Gaussians that carry a byte
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +64,7 @@ def test_the_same_again_gives_the_same_bits_and_other_payloads_others(plain: Gau
     stego = embed_derived(plain, [(own, PAYLOAD)])
     assert_same_bits(embed_derived(plain, [(own, PAYLOAD)]), stego)
     other = embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")])
-    same = (read_low_bits(other) == read_low_bits(stego)).mean()
+    same = (read_low_bits(other) == read_low_bits(stego))[is_random(plain)].mean()
     assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
 
 
@@ -96,33 +105,46 @@ def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
         extract_derived(rest, other[0])
 
 
-def test_survives_files_without_normals_with_more_properties_and_in_other_orders(
-    stego: Gaussians, tmp_path: Path
-) -> None:
-    columns = columns_of(stego)
-    bare = {name: values for name, values in columns.items() if name not in ("nx", "ny", "nz")}
-    more = {"label": np.ones(len(stego), np.float32)} | dict(reversed(columns.items()))
-    doubles = dict.fromkeys(columns, "double")
-    for index, data in enumerate(
-        (
-            ply_bytes(bare),
-            ply_bytes(more),
-            ply_bytes(columns, form="binary_big_endian"),
-            ply_bytes(columns, kinds=doubles),
-            ply_bytes(bare, form="ascii"),
-        )
-    ):
-        path = tmp_path / f"{index}.ply"
-        path.write_bytes(data)
-        assert_same_bits(read_ply(path), stego)
-    assert extract(read_ply(tmp_path / "1.ply"), KEY) == PAYLOAD
+Columns = dict[str, np.ndarray]
+OTHER_FILES: dict[str, Callable[[Columns], bytes]] = {
+    "without normals": lambda columns: ply_bytes(_without_normals(columns)),
+    "with unknown properties": lambda columns: ply_bytes({**columns, "label": np.ones(len(columns["x"]))}),
+    "in another order": lambda columns: ply_bytes(dict(reversed(columns.items()))),
+    "big-endian": lambda columns: ply_bytes(columns, form="binary_big_endian"),
+    "in double precision": lambda columns: ply_bytes(columns, kinds=dict.fromkeys(columns, "double")),
+    "as text": lambda columns: ply_bytes(_without_normals(columns), form="ascii"),
+}
 
 
-def test_survives_our_writer_and_gsply(stego: Gaussians, tmp_path: Path) -> None:
-    write_ply(tmp_path / "ours.ply", stego)
-    gsply.plywrite(tmp_path / "theirs.ply", gsply.plyread(tmp_path / "ours.ply"))
-    for name in ("ours", "theirs"):
-        assert extract(read_ply(tmp_path / f"{name}.ply"), KEY) == PAYLOAD
+def _without_normals(columns: Columns) -> Columns:
+    return {name: values for name, values in columns.items() if name not in ("nx", "ny", "nz")}
+
+
+@pytest.mark.parametrize("name", OTHER_FILES)
+def test_survives_other_files(stego: Gaussians, tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.ply").write_bytes(OTHER_FILES[name](columns_of(stego)))
+    again = read_ply(tmp_path / "a.ply")
+    assert_same_bits(again, stego)
+    assert extract(again, KEY) == PAYLOAD
+
+
+def _resave_by_plyfile(source: Path, target: Path) -> None:
+    data = plyfile.PlyData.read(source)
+    plyfile.PlyData([plyfile.PlyElement.describe(data["vertex"].data.copy(), "vertex")]).write(target)
+
+
+RESAVERS: dict[str, Callable[[Path, Path], object]] = {
+    "keyss": lambda source, target: write_ply(target, read_ply(source)),
+    "gsply": lambda source, target: gsply.plywrite(target, gsply.plyread(source)),
+    "plyfile": _resave_by_plyfile,
+}
+
+
+@pytest.mark.parametrize("name", RESAVERS)
+def test_survives_being_saved_again(stego: Gaussians, tmp_path: Path, name: str) -> None:
+    write_ply(tmp_path / "in.ply", stego)
+    RESAVERS[name](tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_ply(tmp_path / "out.ply"), KEY) == PAYLOAD
 
 
 def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
@@ -166,15 +188,77 @@ def _opened(stego: Gaussians, key: DerivedKey) -> list[tuple[int, bytes]]:
     return list(_header_cipher(key).open_all(identities(stego), [r.tobytes() for r in read_low_bits(stego)]))
 
 
-def test_keys_that_are_not_the_right_one_open_nothing() -> None:
-    """1,000 random keys at the level below Argon2id, whose output is replaced: it is what keys differ in."""
-    model, own = trained_like(600, seed=3), keys()
+def _neighbours(key: str) -> list[str]:
+    """`key` with one character changed to any other of the alphabet, or its cases exchanged."""
+    changed = {key[:i] + c + key[i + 1 :] for i in range(len(key)) for c in ALPHABET}
+    return sorted((changed | {key.swapcase(), key.upper(), key.lower()}) - {key})
+
+
+def test_a_thousand_random_keys_open_nothing() -> None:
+    """Below Argon2id, whose output is replaced: it is what keys differ in."""
+    model, own = trained_like(SMALLEST, seed=3), keys()
     stego = embed_derived(model, [(own, b"x")])
     names = identities(stego)
     assert extract_derived(stego, own[0], names) == b"x"
     for number in range(1000):
         with pytest.raises(WrongKeyError):
             extract_derived(stego, DerivedKey.of_master(number.to_bytes(32, "big")), names)
+
+
+def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All the way from the text, with an Argon2id that takes 64 KiB and one pass, which no file may ask for.
+
+    At full cost the same is done by `test_wrong_keys_at_full_cost`.
+    """
+
+    def cheap(secret: bytes, salt: bytes, **costs: object) -> bytes:
+        return hash_secret_raw(secret, salt, 1, 64, 1, 32, Type.ID)
+
+    monkeypatch.setattr("keyss.seal.keys.hash_secret_raw", cheap)
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    neighbours = _neighbours(GENERATED)
+    assert len(neighbours) == 16 * 61 + 3
+    for neighbour in neighbours:
+        with pytest.raises(WrongKeyError):
+            extract(stego, neighbour)
+
+
+@pytest.mark.slow
+def test_wrong_keys_at_full_cost() -> None:
+    """1,000 random keys and all one-character neighbours, as a person would try them; 3 to 10 minutes."""
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    for wrong in [*_neighbours(GENERATED), *(generate_key() for _ in range(1000))]:
+        with pytest.raises(WrongKeyError):
+            extract(stego, wrong)
+
+
+def test_a_wrong_key_makes_the_same_work_as_a_right_one(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the decryption, counting what takes long; in seconds: benchmarks/attempts.py."""
+    work: Counter[str] = Counter()
+
+    def count(where: str) -> None:
+        module, name = where.rsplit(".", 1)
+        real = getattr(importlib.import_module(module), name)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            work[name] += 1
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(where, counted)
+
+    for where in ("keys.hash_secret_raw", "container.identities", "container.read_low_bits", "cells.blake2b"):
+        count(f"keyss.seal.{where}")
+    assert extract(stego, KEY) == PAYLOAD
+    right = work.copy()
+    work.clear()
+    with pytest.raises(WrongKeyError):
+        extract(stego, "The right key")
+    assert right["hash_secret_raw"] == work["hash_secret_raw"] == 1
+    assert right == work
 
 
 def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
@@ -235,9 +319,23 @@ def test_values_that_are_not_random_stay_as_they_are() -> None:
     assert not usable[:230].any()
     assert not usable[300:310].any()
     assert not usable[-10:].any()
-    assert usable[310:1500].mean() > 0.99
+    assert usable[310:1500].mean() > 0.95
     stego = embed_derived(twice, [(keys(), b"x")])
     assert_same_bits(stego[torch.from_numpy(~usable)], twice[torch.from_numpy(~usable)])
+
+
+def test_values_that_are_nearly_equal_stay_as_they_are() -> None:
+    """Grey colours and round Gaussians, whichever low bits their values have."""
+    model = trained_like(3000, seed=8)
+    grey, round_ = slice(0, 300), slice(300, 600)
+    model.sh[grey, 7, 2] = model.sh[grey, 7, 0] * (1 + 1e-5)
+    model.log_scales[round_, 1] = model.log_scales[round_, 2] * (1 - 1e-6)
+    usable = is_random(model)
+    assert not usable[:600].any()
+    assert usable[600:].mean() > 0.95
+    stego = embed_derived(model, [(keys(), b"x")])
+    assert np.array_equal(is_random(stego)[:600], usable[:600])
+    assert_same_bits(model[:600], stego[:600])
 
 
 def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:

@@ -43,7 +43,10 @@ def test_the_same_entropy_gives_the_same_bytes_and_fresh_ones_others() -> None:
     assert seal_sidecar(secrets) != seal_sidecar(secrets)
 
 
-@pytest.mark.parametrize("secrets", [[], [("k", b"")] * 2, [(str(i), b"") for i in range(257)]])
+@pytest.mark.parametrize(
+    "secrets",
+    [[], [("k", b"")] * 2, [("caf\u00e9", b""), ("cafe\u0301", b"")], [(str(i), b"") for i in range(257)]],
+)
 def test_secrets_that_make_no_sense_are_refused(secrets: list[tuple[str, bytes]]) -> None:
     with pytest.raises(UsageError):
         seal_sidecar(secrets)

@@ -156,6 +156,12 @@ def hide(
     sidecar: Annotated[
         bool, arg(help="Write what a key opens to decoder.sealed, not into the low bits of stego.ply.")
     ] = False,
+    key_encoder: Annotated[
+        Literal["argon2", "clip"], arg(help="What conditions the decoder; the seal is always Argon2id's.")
+    ] = "argon2",
+    clip_model: Annotated[
+        Path | None, optional("FOLDER", "CLIP for --key-encoder clip.", "ViT-L/14 in the cache")
+    ] = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -189,6 +195,13 @@ def hide(
     if max_gaussians is None and all(map(is_model, (cover, *secret))):
         config = room_for_models(config, [read_ply(path) for path in (cover, *secret)])
     config = replace(config, fit=_schedule(config.fit, iterations, max_gaussians, seed))
+    if clip_model is not None and key_encoder != "clip":
+        raise UsageError("--clip-model is for --key-encoder clip")
+    encoder = None
+    if key_encoder == "clip":
+        from keyss.hiding.clip_keys import MODEL, ClipKeys
+
+        encoder = ClipKeys(clip_model or MODEL)
     models = secret_model or (None,) * len(secret)
     chosen = keys(key_file, len(secret), confirm=True)
     warn_of_weak_keys(chosen)
@@ -200,6 +213,7 @@ def hide(
         background=background,
         cover_model=cover_model,
         sidecar=sidecar,
+        encoder=encoder,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -234,7 +248,9 @@ def reveal(
         Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
     ] = "secret",
     decoy: Annotated[bool, arg(help="With a wrong key, write the cover instead of failing.")] = False,
-    force: Annotated[bool, arg(help="Go on although the decoder was made for another .ply.")] = False,
+    force: Annotated[
+        bool, arg(help="For a .ply that was quantised: skip the check that the decoder belongs to it.")
+    ] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: UnusedSeed = 0,

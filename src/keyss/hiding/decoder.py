@@ -90,6 +90,11 @@ class Decoder(nn.Module):
         self.knots.copy_(torch.tensor(knots))
         self.values.copy_(torch.tensor(values))
 
+    @property
+    def faint_logit(self) -> float:
+        """A logit at which the curve shows a Gaussian nearly opaque: high between its middle knots."""
+        return float(torch.lerp(self.knots[2], self.knots[3], 0.7))
+
     def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
         gate = self._gate(embedding)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from keyss.core.alignment import align
 from keyss.core.errors import UsageError
@@ -45,6 +47,7 @@ def hide_scenes(
     *,
     plains: Sequence[Gaussians | None] | None = None,
     sidecar: bool = False,
+    encoder: Callable[[str], Tensor] | None = None,
     device: torch.device | str = "cpu",
     checkpoints: Path | None = None,
     resume: bool = False,
@@ -53,7 +56,8 @@ def hide_scenes(
     """Hide `scenes[1:]` in `scenes[0]`, each to be opened by its key.
 
     `plains`: existing plain models, None for those to be fitted. `sidecar`: the sealed secrets go into a
-    file of their own and not into the low bits of the stego model. With `checkpoints` (a folder) the state
+    file of their own and not into the low bits of the stego model. `encoder`: from a key to the embedding
+    [64] that conditions its decoder, by default what Argon2id gives. With `checkpoints` (a folder) the state
     of every stage is kept there, and `resume` goes on from it. Raises UsageError for keys that are equal or
     not one per secret and for a model too small for what it has to carry, Interrupted on Ctrl-C, InputError
     for checkpoints of another run.
@@ -63,8 +67,9 @@ def hide_scenes(
     device = torch.device(device)
     derivation = KeyDerivation(salt=training_salt(scenes[0], config.fit.seed))
     derived = [DerivedKey(key, derivation) for key in keys]
-    if len({key.verifier() for key in derived}) != len(derived):
+    if any(a.equals(b) for a, b in combinations(derived, 2)):
         raise UsageError("two secrets have the same key: each needs its own")
+    embeddings = [key.embedding() for key in derived] if encoder is None else [encoder(key) for key in keys]
     if not sidecar:
         check_room(_largest_payload(config), config.fit.max_gaussians, len(keys), config.fit.sh_degree)
 
@@ -90,14 +95,17 @@ def hide_scenes(
     frames = [Similarity.identity()]
     frames += [align([view.camera for view in scene.train], cover_cameras) for scene in scenes[1:]]
     placed = [PlacedScene.of(*parts) for parts in zip(scenes, models, frames, strict=True)]
-    run = JointRun(placed, [key.embedding() for key in derived], config, device)
+    run = JointRun(placed, embeddings, config, device)
     seconds += train(
         run,
         "hide",
         fingerprint={
             "scenes": [scene.digest() for scene in scenes],
             "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
-            "keys": [hashlib.sha256(key.verifier()).hexdigest() for key in derived],
+            "keys": [
+                hashlib.sha256(key.verifier() + embedding.numpy().tobytes()).hexdigest()
+                for key, embedding in zip(derived, embeddings, strict=True)
+            ],
             "config": json.loads(json.dumps(asdict(config))),  # tuples as they are read back
             "device": device.type,
         },

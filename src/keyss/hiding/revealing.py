@@ -2,27 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
 from keyss.files.reading import read_file
-from keyss.hiding.payload import HiddenSecret, unpack_secret
-from keyss.seal import extract, unseal_sidecar
+from keyss.hiding.decoder import Decoder, DecoderShape
+from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.seal import DerivedKey
+from keyss.seal.container import extract_derived, key_for
+from keyss.seal.low_bits import identities
+from keyss.seal.sidecar import open_slots, read_header
 
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
+_ROUNDED_LOGIT = -12.5  # below it an opacity was rounded to zero: those of one secret or two lie above
+_DECOY_STRENGTH = 0.02  # standard deviation of a decoy's changes of opacity logits
 
 
-def open_secret(stego: Gaussians, key: str, sidecar: bytes | None = None) -> HiddenSecret:
+def open_secret(
+    stego: Gaussians, key: str, sidecar: bytes | None = None, *, decoy: bool = False
+) -> HiddenSecret:
     """What `key` opens, in the low bits of `stego` or in the bytes of a `sidecar`.
 
-    Raises WrongKeyError when it opens nothing, InputError when what is there is damaged.
+    `decoy`: a key that opens nothing gets a secret that shows the cover, see `decoy_secret`. Otherwise raises
+    WrongKeyError for it. Raises InputError when what is there is damaged.
     """
-    return unpack_secret(extract(stego, key) if sidecar is None else unseal_sidecar(sidecar, key))
+    names = identities(stego) if sidecar is None else []
+    derived = key_for(names, key) if sidecar is None else DerivedKey(key, read_header(sidecar)[0])
+    try:
+        packed = extract_derived(stego, derived, names) if sidecar is None else open_slots(sidecar, derived)
+    except WrongKeyError:
+        if not decoy:
+            raise
+        packed = pack_secret(decoy_secret(stego, derived))
+    return unpack_secret(packed)
+
+
+def decoy_secret(stego: Gaussians, key: DerivedKey) -> HiddenSecret:
+    """A secret that is the cover: what a wrong key opens for whoever looks on.
+
+    Its decoder has the default shape and a random curve, and changes opacities by too little to be seen. So a
+    reveal does the same work as with a right key, and gives neither the bytes of `stego` nor, for who does
+    not have the key, bytes that can be computed.
+    """
+    generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
+    decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))
+    decoder.prepare(stego, key.embedding())
+    decoder.values.normal_(std=_DECOY_STRENGTH, generator=generator)
+    anchors = choose_anchors(stego, generator)
+    return HiddenSecret(decoder.requires_grad_(False), Similarity.identity(), anchors)
 
 
 def read_sidecar(path: Path) -> bytes:
@@ -37,10 +72,16 @@ def reveal_gaussians(
     """The secret as a model of its own that needs no decoder and no cover.
 
     `frame`: "secret" gives it in its own frame, so that its cameras fit it; "cover" leaves it where it was
-    hidden. `force` skips the check that the secret belongs to this model, for models whose positions were
-    quantised. Raises InputError for a secret of another model.
+    hidden. `force` is for models that were quantised: it skips the check that the secret belongs to this one,
+    and gives opacities that were rounded to zero, where the secret's Gaussians lie, the value that they
+    mostly had. Raises InputError for a secret of another model.
     """
-    if not force:
+    if force:
+        rounded = stego.opacity_logits < _ROUNDED_LOGIT
+        stego = replace(
+            stego, opacity_logits=stego.opacity_logits.masked_fill(rounded, secret.decoder.faint_logit)
+        )
+    else:
         secret.check_belongs_to(stego)
     decoded = decode(stego, secret, secret.embedding)
     if frame == "cover":

@@ -20,7 +20,7 @@ from keyss.hiding.visibility import contributions
 # higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
 # band of logits of its own.
 DRAWN_LOGIT = -5.54
-HIDDEN_LOGIT, HIDDEN_STEP = -9.0, -3.5
+HIDDEN_LOGIT, HIDDEN_STEP = -8.2, -3.1
 HIDDEN_SLOPE = 0.25
 SHOWN_LOGITS = (-4.0, 6.0)
 TRANSPARENT_LOGIT = -8.0

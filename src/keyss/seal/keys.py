@@ -131,6 +131,10 @@ class DerivedKey:
         """Whether `verifier` is this key's, in constant time."""
         return hmac.compare_digest(self.verifier(), verifier)
 
+    def equals(self, other: DerivedKey) -> bool:
+        """Whether both come from the same key and derivation, in constant time."""
+        return self.matches(other.verifier())
+
     def embedding(self) -> Tensor:
         """[64] float32 unit vector, uniform on the sphere over keys: what the decoder is conditioned on."""
         words = np.frombuffer(self.expand("embedding", 8 * EMBEDDING_SIZE), "<u8")

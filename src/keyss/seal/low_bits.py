@@ -93,9 +93,10 @@ def is_random(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
     """[N] whether the low bits of a Gaussian look like those of trained values, and can be replaced.
 
     Not so with zeros, integers and short fractions, subnormal numbers, values that are there too often (after
-    a few steps of training many are the same small multiple of the learning rate), and Gaussians that are
-    there twice. Such a test must exclude hardly anything that is random: what is excluded stays, the same
-    comes up among the new low bits, and twice as much of it as by chance would be a tell.
+    a few steps of training many are the same small multiple of the learning rate), Gaussians that are there
+    twice, and those with twins (see `_has_twins`). A test that looks at the low bits must exclude hardly
+    anything that is random: what is excluded stays, the same comes up among the new low bits, and twice as
+    much of it as by chance would be a tell.
     """
     used = _used(gaussians)
     exponents = used >> 23 & 255
@@ -108,7 +109,21 @@ def is_random(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
     names = identities(gaussians)
     times = Counter(names)
     result &= np.array([times[name] == 1 for name in names], dtype=bool)
-    return result
+    return result & ~_has_twins(used, _mask(gaussians))
+
+
+def _has_twins(used: Words, mask: Words) -> npt.NDArray[np.bool_]:
+    """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
+
+    Grey Gaussians have that, and round ones: their low bits are not independent. Decided by the bits that
+    embedding leaves, which by chance are the same, or neighbours, in some 3 % of all Gaussians.
+    """
+    shifts = [int(bits).bit_length() for bits in mask]
+    high = ((used & np.uint32(0x7FFFFFFF)) >> np.array(shifts, np.uint32)).astype(np.int32)
+    twins = np.zeros(len(used), dtype=bool)
+    for together in (high[:, None, 0:3], high[:, None, 3:7], high[:, _GEOMETRY:].reshape(len(used), -1, 3)):
+        twins |= (np.diff(np.sort(together, axis=2), axis=2) <= 1).any(axis=(1, 2))
+    return twins
 
 
 def check_natural(gaussians: Gaussians, chosen: npt.NDArray[np.bool_]) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import secrets as system_random
 import struct
 from collections.abc import Sequence
+from itertools import combinations
 
 from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
 
@@ -39,17 +40,18 @@ def seal_sidecar(secrets: Sequence[tuple[str, bytes]], *, entropy: bytes | None 
     """
     if not 1 <= len(secrets) <= MAX_SLOTS:
         raise UsageError(f"expected 1 to {MAX_SLOTS} secrets, got {len(secrets)}")
-    if len({key for key, _ in secrets}) != len(secrets):
-        raise UsageError("two secrets have the same key: each needs its own")
     entropy = system_random.token_bytes(32) if entropy is None else entropy
     derivation = KeyDerivation(salt=expand(entropy, "sidecar/salt", SALT_BYTES))
+    derived = [DerivedKey(key, derivation) for key, _ in secrets]
+    if any(a.equals(b) for a, b in combinations(derived, 2)):
+        raise UsageError("two secrets have the same key: each needs its own")
     count = -(-len(secrets) // SLOTS) * SLOTS
     size = max(sealed_size(compressed_size(payload)) for _, payload in secrets)
     header = _pack_header(derivation, count, _WRAPPED + size)
     slots = []
-    for index, (key, payload) in enumerate(secrets):
+    for index, (key, (_, payload)) in enumerate(zip(derived, secrets, strict=True)):
         data_key = expand(entropy, f"sidecar/data-key/{index}", DATA_KEY_BYTES)
-        wrapped = aes_key_wrap(_wrapping_key(DerivedKey(key, derivation)), data_key)
+        wrapped = aes_key_wrap(_wrapping_key(key), data_key)
         slots.append(wrapped + seal(data_key, payload, header, size=size))
     noise = stream(entropy, "sidecar/noise", (count - len(slots)) * (_WRAPPED + size))
     slots += [noise[i : i + _WRAPPED + size] for i in range(0, len(noise), _WRAPPED + size)]

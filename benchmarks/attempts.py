@@ -1,0 +1,91 @@
+"""How long a right and a wrong key take: medians of attempts that take turns.
+
+    python benchmarks/attempts.py [--gaussians 20000] [--rounds 21]
+
+"open" is everything up to the unpacked secret or to the refusal, "reveal" what `keyss reveal --decoy` does,
+its files included. The noise is the right key against itself, every other attempt against the rest. On a
+machine that does other things it is larger than what is to be seen; the time of the processor suffers less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import torch
+
+import keyss
+from keyss.core.errors import WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.files.ply import write_ply
+from keyss.hiding.decoder import Decoder, DecoderShape
+from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret
+from keyss.hiding.revealing import open_secret
+from keyss.seal import embed, generate_key, random_embeddings, seal_sidecar
+from seal.trained_like import trained_like
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--gaussians", type=int, default=20_000)
+    parser.add_argument("--rounds", type=int, default=21)
+    asked = parser.parse_args()
+    right, wrong = generate_key(), generate_key()
+    plain = trained_like(asked.gaussians)
+    generator = torch.Generator().manual_seed(0)
+    decoder = Decoder(DecoderShape()).requires_grad_(False)
+    decoder.prepare(plain, random_embeddings(1, generator)[0])
+    anchors = choose_anchors(plain, generator)
+    secret = HiddenSecret(decoder, Similarity.identity(), anchors)
+    payload = [(right, pack_secret(secret))]
+    stego, sidecar = embed(plain, payload), seal_sidecar(payload)
+    print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
+    with tempfile.TemporaryDirectory() as folder:
+        path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"
+        write_ply(path, stego)
+        beside.write_bytes(sidecar)
+        _compare("open, one file", lambda key: _attempt(stego, key, None), right, wrong, asked.rounds)
+        _compare("open, sidecar", lambda key: _attempt(stego, key, sidecar), right, wrong, asked.rounds)
+        for name, source in (("reveal --decoy, one file", None), ("reveal --decoy, sidecar", beside)):
+            _compare(
+                name,
+                lambda key, source=source: keyss.reveal(
+                    path, key, decoder=source, decoy=True, out=Path(folder) / "out.ply", overwrite=True
+                ),
+                right,
+                wrong,
+                asked.rounds,
+            )
+
+
+def _attempt(stego: Gaussians, key: str, sidecar: bytes | None) -> None:
+    with suppress(WrongKeyError):
+        open_secret(stego, key, sidecar)
+
+
+def _compare(name: str, attempt: Callable[[str], object], right: str, wrong: str, rounds: int) -> None:
+    attempt(right)
+    attempt(wrong)
+    for clock, seconds in (("by the clock", time.perf_counter), ("of the processor", time.process_time)):
+        taken: dict[str, list[float]] = {right: [], wrong: []}
+        for number in range(rounds):
+            for key in (right, wrong) if number % 2 else (wrong, right):
+                start = seconds()
+                attempt(key)
+                taken[key].append(seconds() - start)
+        a, b = (statistics.median(taken[key]) for key in (right, wrong))
+        noise = statistics.median(taken[right][::2]) / statistics.median(taken[right][1::2]) - 1
+        print(f"{name}, {clock}: right {a:.3f} s, wrong {b:.3f} s ({b / a - 1:+.1%}; noise {noise:+.1%})")
+
+
+if __name__ == "__main__":
+    main()

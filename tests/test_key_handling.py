@@ -1,0 +1,105 @@
+"""A key is in its file and in memory: not among arguments, in messages, or in anything that is written."""
+
+from __future__ import annotations
+
+import base64
+import inspect
+import io
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from files.scene_files import write_blender, write_nerfstudio
+from keyss.cli import commands, main
+from keyss.core.errors import KeyssError
+from keyss.fitting.loop import Silent
+from keyss.seal import DerivedKey, KeyDerivation, seal_sidecar, unseal_sidecar
+
+KEY = "q7Rv2LxT9bWm4KzD"
+SPELLINGS = [
+    *(KEY.encode(coding) for coding in ("utf-8", "utf-16-le", "utf-16-be")),
+    KEY.encode().hex().encode(),
+    base64.b64encode(KEY.encode()).rstrip(b"="),
+]
+
+
+class _CtrlC(Silent):
+    """Presses it in the middle of hiding."""
+
+    hiding = False
+
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        self.hiding = title.startswith("hide")
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        if self.hiding:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_blender(tmp_path / "a", count=3, channels=3)
+    write_nerfstudio(tmp_path / "b", count=4)
+    (tmp_path / "key.txt").write_text(KEY)
+    return tmp_path
+
+
+def _spelt(data: bytes) -> bool:
+    return any(spelling.lower() in data.lower() for spelling in SPELLINGS)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.rglob("*") if path.is_file() and path.name != "key.txt")
+
+
+def test_nothing_that_is_written_or_said_holds_the_key(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    run, key = folder / "run", ["--key-file", str(folder / "key.txt")]
+    (folder / "key.txt").chmod(0o644)  # so that there is a warning to look at
+    scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--sidecar", "-o", str(run)]
+    size = ["--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu"]
+    with monkeypatch.context() as patch:
+        patch.setattr("keyss.progress.reporter", _CtrlC)
+        assert main(["hide", *scenes, *key, *size]) == 130
+    checkpoints = list(_files(run / "checkpoint"))
+    assert len(checkpoints) >= 3
+    assert not any(_spelt(path.read_bytes()) for path in checkpoints)
+
+    assert main(["hide", *scenes, *key, *size, "--resume"]) == 0
+    stego = str(run / "stego.ply")
+    assert main(["reveal", stego, *key, "-o", str(folder / "secret.ply")]) == 0
+    assert main(["evaluate", str(run), *key, "--wrong-keys", "2"]) == 0
+    assert main(["reveal", str(run / "private" / "cover.ply"), *key, "-o", str(folder / "no.ply")]) == 3
+    assert main(["info", str(run / "decoder.sealed")]) == 0
+    written = list(_files(folder))
+    assert {"stego.ply", "decoder.sealed", "config.json", "metrics.json"} <= {path.name for path in written}
+    assert [path for path in written if _spelt(path.read_bytes())] == []
+    said = capsys.readouterr()
+    assert "others can read this key file" in said.err
+    assert not _spelt((said.out + said.err + caplog.text).encode())
+
+
+def test_no_command_takes_a_key_as_an_argument() -> None:
+    for command in commands.ALL:
+        for name, parameter in inspect.signature(command).parameters.items():
+            if "key" in name and name not in ("wrong_keys", "key_encoder"):
+                assert "Path" in str(parameter.annotation) or parameter.annotation == "KeyFiles", name
+
+
+def test_errors_and_representations_do_not_show_the_key() -> None:
+    derived = DerivedKey(KEY, KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8192, parallelism=1))
+    assert KEY not in repr(derived)
+    assert derived.expand("seal", 32).hex() not in repr(derived)
+    with pytest.raises(KeyssError) as caught:
+        unseal_sidecar(seal_sidecar([("another", b"x")]), KEY)
+    assert not _spelt(str(caught.value).encode())
