@@ -109,7 +109,7 @@ def test_without_transformers_one_sentence_names_the_extra(monkeypatch: pytest.M
 def test_hiding_seals_what_clip_gives(encoder: ClipKeys) -> None:
     """Two keys that are the same to CLIP have the same embedding and open different things."""
     fit = FitConfig(iterations=10, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0)
-    config = HideConfig(fit=fit, distil_steps=10)
+    config = HideConfig(fit=fit)
     scenes, models = (
         [tiny_scene(seed) for seed in range(3)],
         [random_gaussians(seed=seed) for seed in range(3)],

@@ -17,7 +17,7 @@ RESTARTS = 4
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     scenes, models = _scenes()
-    config = PAPER.with_fit(iterations=600)
+    config = PAPER.with_fit(iterations=300)
     return hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
 
 

@@ -24,6 +24,7 @@ Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
 _ROUNDED_LOGIT = -12.5  # below it an opacity was rounded to zero: those of one secret or two lie above
 _DECOY_STRENGTH = 0.02  # standard deviation of a decoy's changes of opacity logits
+_DECOY_MOVE = 1e-4  # and of its turns (radians), shifts (of the model's size) and changes of scale
 
 
 def open_secret(
@@ -48,16 +49,20 @@ def open_secret(
 def decoy_secret(stego: Gaussians, key: DerivedKey) -> HiddenSecret:
     """A secret that is the cover: what a wrong key opens for whoever looks on.
 
-    Its decoder has the default shape and a random curve, and changes opacities by too little to be seen. So a
-    reveal does the same work as with a right key, and gives neither the bytes of `stego` nor, for who does
-    not have the key, bytes that can be computed.
+    Its decoder has the default shape and a random curve, its frame is a random one, and both change too little
+    to be seen. So a reveal does the same work as with a right key, and gives neither the bytes of `stego` nor,
+    for who does not have the key, bytes that can be computed.
     """
     generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
     decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))
     decoder.prepare(stego, key.embedding())
     decoder.values.normal_(std=_DECOY_STRENGTH, generator=generator)
-    anchors = choose_anchors(stego, generator)
-    return HiddenSecret(decoder.requires_grad_(False), Similarity.identity(), anchors)
+    turn, shift = _DECOY_MOVE * torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    skew = torch.zeros(3, 3, dtype=torch.float64)
+    skew[[2, 0, 1], [1, 2, 0]] = turn
+    size = (stego.means - stego.means.mean(0)).norm(dim=1).median().double().clamp_min(1e-9)
+    frame = Similarity(1 + float(shift.mean()), torch.matrix_exp(skew - skew.T), shift * size)
+    return HiddenSecret(decoder.requires_grad_(False), frame, choose_anchors(stego, generator))
 
 
 def read_sidecar(path: Path) -> bytes:
