@@ -58,7 +58,7 @@ def embed(stego: Gaussians, secrets: Sequence[tuple[str, bytes]]) -> Gaussians:
     if not secrets:
         raise UsageError("expected at least one secret")
     names = identities(stego)
-    derivations = [_derivation(identity) for identity in smallest(names)]
+    derivations = [derivation_of(identity) for identity in smallest(names)]
     return embed_derived(
         stego,
         [([DerivedKey(key, each) for each in derivations], payload) for key, payload in secrets],
@@ -121,7 +121,7 @@ def extract(stego: Gaussians, key: str) -> bytes:
     payload is there but too much of it was removed or changed.
     """
     names = identities(stego)
-    return extract_derived(stego, DerivedKey(key, _derivation(smallest(names)[0])), names)
+    return extract_derived(stego, DerivedKey(key, derivation_of(smallest(names)[0])), names)
 
 
 def extract_derived(stego: Gaussians, key: DerivedKey, names: Sequence[bytes] | None = None) -> bytes:
@@ -148,7 +148,7 @@ def smallest(names: Iterable[bytes]) -> list[bytes]:
     return sorted(set(names))[:SALTS]
 
 
-def _derivation(identity: bytes) -> KeyDerivation:
+def derivation_of(identity: bytes) -> KeyDerivation:
     """The costs are fixed: there is nowhere to state others before a key is derived."""
     return KeyDerivation(salt=hashlib.sha256(b"keyss/v1/salt" + identity).digest()[:SALT_BYTES])
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +36,7 @@ _SHORT = np.uint32((1 << 20) - 1)
 # Nor is a Gaussian, when so many of its values have so many zeros; by chance one in three million is that.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 
+_CHUNK = 1 << 16
 _SAMPLE = 20_000
 _LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in trained models, above 50 in others
 
@@ -98,16 +98,31 @@ def is_random(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
     comes up among the new low bits, and twice as much of it as by chance would be a tell.
     """
     used = _used(gaussians)
-    exponents = used >> 23 & 255
-    good = ((used & _SHORT) != 0) & (exponents > 0) & (exponents < 254)
-    for group in _GROUPS:
-        values = used[:, group]
-        _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-        good[:, group] &= (counts[inverse] < _unlikely_copies(values.size)).reshape(values.shape)
-    result: npt.NDArray[np.bool_] = good.all(axis=1) & (((used & _ZEROS) == 0).sum(axis=1) < _ZERO_FIELDS)
-    names = identities(gaussians)
-    times = Counter(names)
-    result &= np.array([times[name] == 1 for name in names], dtype=bool)
+    good = np.ones(len(used), bool)
+    zeros = np.zeros(len(used), np.int64)
+    frequent = [_frequent(used[:, group]) for group in _GROUPS]
+    for start in range(0, len(used), _CHUNK):  # some at a time: models may have millions of Gaussians
+        part = used[start : start + _CHUNK]
+        exponents = part >> 23 & 255
+        fine = ((part & _SHORT) != 0) & (exponents > 0) & (exponents < 254)
+        for group, values in zip(_GROUPS, frequent, strict=True):
+            if len(values):
+                place = np.searchsorted(values, part[:, group]).clip(max=len(values) - 1)
+                fine[:, group] &= values[place] != part[:, group]
+        good[start : start + _CHUNK] = fine.all(axis=1)
+        zeros[start : start + _CHUNK] = ((part & _ZEROS) == 0).sum(axis=1)
+    del used
+    names = (
+        name
+        for start in range(0, len(good), _CHUNK)
+        for name in identities(gaussians[start : start + _CHUNK])
+    )
+    _, inverse, times = np.unique(
+        np.fromiter((int.from_bytes(name[:8], "little") for name in names), np.uint64, len(good)),
+        return_inverse=True,
+        return_counts=True,
+    )
+    result: npt.NDArray[np.bool_] = good & (zeros < _ZERO_FIELDS) & (times[inverse] == 1)
     return result
 
 
@@ -150,6 +165,13 @@ def _mask(gaussians: Gaussians) -> Words:
     """[F] the bits in use of every field."""
     bits = [_GEOMETRY_BITS] * _GEOMETRY + [_SH_BITS] * _sh_count(gaussians.sh_degree)
     return np.array([((1 << count) - 1) << _UNUSED_BITS for count in bits], np.uint32)
+
+
+def _frequent(values: Words) -> Words:
+    """[V] the values that occur more often than is likely."""
+    flat = np.sort(values, axis=None)
+    more = _unlikely_copies(flat.size) - 1
+    return np.unique(flat[more:][flat[more:] == flat[: len(flat) - more]])
 
 
 def _unlikely_copies(count: int) -> int:
