@@ -18,6 +18,7 @@ could compute what the file would be without other secrets.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import struct
 from collections import Counter
@@ -49,6 +50,7 @@ from keyss.seal.plan import COPIES, SALTS
 
 VERSION = 1
 LEAST_USABLE = 0.5  # share of the cover's Gaussians that must have random low bits
+SALTS_TRIED = 2
 _PREFIX = struct.Struct("<BBI")
 
 Bytes = npt.NDArray[np.uint8]
@@ -62,6 +64,11 @@ class Carried:
 
     gaussians: Gaussians  # those that are left, in the order of their carriers
     count: int  # how many were put in
+    bits: int  # of a record
+
+    def fingerprint(self) -> str:
+        """By which a whole secret can be recognised; says nothing without it."""
+        return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -112,26 +119,32 @@ def embed(
     system's. Takes 1.6 s per secret for key derivation. Raises UsageError for equal keys and for secrets that
     are too large, with the number that fits; InputError for a cover whose low bits are not random.
     """
-    names = model_bits.identities(cover)
-    derivations = [derivation_of(identity) for identity in salts(names)]
-    derived = [([DerivedKey(key, each) for each in derivations], model) for key, model in secrets]
-    return embed_derived(cover, derived, names=names, entropy=entropy)
+    derived = derive_all(cover, [key for key, _ in secrets])
+    return embed_derived(
+        cover, list(zip(derived, (model for _, model in secrets), strict=True)), entropy=entropy
+    )
+
+
+def derive_all(cover: Gaussians, keys: Sequence[str]) -> list[list[DerivedKey]]:
+    """What each of the keys becomes under each of the salts; takes 1.6 s a key."""
+    derivations = [derivation_of(identity) for identity in salts(model_bits.identities(cover))]
+    return [[DerivedKey(key, each) for each in derivations] for key in keys]
 
 
 def embed_derived(
     cover: Gaussians,
     secrets: Sequence[tuple[Sequence[DerivedKey], Gaussians]],
     *,
-    names: Bytes | None = None,
+    usable: Flags | None = None,
     entropy: bytes | None = None,
 ) -> Gaussians:
     """`embed` after key derivation: of every secret its key under each of the salts, and the model.
 
-    `names`: the cover's identities, if they are known already.
+    `usable`: the cover's `usable_carriers`, if they are known already.
     """
     if len({keys[0].verifier() for keys, _ in secrets}) != len(secrets) or not secrets:
         raise UsageError("expected at least one secret, and another key for each")
-    usable = usable_carriers(cover)
+    usable = usable_carriers(cover) if usable is None else usable
     rows = np.flatnonzero(usable)
     sizes = [Size(len(model), model.sh_degree) for _, model in secrets]
     layouts = plan(sizes, len(rows), len(cover), cover.sh_degree)
@@ -139,8 +152,7 @@ def embed_derived(
     entropy = os.urandom(32) if entropy is None else entropy
     order = np.frombuffer(stream(entropy, "carry/order", 8 * len(rows)), "<u8")
     rows = rows[np.argsort(order, kind="stable")]
-    names = model_bits.identities(cover) if names is None else names
-    writer = _Writer(entropy, names[rows], cover.sh_degree)
+    writer = _Writer(entropy, model_bits.identities(cover)[rows], cover.sh_degree)
     data_keys = [expand(entropy, f"carry/data-key/{i}", DATA_KEY_BYTES) for i in range(len(secrets))]
     codecs = [Codec.fit(model, layout.table) for (_, model), layout in zip(secrets, layouts, strict=True)]
     for (keys, model), layout, codec, data_key in zip(secrets, layouts, codecs, data_keys, strict=True):
@@ -155,10 +167,11 @@ def extract(stego: Gaussians, key: str) -> Carried:
     """The model that `key` opens in `stego`.
 
     Raises WrongKeyError when it opens nothing, and InputError when too much was removed to read the rest.
-    Two salts are tried, so that a single changed or added Gaussian cannot lock out the key.
+    If the first salt opens nothing a second one is tried: a single changed or added Gaussian may have taken
+    the first one's place, and must not lock out the key.
     """
     carriers = Carriers.of(stego)
-    for identity in carriers.salts()[:2]:
+    for identity in carriers.salts()[:SALTS_TRIED]:
         try:
             return extract_derived(carriers, DerivedKey(key, derivation_of(identity)))
         except WrongKeyError:
@@ -191,7 +204,8 @@ def extract_derived(carriers: Carriers, key: DerivedKey) -> Carried:
     if not len(records):
         raise InputError("the key is right, but nothing is left of what it opens")
     origin = np.concatenate([np.flatnonzero(fits) for fits, _ in found])
-    return Carried(codec.decode(records[np.argsort(origin, kind="stable")]), count)
+    records = records[np.argsort(origin, kind="stable")]
+    return Carried(codec.decode(records), count, codec.table.total)
 
 
 class _Writer:

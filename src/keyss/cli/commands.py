@@ -119,10 +119,15 @@ def fit(
 
 def hide(
     *,
-    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see.")],
+    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see; to carry, or a .ply.")],
     secret: Annotated[
-        UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE", help="Scene to hide in it; at least one.")
+        UseAppendAction[tuple[Path, ...]],
+        arg(metavar="SCENE", help="Scene to hide in it; at least one. To carry, or a .ply."),
     ],
+    method: Annotated[
+        Literal["learned", "carry"],
+        arg(help="Train one model that shows both, or carry one model in the low bits of the other."),
+    ] = "learned",
     key_file: KeyFiles = (),
     out: OutFolder,
     preset: Annotated[Literal["quick", "default"], arg(help="Size and length of the run.")] = "default",
@@ -148,6 +153,10 @@ def hide(
     sidecar: Annotated[
         bool, arg(help="Write what a key opens to decoder.sealed, not into the low bits of stego.ply.")
     ] = False,
+    thin: Annotated[bool, arg(help="Carry: leave out what is least visible of too large a secret.")] = False,
+    dither: Annotated[
+        bool, arg(help="Carry: give the cover new low bits where they are not random.")
+    ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -161,7 +170,7 @@ def hide(
 
     from keyss import verbs
     from keyss.cli.keys import keys, warn_of_weak_keys
-    from keyss.cli.tables import print_files, print_metrics
+    from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.core.errors import UsageError
     from keyss.hiding.config import PRESETS
     from keyss.hiding.mask import parse_mask
@@ -173,6 +182,8 @@ def hide(
         raise UsageError(
             f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
         )
+    if method == "carry" and (mask is not None or start is not None):
+        raise UsageError("--mask and --start are for the learned method: carrying trains no decoder")
     config = PRESETS[preset]
     config = replace(
         config,
@@ -186,18 +197,21 @@ def hide(
     verbs.hide(
         cover,
         [verbs.Secret(scene, key, model) for scene, key, model in zip(secret, chosen, models, strict=True)],
+        method=method,
         config=config,
         width=width,
         background=background,
         cover_model=cover_model,
         sidecar=sidecar,
+        thin=thin,
+        dither=dither,
         device=device,
         out=out,
         overwrite=overwrite,
         resume=resume,
         reporter=reporter(),
     )
-    print_metrics(_metrics(out))
+    (print_carry if method == "carry" else print_metrics)(_metrics(out))
     print_files(
         out,
         {
@@ -297,7 +311,7 @@ def evaluate(
     """
     from keyss import verbs
     from keyss.cli.keys import keys
-    from keyss.cli.tables import print_files, print_metrics
+    from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.progress import reporter
 
     metrics = verbs.evaluate(
@@ -308,7 +322,7 @@ def evaluate(
         device=device,
         reporter=reporter(),
     )
-    print_metrics(metrics)
+    (print_carry if metrics.get("method") == "carry" else print_metrics)(metrics)
     print_files(run, {"metrics.json": "the numbers"})
 
 

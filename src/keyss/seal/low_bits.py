@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,7 @@ _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 
 _CHUNK = 1 << 16
 _SAMPLE = 20_000
+_SHIFTS = (_UNUSED_BITS, _UNUSED_BITS + _SH_BITS - 8)  # two overlapping bytes
 _LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in trained models, above 50 in others
 
 Words = npt.NDArray[np.uint32]
@@ -134,17 +136,28 @@ def check_natural(gaussians: Gaussians, chosen: npt.NDArray[np.bool_]) -> None:
     rows = np.flatnonzero(chosen)
     rows = rows[:: max(1, len(rows) // _SAMPLE)]
     used = _used(gaussians)[rows]
-    for shift in (_UNUSED_BITS, _UNUSED_BITS + _SH_BITS - 8):
+    for shift in _SHIFTS:
         for column in range(used.shape[1]):
-            counts = np.bincount(used[:, column] >> shift & 255, minlength=256)
-            expected = len(rows) / 256
-            ratio = float(((counts - expected) ** 2).sum() / expected / 255)
+            ratio = _chi_square(used[:, column] >> shift & 255)
             if ratio > _LARGEST_RATIO:
                 raise InputError(
                     f"the low bits of {_field_name(column)} are not random in this model (chi-square "
                     f"{ratio:.1f} per degree of freedom, 1 expected), so that nothing can be hidden in them: "
                     "it was quantised, scaled or moved after its training; --sidecar needs no low bits"
                 )
+
+
+def is_uniform(values: npt.NDArray[np.float32]) -> bool:
+    """The same test for one property [N]."""
+    words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
+    return all(_chi_square(words >> shift & 255) <= _LARGEST_RATIO for shift in _SHIFTS)
+
+
+def _chi_square(bytes_: npt.NDArray[np.integer[Any]]) -> float:
+    """Per degree of freedom, of the frequencies of numbers below 256."""
+    counts = np.bincount(bytes_, minlength=256)
+    expected = len(bytes_) / 256
+    return float(((counts - expected) ** 2).sum() / expected / 255)
 
 
 def _field_name(column: int) -> str:
