@@ -1,6 +1,7 @@
 """How well a classifier tells embedded models from ordinary ones, on models that you have.
 
     python benchmarks/steganalysis.py bonsai=runs/a/model.ply bonsai=runs/b/model.ply fox=runs/c/model.ply ...
+    python benchmarks/steganalysis.py --carry bonsai=...     # each carries a part of the next instead
 
 Each model is cut into up to four spatially disjoint parts of at least 1,000 Gaussians, and each part is
 embedded into. The classifiers learn from all scenes but one and are tried on that one; a scene is the name
@@ -17,6 +18,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from keyss.carry import carrying
 from keyss.files.ply import read_ply
 from keyss.seal import DerivedKey
 from keyss.seal.container import embed_derived
@@ -25,15 +27,23 @@ from seal.steganalysis import features, held_out_auc, parts
 
 
 def main(arguments: list[str]) -> None:
+    carried = "--carry" in arguments
+    arguments = [argument for argument in arguments if argument != "--carry"]
     plain, embedded, scenes = [], [], []
+    secret = read_ply(arguments[-1].split("=", 1)[1])
     for argument in arguments:
         scene, path = argument.split("=", 1)
         model = read_ply(path)
         for part in parts(model, min(2, int(np.log2(len(model) / 1000)))):
             keys = [DerivedKey.of_master(os.urandom(32)) for _ in range(SALTS)]
             plain.append(features(part))
-            embedded.append(features(embed_derived(part, [(keys, os.urandom(800))])))
+            if carried:
+                stego = carrying.embed_derived(part, [(keys, secret[: len(part)])])
+            else:
+                stego = embed_derived(part, [(keys, os.urandom(800))])
+            embedded.append(features(stego))
             scenes.append(scene)
+        secret = model
     numbers = np.unique(scenes, return_inverse=True)[1]
     count = len(scenes)
     pairs = held_out_auc(np.array(plain + embedded), np.repeat([0, 1], count), np.tile(numbers, 2))

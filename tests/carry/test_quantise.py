@@ -35,7 +35,7 @@ def test_a_line_is_off_by_half_a_step_at_most_and_clips_beyond_its_ends(
 
 
 @given(st.data(), st.integers(0, 3), st.sampled_from([0, 40, 500]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_every_attribute_comes_back_within_the_error_of_its_bits(
     data: st.DataObject, degree: int, more: int
 ) -> None:
@@ -61,7 +61,7 @@ def test_every_attribute_comes_back_within_the_error_of_its_bits(
         assert float((was - now).abs().max()) <= 1.1 * line.reach / ((1 << table.means) - 1) + 1e-5
     assert torch.isfinite(back.sh).all()
     length = model.quats.double().norm(dim=1)
-    unit = model.quats.double() / length[:, None].clamp_min(1e-30)
+    unit = model.quats.double() / length[:, None].clamp_min(1e-60)
     same = (unit * back.quats.double()).sum(1).abs()[length > 0]
     # Each of the three is off by half a step of sqrt(2) / (2^bits - 1), and the fourth by as much as follows.
     assert (1 - same <= 6 * (0.5**0.5 / ((1 << table.quats) - 1)) ** 2 + 1e-6).all()

@@ -8,7 +8,8 @@ key opens is found by opening every Gaussian's cell and keeping those whose tag 
   are key cells for each of the 12 smallest.
 - *Parameter cells*, closed under the data key, say how records are to be read, 24 times.
 - *Records*, closed under the data key, are a quantised Gaussian each (see `quantise`) and need no number:
-  shuffling and cropping are harmless, and who removes a carrier removes what it carries and no more.
+  shuffling and cropping are harmless, and who removes a carrier removes what it carries and no more. *Copies*
+  of the most visible ones are told from records by another label; they count where the record is gone.
 
 Which carrier gets what is drawn at random, so that a secret Gaussian's carrier says nothing about it. All
 carriers that carry nothing get noise: cells of other secrets and of none look alike. The random numbers come
@@ -37,10 +38,12 @@ from keyss.carry.plan import (
     PREFIX_BYTES,
     Layout,
     Size,
+    check_degrees,
     part_bytes,
     plan,
 )
 from keyss.carry.quantise import Codec
+from keyss.carry.thinning import visible_rows
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.seal.container import derivation_of, smallest
@@ -144,9 +147,10 @@ def embed_derived(
     """
     if len({keys[0].verifier() for keys, _ in secrets}) != len(secrets) or not secrets:
         raise UsageError("expected at least one secret, and another key for each")
+    sizes = [Size(len(model), model.sh_degree) for _, model in secrets]
+    check_degrees(sizes, cover.sh_degree)
     usable = usable_carriers(cover) if usable is None else usable
     rows = np.flatnonzero(usable)
-    sizes = [Size(len(model), model.sh_degree) for _, model in secrets]
     layouts = plan(sizes, len(rows), len(cover), cover.sh_degree)
 
     entropy = os.urandom(32) if entropy is None else entropy
@@ -159,7 +163,9 @@ def embed_derived(
         writer.header(keys, data_key, _pack_parameters(layout, codec, len(model)))
     ordered = sorted(range(len(secrets)), key=lambda i: layouts[i].cells)  # whole carriers first
     for i in ordered:
-        writer.records(data_keys[i], codecs[i].encode(secrets[i][1]), layouts[i].cells)
+        records, copied = codecs[i].encode(secrets[i][1]), visible_rows(secrets[i][1], layouts[i].copies)
+        writer.records(_record_cipher(data_keys[i], codecs[i]), records, layouts[i].cells)
+        writer.records(_copy_cipher(data_keys[i], codecs[i]), records[copied], layouts[i].cells)
     return model_bits.write_low_bits(cover, rows, writer.table)
 
 
@@ -193,19 +199,31 @@ def extract_derived(carriers: Carriers, key: DerivedKey) -> Carried:
         raise WrongKeyError("this key opens nothing here")
     cells, count, codec = _unpack_parameters({int(part[0]): part[1:].tobytes() for part in opened})
     size = width // cells
-    cipher = _record_cipher(data_key, codec)
-    if cipher.cell_bytes > size:
+    if TAG_BYTES + codec.record_bytes > size:
         raise InputError("the hidden parameters are damaged: records larger than their cells")
+    records = _open_cells(carriers, _record_cipher(data_key, codec), cells)
+    copies = _open_cells(carriers, _copy_cipher(data_key, codec), cells)
+    records = np.concatenate([records, copies[~_are_among(copies, records)]])
+    if not len(records):
+        raise InputError("the key is right, but nothing is left of what it opens")
+    return Carried(codec.decode(records), count, codec.table.total)
+
+
+def _open_cells(carriers: Carriers, cipher: CellCipher, cells: int) -> Bytes:
+    """[M, size] what the cipher opens, in the order of the carriers."""
+    size = carriers.low.shape[1] // cells
     found = [
         cipher.open(carriers.names, carriers.low[:, slot * size : (slot + 1) * size], slot)
         for slot in range(cells)
     ]
-    records = np.concatenate([data for _, data in found])
-    if not len(records):
-        raise InputError("the key is right, but nothing is left of what it opens")
     origin = np.concatenate([np.flatnonzero(fits) for fits, _ in found])
-    records = records[np.argsort(origin, kind="stable")]
-    return Carried(codec.decode(records), count, codec.table.total)
+    return np.concatenate([data for _, data in found])[np.argsort(origin, kind="stable")]
+
+
+def _are_among(rows: Bytes, others: Bytes) -> Flags:
+    """[R] which of the rows are there among the others."""
+    code = f"S{rows.shape[1]}"  # bytes of a fixed length: zeros at their end make no difference
+    return np.isin(rows.view(code)[:, 0], others.view(code)[:, 0])
 
 
 class _Writer:
@@ -231,8 +249,7 @@ class _Writer:
         table = np.frombuffer(b"".join(parts * PARAMETER_COPIES), np.uint8).reshape(-1, 1 + size)
         self._whole(_parameter_cipher(data_key, self.table.shape[1]), table)
 
-    def records(self, data_key: bytes, records: Bytes, cells: int) -> None:
-        cipher = CellCipher(data_key, "carry/record", records.shape[1])
+    def records(self, cipher: CellCipher, records: Bytes, cells: int) -> None:
         if cells == 1:
             self._whole(cipher, records)
             return
@@ -262,6 +279,10 @@ def _parameter_cipher(data_key: bytes, width: int) -> CellCipher:
 
 def _record_cipher(data_key: bytes, codec: Codec) -> CellCipher:
     return CellCipher(data_key, "carry/record", codec.record_bytes)
+
+
+def _copy_cipher(data_key: bytes, codec: Codec) -> CellCipher:
+    return CellCipher(data_key, "carry/copy", codec.record_bytes)
 
 
 def _pack_parameters(layout: Layout, codec: Codec, count: int) -> bytes:

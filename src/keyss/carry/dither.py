@@ -22,6 +22,7 @@ from keyss.seal.keys import stream
 from keyss.seal.low_bits import is_uniform
 
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
+_SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
 _VIEWS, _SIZE = 4, 256
 
@@ -65,6 +66,10 @@ def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:
     gaps = np.diff(unique)
     reach = np.minimum(np.append(gaps, np.inf), np.insert(gaps, 0, np.inf))
     reach = np.minimum(reach, np.quantile(gaps, _TYPICAL)) / 2
+    half = unique.astype(np.float16)
+    if len(unique) > _SPARSE * len(values) and (half == unique).all():
+        # Of half precision, but not every value occurs: the next one that does may be several steps away.
+        reach = np.minimum(reach, np.spacing(np.abs(half)).astype(np.float64) / 2)
     moved: Floats = (values + noise * reach[inverse]).astype(np.float32)
     return moved
 

@@ -22,9 +22,9 @@ def filled(gaussians: Gaussians, count: int) -> Gaussians:
     share = max(len(gaussians) / max(count, 1), 1 - _MOST_LOST)
     if share >= 1:
         return gaussians
-    transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7)
+    transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7) ** (1 / share)
     return replace(
         gaussians,
-        opacity_logits=torch.logit(1 - transmittance ** (1 / share)).float(),
+        opacity_logits=torch.logit(1 - transmittance.clamp_min(1e-7)).float(),
         log_scales=gaussians.log_scales + _GROWTH * math.log(1 / share),
     )

@@ -25,7 +25,7 @@ from keyss.carry.carrying import (
 )
 from keyss.carry.dither import cost, dither
 from keyss.carry.filling import filled
-from keyss.carry.plan import Size, room, thinned
+from keyss.carry.plan import Size, check_degrees, room, thinned
 from keyss.carry.thinning import most_visible
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -115,11 +115,12 @@ def carry(
     InputError for a cover whose low bits are not random.
     """
     device, start = torch.device(device), time.monotonic()
+    models = [source.gaussians for _, source in secrets]
+    sizes = [Size(len(model), model.sh_degree) for model in models]
+    check_degrees(sizes, cover.gaussians.sh_degree)
     carrier = dither(cover.gaussians, os.urandom(32)) if dithered else cover.gaussians
     usable = usable_carriers(carrier)
     count = int(usable.sum())
-    models = [source.gaussians for _, source in secrets]
-    sizes = [Size(len(model), model.sh_degree) for model in models]
     if thin:
         counts = thinned(sizes, count, carrier.sh_degree)
         models = [most_visible(model, kept) for model, kept in zip(models, counts, strict=True)]

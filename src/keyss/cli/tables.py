@@ -57,7 +57,8 @@ def print_carry(metrics: Metrics, console: Console | None = None) -> None:
     console.print(table)
     console.print(
         f"{metrics['carriers']:,} of the cover's {metrics['gaussians']:,} Gaussians can carry something; "
-        f"up to {metrics['room']:,} fit. {metrics['seconds']:.1f} s."
+        f"up to {metrics['room']:,} fit. {metrics['seconds']:.1f} s.",
+        soft_wrap=True,
     )
     if metrics["dither_psnr"] is not None:
         console.print(f"Dithering costs the cover {metrics['dither_psnr']:.1f} dB (PSNR before and after).")
