@@ -78,10 +78,10 @@ def test_too_large_secrets_are_refused_or_thinned(
     hide = ("hide", "--method", "carry", "--cover", "cover.ply", "--key-file", "key", "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out")
     assert status == 2
-    assert "4,610 would fit; --thin" in err
+    assert "4,562 would fit; --thin" in err
     assert not (tmp_path / "out").exists()
     assert run(*hide, "-o", tmp_path / "out", "--thin")[0] == 0
-    assert json.loads((tmp_path / "out/metrics.json").read_text())["secrets"][0]["carried"] == 4610
+    assert json.loads((tmp_path / "out/metrics.json").read_text())["secrets"][0]["carried"] == 4562
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def thinned(sizes: Sequence[Size], carriers: int, cover_degree: int) -> list[int
 
 
 def header_carriers(cover_degree: int, secret_degree: int) -> int:
-    """Carriers that a secret's header takes: 192 where both SH degrees are 3."""
+    """Carriers that a secret's header takes: 216 where both SH degrees are 3."""
     return SALTS * COPIES + parameter_parts(cover_degree, secret_degree) * PARAMETER_COPIES
 
 

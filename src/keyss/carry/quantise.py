@@ -7,6 +7,7 @@ A record holds everything that renders: position, log scales, opacity logit, dir
 - positions, colours and harmonics as asinh((value - centre) / spread): fine where most are, coarse in
   proportion to the distance further out. Positions reach to the furthest one; of the others the few furthest
   may be clipped, whichever gives the least mean square error;
+- of three colours their brightness and two differences, which are small, on a line of their own;
 - of a quaternion the three smallest components, of which none is above sqrt(1/2), and which is left out.
 """
 
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.carry.table import BANDS, Table
+from keyss.carry.table import BANDS, CHROMA_FEWER, Table
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 
@@ -31,7 +32,10 @@ Bytes = npt.NDArray[np.uint8]
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _LARGEST_QUAT = 0.5**0.5
 _FURTHEST = 1e30  # no value that a line may give is larger
+# Brightness, red against green, and both against blue: rows of unit length at right angles.
+_COLOURS = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3], [2], [6]])
 _CHUNK = 1 << 14  # Gaussians at a time when packing: every bit takes a byte meanwhile
+_LEAST_SPREAD = 1e-30
 _SAMPLE = 20_000  # values that a line is fitted to
 _LINE = struct.Struct("<3f")
 _TABLE_BYTES = len(astuple(Table.floor(0)))
@@ -75,7 +79,7 @@ class Codec:
     """How the Gaussians of one secret are written: a table of bits, and a line for each kind of number."""
 
     table: Table
-    lines: tuple[Line, ...]  # x, y, z, log scales, opacity logits, colours, then a line per band
+    lines: tuple[Line, ...]  # x, y, z, log scales, opacity logits; two per band, the constant one first
 
     @staticmethod
     def fit(gaussians: Gaussians, table: Table) -> Codec:
@@ -84,12 +88,12 @@ class Codec:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
         means = [_asinh_line(_doubles(gaussians.means[:, axis])) for axis in range(3)]
         flat = [_even_line(_doubles(gaussians.log_scales)), _even_line(_logits(gaussians))]
-        colour = _best_line(_doubles(gaussians.sh[:, 0]), table.dc)
-        harmonics = [
-            _best_line(_doubles(gaussians.sh[:, band]), bits, centred=True)
-            for band, bits in zip(_bands(table.sh_degree), table.bands, strict=True)
+        colours = [
+            _best_line(values, bits, centred=band > 0)
+            for band in range(table.sh_degree + 1)
+            for values, bits in _colours(gaussians, table, band)
         ]
-        return Codec(table, (*means, *flat, colour, *harmonics))
+        return Codec(table, (*means, *flat, *colours))
 
     @property
     def record_bytes(self) -> int:
@@ -112,14 +116,14 @@ class Codec:
         return Gaussians.cat(parts)
 
     def pack(self) -> bytes:
-        """The codec itself: 80 to 116 bytes."""
+        """The codec itself: 92 to 164 bytes."""
         numbers = b"".join(_LINE.pack(line.centre, line.spread, line.reach) for line in self.lines)
         return bytes(astuple(self.table)) + numbers
 
     @staticmethod
     def packed_size(sh_degree: int) -> int:
         """Bytes of a packed codec for secrets of this SH degree."""
-        return _TABLE_BYTES + _LINE.size * (6 + sh_degree)
+        return _TABLE_BYTES + _LINE.size * (7 + 2 * sh_degree)
 
     @staticmethod
     def size_from(data: bytes) -> int:
@@ -135,7 +139,7 @@ class Codec:
             lines = tuple(Line(*values) for values in _LINE.iter_unpack(numbers))
         except (ValueError, struct.error) as error:
             raise InputError(f"the hidden parameters are damaged: {error}") from error
-        if len(lines) != 6 + table.sh_degree:
+        if len(lines) != 7 + 2 * table.sh_degree:
             raise InputError("the hidden parameters are damaged: they are too short")
         return Codec(table, lines)
 
@@ -146,24 +150,27 @@ class Codec:
             yield next(lines).encode(_doubles(gaussians.means[:, axis : axis + 1]), table.means), table.means
         yield next(lines).encode(_doubles(gaussians.log_scales), table.log_scales), table.log_scales
         yield next(lines).encode(_logits(gaussians)[:, None], table.opacity), table.opacity
-        yield next(lines).encode(_doubles(gaussians.sh[:, 0]), table.dc), table.dc
         left_out, three = _three_smallest(_doubles(gaussians.quats))
         yield left_out, 2
         yield Line(0, 0, _LARGEST_QUAT).encode(three, table.quats), table.quats
-        for band, bits in zip(_bands(table.sh_degree), table.bands, strict=True):
-            yield next(lines).encode(_doubles(gaussians.sh[:, band].flatten(1)), bits), bits
+        for band in range(table.sh_degree + 1):
+            for values, bits in _colours(gaussians, table, band):
+                yield next(lines).encode(values.reshape(len(values), -1), bits), bits
 
     def _values(self, records: Bytes) -> Gaussians:
         table, lines, read = self.table, iter(self.lines), _Unpacker(records)
         means = np.concatenate([next(lines).decode(read(1, table.means), table.means) for _ in range(3)], 1)
         log_scales = next(lines).decode(read(3, table.log_scales), table.log_scales)
         logits = next(lines).decode(read(1, table.opacity), table.opacity)[:, 0]
-        harmonics = [next(lines).decode(read(3, table.dc), table.dc)]
         left_out = read(1, 2)
         quats = _whole_quats(left_out, Line(0, 0, _LARGEST_QUAT).decode(read(3, table.quats), table.quats))
-        for count, bits in zip(BANDS, table.bands, strict=False):
-            harmonics.append(next(lines).decode(read(3 * count, bits), bits))
-        sh = np.concatenate(harmonics, axis=1).reshape(len(records), -1, 3)
+        harmonics = []
+        for count, bits in zip((1, *BANDS), (table.dc, *table.bands), strict=False):
+            brightness = next(lines).decode(read(count, bits), bits)[:, :, None]
+            bits -= CHROMA_FEWER
+            differences = next(lines).decode(read(2 * count, bits), bits).reshape(-1, count, 2)
+            harmonics.append(np.concatenate([brightness, differences], axis=2) @ _COLOURS)
+        sh = np.concatenate(harmonics, axis=1)
         return Gaussians(*(torch.from_numpy(v).float() for v in (means, quats, log_scales, logits, sh)))
 
 
@@ -254,12 +261,16 @@ def _best_line(values: Floats, bits: int, *, centred: bool = False) -> Line:
 def _line(centre: float, spread: float, reach: float) -> Line:
     """A line whose numbers are of single precision, as they are stored, and that is longer than a point."""
     reach = max(reach * (1 + 1e-6), 1e-6)
+    spread = max(spread, _LEAST_SPREAD) if spread > 0 else 0.0
     return Line(*_LINE.unpack(_LINE.pack(centre, spread, reach)))
 
 
-def _bands(sh_degree: int) -> list[slice]:
-    """Where the bands above the constant one lie in `Gaussians.sh`."""
-    return [slice(degree**2, (degree + 1) ** 2) for degree in range(1, sh_degree + 1)]
+def _colours(gaussians: Gaussians, table: Table, band: int) -> Iterator[tuple[Floats, int]]:
+    """A band's brightness [N, count] and differences [N, count, 2], with the bits of each."""
+    bits = (table.dc, *table.bands)[band]
+    rotated = _doubles(gaussians.sh[:, band**2 : (band + 1) ** 2]) @ _COLOURS.T
+    yield rotated[:, :, 0], bits
+    yield rotated[:, :, 1:], bits - CHROMA_FEWER
 
 
 def _doubles(values: torch.Tensor) -> Floats:
