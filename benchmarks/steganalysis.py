@@ -1,6 +1,7 @@
 """How well a classifier tells embedded models from ordinary ones, on models that you have.
 
     python benchmarks/steganalysis.py bonsai=runs/a/model.ply bonsai=runs/b/model.ply fox=runs/c/model.ply ...
+    python benchmarks/steganalysis.py --carry bonsai=...     # each carries a part of the next instead
 
 Each model is cut into up to four spatially disjoint parts of at least 1,000 Gaussians, and each part is
 embedded into. The classifiers learn from all scenes but one and are tried on that one; a scene is the name
@@ -19,6 +20,7 @@ from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from keyss.carry import carrying
 from keyss.files.ply import read_ply
 from keyss.seal import DerivedKey
 from keyss.seal.container import embed_derived
@@ -29,16 +31,24 @@ Labels = npt.NDArray[np.int64]
 
 
 def main(arguments: list[str]) -> None:
+    carried = "--carry" in arguments
+    arguments = [argument for argument in arguments if argument != "--carry"]
     plain, embedded, scenes, models = [], [], [], []
+    secret = read_ply(arguments[-1].split("=", 1)[1])
     for model, argument in enumerate(arguments):
         scene, path = argument.split("=", 1)
         whole = read_ply(path)
         for part in parts(whole, min(2, int(np.log2(len(whole) / 1000)))):
             keys = [DerivedKey.of_master(os.urandom(32)) for _ in range(SALTS)]
             plain.append(features(part))
-            embedded.append(features(embed_derived(part, [(keys, os.urandom(800))])))
+            if carried:
+                stego = carrying.embed_derived(part, [(keys, secret[: len(part)])])
+            else:
+                stego = embed_derived(part, [(keys, os.urandom(800))])
+            embedded.append(features(stego))
             scenes.append(scene)
             models.append(model)
+        secret = whole
     groups, owners = np.unique(scenes, return_inverse=True)[1], np.array(models)
     count = len(scenes)
     print(f"{len(arguments)} models of {groups.max() + 1} scenes in {count} parts")

@@ -17,6 +17,9 @@ import torch
 from torch import Tensor
 
 from keyss._version import __version__
+from keyss.carry import verb as carrying
+from keyss.carry.carrying import Carried
+from keyss.carry.filling import filled
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
@@ -30,6 +33,7 @@ from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.hiding.config import HideConfig
 from keyss.hiding.from_models import is_model, scene_of_model
+from keyss.hiding.opening import open_model
 from keyss.hiding.payload import HiddenSecret, pack_secret
 from keyss.hiding.pipeline import hide_scenes
 from keyss.hiding.revealing import Frame, open_secret, read_sidecar, reveal_gaussians
@@ -38,6 +42,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering import render as render_image
 from keyss.seal.sidecar import read_header
 
+Method = Literal["learned", "carry"]
 Split = Literal["test", "train", "all"]
 Background = Tensor | Sequence[float] | None
 PathLike = str | Path
@@ -54,9 +59,9 @@ PRIVATE = "private"  # plain models of cover and secrets: for measuring, never t
 
 @dataclass(frozen=True)
 class Secret:
-    """A scene to hide and the key that is to open it."""
+    """A scene to hide and the key that is to open it; for carrying also a .ply file, or a model."""
 
-    scene: PathLike | Scene
+    scene: PathLike | Scene | Gaussians
     key: str
     model: PathLike | Gaussians | None = None  # a plain 3DGS model of it, if there is one already
 
@@ -127,15 +132,18 @@ def fit(
 
 
 def hide(
-    cover: PathLike | Scene,
+    cover: PathLike | Scene | Gaussians,
     secrets: Sequence[Secret],
     *,
+    method: Method = "learned",
     config: HideConfig | None = None,
     width: int | None = None,
     background: Background = None,
     cover_model: PathLike | Gaussians | None = None,
     sidecar: bool = False,
     encoder: Callable[[str], Tensor] | None = None,
+    thin: bool = False,
+    dither: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -150,17 +158,32 @@ def hide(
     decoder, such as a `keyss.hiding.clip_keys.ClipKeys`; by default Argon2id's. `out` (a folder) gets these,
     `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which
     `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+
+    With the `method` "carry" the models themselves go into the low bits of the cover's (`keyss.carry.verb`):
+    nothing is trained but the models of scenes, cover and secrets may be .ply files or `Gaussians`, and of
+    `config` only `fit` counts. `thin` leaves out of secrets that are too large what is least visible;
+    `dither` gives new low bits to a cover whose are not random.
     """
     config = config or HideConfig()
     if not secrets:
         raise UsageError("expected at least one secret")
+    if sidecar if method == "carry" else (thin or dither):
+        raise UsageError("--thin and --dither are for --method carry, --sidecar is for the other")
     target = resolve_device(device)
     folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
+    if method == "carry":
+        stego, metrics = carrying.hide(
+            [(cover, cover_model), *((secret.scene, secret.model) for secret in secrets)],
+            [secret.key for secret in secrets],
+            carrying.PlainModels(width, background, config.fit, target, folder, resume, reporter),
+            thin=thin,
+            dithered=dither,
+        )
+        return HideResult(stego, None, metrics)
     sources = [cover, *(secret.scene for secret in secrets)]
-    given = [cover_model, *(secret.model for secret in secrets)]
     given = [
         source if model is None and not isinstance(source, Scene) and is_model(source) else model
-        for source, model in zip(sources, given, strict=True)
+        for source, model in zip(sources, [cover_model, *(secret.model for secret in secrets)], strict=True)
     ]
     plains = [None if model is None else _model(model) for model in given]
     scenes = [_scene(source, width, background) for source in sources]
@@ -230,6 +253,9 @@ def reveal(
 ) -> Gaussians:
     """The secret that `key` opens in a stego model, as an ordinary model; see `reveal_gaussians`.
 
+    Which method hid it shows itself. A carried one was never in the cover's frame and comes in its own; if
+    Gaussians were lost, the others are enlarged to make up for them (`keyss.carry.filling`).
+
     `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
     lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
     opens nothing (with `decoy` the cover comes instead, see `decoy_secret`), InputError for files that are
@@ -241,7 +267,10 @@ def reveal(
     if decoder is None and not isinstance(stego, Gaussians):
         decoder = _sidecar_beside(Path(stego))
     secret = _open(model, key, decoder, decoy=decoy)
-    revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
+    if isinstance(secret, Carried):
+        revealed = filled(secret.gaussians, secret.count)
+    else:
+        revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
     if path is not None:
         write_ply(path, revealed)
     return revealed
@@ -310,17 +339,22 @@ def evaluate(
     opened = {_fingerprint(secret): secret for secret in (_open(stego, key, beside) for key in keys)}
     if set(opened) != set(fingerprints):
         raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(opened)} of them")
-    scenes = [_scene(source, width, background) for source in sources]
-    bounds = [read_ply(folder / name) for name in _plain_names(len(scenes) - 1)]
-    metrics = measure_hiding(
-        stego.to(target),
-        [opened[fingerprint] for fingerprint in fingerprints],
-        scenes,
-        [bound.to(target) for bound in bounds],
-        wrong_keys=wrong_keys,
-        seed=seed,
-    )
-    metrics = {**old, **metrics}
+    found = [opened[fingerprint] for fingerprint in fingerprints]
+    learned = [each for each in found if isinstance(each, HiddenSecret)]
+    carried = [each for each in found if isinstance(each, Carried)]
+    if carried:
+        metrics = carrying.evaluate(old, stego, carried, sources, width, background, target)
+    else:
+        scenes = [_scene(source, width, background) for source in sources]
+        bounds = [read_ply(folder / name) for name in _plain_names(len(scenes) - 1)]
+        metrics = old | measure_hiding(
+            stego.to(target),
+            learned,
+            scenes,
+            [bound.to(target) for bound in bounds],
+            wrong_keys=wrong_keys,
+            seed=seed,
+        )
     write_bytes(folder / METRICS, _json_bytes(metrics))
     return metrics
 
@@ -378,23 +412,24 @@ def _describe_scene(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _scene(source: PathLike | Scene, width: int | None, background: Background) -> Scene:
-    """A scene, the photos in a folder, or what the model in a `.ply` shows from all around."""
+def _scene(source: PathLike | Scene | Gaussians, width: int | None, background: Background) -> Scene:
+    """A scene, the photos in a folder, or what a model or the one in a `.ply` shows from all around."""
     if isinstance(source, Scene):
         return source
-    if not is_model(source):
+    if not isinstance(source, Gaussians) and not is_model(source):
         return load_scene(source, width=width, background=background)
+    name = "model" if isinstance(source, Gaussians) else Path(source).stem
     colour = None if background is None else torch.as_tensor(background, dtype=torch.float32)
-    return scene_of_model(read_ply(source), Path(source).stem, size=width, background=colour)
+    return scene_of_model(_model(source), name, size=width, background=colour)
 
 
 def _model(source: PathLike | Gaussians) -> Gaussians:
     return source.to("cpu") if isinstance(source, Gaussians) else read_ply(source)
 
 
-def _name(source: PathLike | Scene) -> str | None:
+def _name(source: PathLike | Scene | Gaussians) -> str | None:
     """Where a scene can be found again, None for one in memory."""
-    return None if isinstance(source, Scene) else str(Path(source).resolve())
+    return None if isinstance(source, Scene | Gaussians) else str(Path(source).resolve())
 
 
 def _width(scene: Scene) -> int:
@@ -403,9 +438,11 @@ def _width(scene: Scene) -> int:
 
 def _open(
     stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False
-) -> HiddenSecret:
-    """See `open_secret`. Errors name the sidecar's file."""
-    if sidecar is None or isinstance(sidecar, bytes):
+) -> HiddenSecret | Carried:
+    """What the key opens, of either method; see `open_model`. Errors name the sidecar's file."""
+    if sidecar is None:
+        return open_model(stego, key, decoy=decoy)
+    if isinstance(sidecar, bytes):
         return open_secret(stego, key, sidecar, decoy=decoy)
     try:
         return open_secret(stego, key, read_sidecar(Path(sidecar)), decoy=decoy)
@@ -418,8 +455,10 @@ def _sidecar_beside(stego: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def _fingerprint(secret: HiddenSecret) -> str:
+def _fingerprint(secret: HiddenSecret | Carried) -> str:
     """By which `evaluate` knows whose key it was given; says nothing without the secret."""
+    if isinstance(secret, Carried):
+        return secret.fingerprint()
     return hashlib.sha256(pack_secret(secret)).hexdigest()[:16]
 
 

@@ -124,6 +124,10 @@ def hide(
         UseAppendAction[tuple[Path, ...]],
         arg(metavar="SCENE", help="Scene or .ply model to hide in it; at least one."),
     ],
+    method: Annotated[
+        Literal["learned", "carry"],
+        arg(help="Train one model that shows both, or carry one model in the low bits of the other."),
+    ] = "learned",
     key_file: KeyFiles = (),
     out: OutFolder,
     preset: Annotated[
@@ -162,6 +166,10 @@ def hide(
     clip_model: Annotated[
         Path | None, optional("FOLDER", "CLIP for --key-encoder clip.", "ViT-L/14 in the cache")
     ] = None,
+    thin: Annotated[bool, arg(help="Carry: leave out what is least visible of too large a secret.")] = False,
+    dither: Annotated[
+        bool, arg(help="Carry: give the cover new low bits where they are not random.")
+    ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -176,7 +184,7 @@ def hide(
 
     from keyss import verbs
     from keyss.cli.keys import keys, warn_of_weak_keys
-    from keyss.cli.tables import print_files, print_metrics
+    from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.core.errors import UsageError
     from keyss.files.ply import read_ply
     from keyss.hiding.config import PRESETS
@@ -190,6 +198,8 @@ def hide(
         raise UsageError(
             f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
         )
+    if method == "carry" and (mask is not None or start is not None):
+        raise UsageError("--mask and --start are for the learned method: carrying trains no decoder")
     config = PRESETS[preset]
     config = config.adapted(None if mask is None else parse_mask(mask), start)
     if max_gaussians is None and all(map(is_model, (cover, *secret))):
@@ -208,19 +218,22 @@ def hide(
     verbs.hide(
         cover,
         [verbs.Secret(scene, key, model) for scene, key, model in zip(secret, chosen, models, strict=True)],
+        method=method,
         config=config,
         width=width,
         background=background,
         cover_model=cover_model,
         sidecar=sidecar,
         encoder=encoder,
+        thin=thin,
+        dither=dither,
         device=device,
         out=out,
         overwrite=overwrite,
         resume=resume,
         reporter=reporter(),
     )
-    print_metrics(_metrics(out))
+    (print_carry if method == "carry" else print_metrics)(_metrics(out))
     print_files(
         out,
         {
@@ -322,7 +335,7 @@ def evaluate(
     """
     from keyss import verbs
     from keyss.cli.keys import keys
-    from keyss.cli.tables import print_files, print_metrics
+    from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.progress import reporter
 
     metrics = verbs.evaluate(
@@ -333,7 +346,7 @@ def evaluate(
         device=device,
         reporter=reporter(),
     )
-    print_metrics(metrics)
+    (print_carry if metrics.get("method") == "carry" else print_metrics)(metrics)
     print_files(run, {"metrics.json": "the numbers"})
 
 

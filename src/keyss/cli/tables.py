@@ -34,6 +34,36 @@ def print_metrics(metrics: Metrics, console: Console | None = None) -> None:
     )
 
 
+def print_carry(metrics: Metrics, console: Console | None = None) -> None:
+    """The numbers of carrying: what is where, and against photos where there are any."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("")
+    for name in ("Gaussians", "carried", "bits each", "PSNR", "SSIM", "bound", "loss"):
+        table.add_column(name, justify="right")
+    secrets, bound = metrics["secrets"], metrics["bound"]
+    rows = [("cover", f"{metrics['gaussians']:,}", "", "", metrics["cover"], bound["cover"])]
+    for i, (secret, limit) in enumerate(zip(secrets, bound["secrets"], strict=True)):
+        counts = (f"{secret['gaussians']:,}", f"{secret['carried']:,}", str(secret["bits"]))
+        rows.append((_numbered("secret", i, len(secrets)), *counts, secret, limit))
+    for *cells, got, limit in rows:
+        if limit is None:
+            table.add_row(*cells)
+            continue
+        numbers = (got["psnr"], got["ssim"], limit["psnr"], limit["psnr"] - got["psnr"])
+        table.add_row(
+            *cells, *(f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 3, 2, 3), strict=True))
+        )
+    console = console or Console()
+    console.print(table)
+    console.print(
+        f"{metrics['carriers']:,} of the cover's {metrics['gaussians']:,} Gaussians can carry something; "
+        f"up to {metrics['room']:,} fit. {metrics['seconds']:.1f} s.",
+        soft_wrap=True,
+    )
+    if metrics["dither_psnr"] is not None:
+        console.print(f"Dithering costs the cover {metrics['dither_psnr']:.1f} dB (PSNR before and after).")
+
+
 def print_fit(metrics: Metrics, console: Console | None = None) -> None:
     """The numbers of a plain fit."""
     table = Table(box=None, pad_edge=False, header_style="bold")

@@ -24,9 +24,9 @@ DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY = 8
 
 
-def is_model(path: str | Path) -> bool:
-    """Whether a path names a model and not a folder of photos."""
-    return Path(path).suffix.lower() == ".ply"
+def is_model(source: str | Path | Gaussians) -> bool:
+    """Whether a source is a model, or the name of one, and not a folder of photos."""
+    return isinstance(source, Gaussians) or Path(source).suffix.lower() == ".ply"
 
 
 @torch.no_grad()

@@ -49,9 +49,9 @@ def open_secret(
 def decoy_secret(stego: Gaussians, key: DerivedKey) -> HiddenSecret:
     """A secret that is the cover: what a wrong key opens for whoever looks on.
 
-    Its decoder has the default shape and a random curve, its frame is a random one, and both change too little
-    to be seen. So a reveal does the same work as with a right key, and gives neither the bytes of `stego` nor,
-    for who does not have the key, bytes that can be computed.
+    Its decoder has the default shape and a random curve, its frame is a random one, and both change too
+    little to be seen. So a reveal does the same work as with a right key, and gives neither the bytes of
+    `stego` nor, for who does not have the key, bytes that can be computed.
     """
     generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
     decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))

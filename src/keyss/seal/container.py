@@ -60,7 +60,7 @@ def embed(stego: Gaussians, secrets: Sequence[tuple[str, bytes]]) -> Gaussians:
     if not secrets:
         raise UsageError("expected at least one secret")
     names = identities(stego)
-    derivations = [_derivation(identity) for identity in smallest(names)]
+    derivations = [derivation_of(identity) for identity in smallest(names)]
     return embed_derived(
         stego,
         [([DerivedKey(key, each) for each in derivations], payload) for key, payload in secrets],
@@ -127,7 +127,7 @@ def extract(stego: Gaussians, key: str) -> bytes:
 
 def key_for(names: Iterable[bytes], key: str) -> DerivedKey:
     """What `key` becomes for a model of these identities; takes about 0.1 s."""
-    return DerivedKey(key, _derivation(smallest(names)[0]))
+    return DerivedKey(key, derivation_of(smallest(names)[0]))
 
 
 def extract_derived(stego: Gaussians, key: DerivedKey, names: Sequence[bytes] | None = None) -> bytes:
@@ -157,7 +157,7 @@ def smallest(names: Iterable[bytes]) -> list[bytes]:
     return sorted(set(names))[:SALTS]
 
 
-def _derivation(identity: bytes) -> KeyDerivation:
+def derivation_of(identity: bytes) -> KeyDerivation:
     """The costs are fixed: there is nowhere to state others before a key is derived."""
     return KeyDerivation(salt=hashlib.sha256(b"keyss/v1/salt" + identity).digest()[:SALT_BYTES])
 

@@ -90,7 +90,8 @@ class DerivedKey:
     """What a key becomes under one `KeyDerivation`.
 
     The labels in use: "embedding" (what conditions the decoder), "verifier" (tells keys apart while hiding),
-    "seal" (wraps the sidecar's data key), "cells/header" (carries the data key in a model's low bits).
+    "seal" (wraps the sidecar's data key), "cells/header" (carries the data key in a model's low bits),
+    "cells/writer" (what is random there depends on it), "carry/key" (carries that of a carried model).
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:

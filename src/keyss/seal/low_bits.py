@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import Counter
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,9 @@ _SHORT = np.uint32((1 << 20) - 1)
 # Nor is a Gaussian, when so many of its values have so many zeros; by chance one in three million is that.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 
+_CHUNK = 1 << 16
 _SAMPLE = 20_000
+_SHIFTS = (_UNUSED_BITS, _UNUSED_BITS + _SH_BITS - 8)  # two overlapping bytes
 _LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in trained models, above 50 in others
 
 Words = npt.NDArray[np.uint32]
@@ -99,17 +101,32 @@ def is_random(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
     much of it as by chance would be a tell.
     """
     used = _used(gaussians)
-    exponents = used >> 23 & 255
-    good = ((used & _SHORT) != 0) & (exponents > 0) & (exponents < 254)
-    for group in _GROUPS:
-        values = used[:, group]
-        _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-        good[:, group] &= (counts[inverse] < _unlikely_copies(values.size)).reshape(values.shape)
-    result: npt.NDArray[np.bool_] = good.all(axis=1) & (((used & _ZEROS) == 0).sum(axis=1) < _ZERO_FIELDS)
-    names = identities(gaussians)
-    times = Counter(names)
-    result &= np.array([times[name] == 1 for name in names], dtype=bool)
-    return result & ~_has_twins(used, _mask(gaussians))
+    good = np.ones(len(used), bool)
+    zeros = np.zeros(len(used), np.int64)
+    frequent, mask = [_frequent(used[:, group]) for group in _GROUPS], _mask(gaussians)
+    for start in range(0, len(used), _CHUNK):  # some at a time: models may have millions of Gaussians
+        part = used[start : start + _CHUNK]
+        exponents = part >> 23 & 255
+        fine = ((part & _SHORT) != 0) & (exponents > 0) & (exponents < 254)
+        for group, values in zip(_GROUPS, frequent, strict=True):
+            if len(values):
+                place = np.searchsorted(values, part[:, group]).clip(max=len(values) - 1)
+                fine[:, group] &= values[place] != part[:, group]
+        good[start : start + _CHUNK] = fine.all(axis=1) & ~_has_twins(part, mask)
+        zeros[start : start + _CHUNK] = ((part & _ZEROS) == 0).sum(axis=1)
+    del used
+    names = (
+        name
+        for start in range(0, len(good), _CHUNK)
+        for name in identities(gaussians[start : start + _CHUNK])
+    )
+    _, inverse, times = np.unique(
+        np.fromiter((int.from_bytes(name[:8], "little") for name in names), np.uint64, len(good)),
+        return_inverse=True,
+        return_counts=True,
+    )
+    result: npt.NDArray[np.bool_] = good & (zeros < _ZERO_FIELDS) & (times[inverse] == 1)
+    return result
 
 
 def _has_twins(used: Words, mask: Words) -> npt.NDArray[np.bool_]:
@@ -134,17 +151,28 @@ def check_natural(gaussians: Gaussians, chosen: npt.NDArray[np.bool_]) -> None:
     rows = np.flatnonzero(chosen)
     rows = rows[:: max(1, len(rows) // _SAMPLE)]
     used = _used(gaussians)[rows]
-    for shift in (_UNUSED_BITS, _UNUSED_BITS + _SH_BITS - 8):
+    for shift in _SHIFTS:
         for column in range(used.shape[1]):
-            counts = np.bincount(used[:, column] >> shift & 255, minlength=256)
-            expected = len(rows) / 256
-            ratio = float(((counts - expected) ** 2).sum() / expected / 255)
+            ratio = _chi_square(used[:, column] >> shift & 255)
             if ratio > _LARGEST_RATIO:
                 raise InputError(
                     f"the low bits of {_field_name(column)} are not random in this model (chi-square "
                     f"{ratio:.1f} per degree of freedom, 1 expected), so that nothing can be hidden in them: "
                     "it was quantised, scaled or moved after its training; --sidecar needs no low bits"
                 )
+
+
+def is_uniform(values: npt.NDArray[np.float32]) -> bool:
+    """The same test for one property [N]."""
+    words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
+    return all(_chi_square(words >> shift & 255) <= _LARGEST_RATIO for shift in _SHIFTS)
+
+
+def _chi_square(bytes_: npt.NDArray[np.integer[Any]]) -> float:
+    """Per degree of freedom, of the frequencies of numbers below 256."""
+    counts = np.bincount(bytes_, minlength=256)
+    expected = len(bytes_) / 256
+    return float(((counts - expected) ** 2).sum() / expected / 255)
 
 
 def _field_name(column: int) -> str:
@@ -165,6 +193,13 @@ def _mask(gaussians: Gaussians) -> Words:
     """[F] the bits in use of every field."""
     bits = [_GEOMETRY_BITS] * _GEOMETRY + [_SH_BITS] * _sh_count(gaussians.sh_degree)
     return np.array([((1 << count) - 1) << _UNUSED_BITS for count in bits], np.uint32)
+
+
+def _frequent(values: Words) -> Words:
+    """[V] the values that occur more often than is likely."""
+    flat = np.sort(values, axis=None)
+    more = _unlikely_copies(flat.size) - 1
+    return np.unique(flat[more:][flat[more:] == flat[: len(flat) - more]])
 
 
 def _unlikely_copies(count: int) -> int:

@@ -1,0 +1,159 @@
+"""What carrying costs and holds: time, memory, capacity, and decibels for models that you have.
+
+    python benchmarks/carry.py                      # 100,000 in 100,000 made-up Gaussians, capacities
+    python benchmarks/carry.py --large              # also 2 million in 2 million: time and peak memory
+    python benchmarks/carry.py --models FOLDER      # every .ply in it as a cover, and as a secret in the next
+    python benchmarks/carry.py --photos SCENE=MODEL.ply SCENE=MODEL.ply    # each in the other, against photos
+
+Each timing runs in a process of its own, from files to files, key derivation included and imports left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import permutations
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from keyss import read_ply, write_ply
+from keyss.carry import embed, extract
+from keyss.carry.carrying import usable_carriers
+from keyss.carry.dither import cost
+from keyss.carry.filling import filled
+from keyss.carry.plan import Size, room
+from keyss.core import Gaussians, KeyssError, Scene
+from keyss.files.scenes import load_scene
+from keyss.fitting.image_metrics import mean_psnr
+from keyss.rendering import render
+from seal.trained_like import trained_like
+
+KEY = "the key of the benchmark"
+REMOVED = 0.25
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--large", action="store_true")
+    parser.add_argument("--models", type=Path)
+    parser.add_argument("--photos", nargs="+", default=[])
+    parser.add_argument("--width", type=int, default=200)
+    parser.add_argument("--step", nargs=3, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.step:
+        _step(arguments.step[0], Path(arguments.step[1]), int(arguments.step[2]))
+        return
+    _capacities()
+    for count in (100_000, 2_000_000) if arguments.large else (100_000,):
+        _timed(count)
+    if arguments.models:
+        _models(sorted(arguments.models.rglob("*.ply")))
+    if arguments.photos:
+        _photos([pair.split("=", 1) for pair in arguments.photos], arguments.width)
+
+
+def _capacities() -> None:
+    print("Gaussians that fit in 100,000 carriers, by SH degree of the secret (0, 1, 2, 3):")
+    for degree in range(4):
+        fits = [room([Size(1, other)], 100_000, degree) for other in range(4)]
+        print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
+
+
+def _timed(count: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for step in ("make", "hide", "reveal"):
+            subprocess.run([sys.executable, __file__, "--step", step, folder, str(count)], check=True)
+
+
+def _step(step: str, folder: Path, count: int) -> None:
+    if step == "make":
+        for name, seed in (("cover", 0), ("secret", 1)):
+            write_ply(folder / f"{name}.ply", trained_like(count, seed))
+        return
+    start = time.perf_counter()
+    if step == "hide":
+        stego = embed(read_ply(folder / "cover.ply"), [(KEY, read_ply(folder / "secret.ply"))])
+        write_ply(folder / "stego.ply", stego)
+    else:
+        carried = extract(read_ply(folder / "stego.ply"), KEY)
+        write_ply(folder / "revealed.ply", carried.gaussians)
+        assert len(carried.gaussians) == count
+    seconds = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2  # KiB on Linux
+    print(f"{step} {count:,} in {count:,}: {seconds:.2f} s, at most {peak:.2f} GiB", flush=True)
+
+
+def _models(paths: list[Path]) -> None:
+    """Renders from around each model, of the stego model and of what comes out again."""
+    models = {path: read_ply(path) for path in paths}
+    for cover, secret in zip(paths, paths[1:] + paths[:1], strict=True):
+        try:
+            usable = usable_carriers(models[cover])
+            stego = embed(models[cover], [(KEY, models[secret])])
+        except KeyssError as error:
+            print(f"{cover}: {error}")
+            continue
+        carried = extract(stego, KEY)
+        print(
+            f"{cover} ({len(stego):,}, {usable.mean():.0%} usable) carries {secret} ({carried.count:,}, "
+            f"{carried.bits} bits): cover before and after {cost(models[cover], stego):.1f} dB, "
+            f"secret and its own model {cost(models[secret], carried.gaussians):.1f} dB",
+            flush=True,
+        )
+
+
+def _photos(pairs: list[list[str]], width: int) -> None:
+    """Against the test photos, whole and with a quarter of the Gaussians removed."""
+    scenes = {scene: load_scene(scene, width=width) for scene, _ in pairs}
+    for (cover, cover_path), (secret, secret_path) in permutations(pairs, 2):
+        model, hidden = read_ply(cover_path), read_ply(secret_path)
+        stego = embed(model, [(KEY, hidden)])
+        found = extract(stego, KEY).gaussians
+        kept = stego[_kept(len(stego))]
+        left = extract(kept, KEY)
+        raw, mended = (
+            _against(scenes[secret], each) for each in (left.gaussians, filled(left.gaussians, left.count))
+        )
+        whole, bare = _against(scenes[secret], found), _against(scenes[secret], hidden)
+        before, after = _against(scenes[cover], model), _against(scenes[cover], kept)
+        cover_change = _between(scenes[cover], model, stego)
+        secret_change = _between(scenes[secret], hidden, found)
+        print(
+            f"{secret} in {cover}:\n"
+            f"  cover before and after {cover_change:.1f} dB, "
+            f"photos {before:.3f} and {_against(scenes[cover], stego):.3f} dB\n"
+            f"  secret and its own model {secret_change:.1f} dB, "
+            f"photos {whole:.3f} ({whole - bare:+.3f}) dB\n"
+            f"  25 % removed: cover {after - before:+.2f} dB, secret {raw - whole:+.2f} dB, made up for "
+            f"{mended - whole:+.2f} dB",
+            flush=True,
+        )
+
+
+def _kept(count: int) -> torch.Tensor:
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
+    return order[: round(count * (1 - REMOVED))].sort().values
+
+
+def _against(scene: Scene, model: Gaussians) -> float:
+    return mean_psnr(model, scene.test, scene.background)
+
+
+def _between(scene: Scene, before: Gaussians, after: Gaussians) -> float:
+    """The worst view's PSNR."""
+    values = []
+    for view in scene.test:
+        pictures = [render(model, view.camera, scene.background).clamp(0, 1) for model in (before, after)]
+        values.append(float(-10 * torch.log10((pictures[0] - pictures[1]).square().mean().clamp_min(1e-12))))
+    return min(values)
+
+
+if __name__ == "__main__":
+    main()
