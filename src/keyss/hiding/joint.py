@@ -17,11 +17,13 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.fitting.sampling import Shuffle
 from keyss.hiding.config import HideConfig, chosen_scenes
 from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.start import make_start
+from keyss.hiding.start import HIDDEN_SLOPE, make_start
 from keyss.hiding.targets import CombinedPoses, PlacedScene
 from keyss.hiding.visibility import possibly_seen
 from keyss.rendering import render_with_meta
 from keyss.seal.keys import random_embeddings
+
+LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
 
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
@@ -55,11 +57,12 @@ class JointRun:
         start = make_start(scenes, config, self.generator)
         self.warm = start.curves is not None
         self.parameters = to_parameters(start.gaussians, device)
-        rate = config.warm_rate if self.warm else 1.0
         self.optimizers = make_optimizers(self.parameters, config.fit, self.extent)
-        for optimizer in self.optimizers.values():
-            optimizer.param_groups[0]["lr"] *= rate
-        self.means_rate = self.optimizers["means"].param_groups[0]["lr"]
+        self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
+        if self.warm:
+            self.rates = {name: config.warm_rate * rate for name, rate in self.rates.items()}
+            # The hidden opacities are drawn together: what moves them moves the secret's 1 / slope as far.
+            self.rates["opacities"] *= HIDDEN_SLOPE
         self.strategy = CappedStrategy(
             config.fit,
             self._largest_opacity if config.prune_by == "all" else None,
@@ -150,7 +153,11 @@ class JointRun:
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
-        self.optimizers["means"].param_groups[0]["lr"] = self.means_rate * 0.01**progress
+        # Constant rates leave everything trembling, which a warm start has no growth to make up for.
+        late = LAST_RATE ** max(0.0, 2 * progress - 1) if self.warm else 1.0
+        for name, optimizer in self.optimizers.items():
+            decay = 0.01**progress if name == "means" else late
+            optimizer.param_groups[0]["lr"] = self.rates[name] * decay
         if self.decoder_optimizer is not None:
             warm_up = min(1.0, self.iteration / 100)
             self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress

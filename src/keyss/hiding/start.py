@@ -71,7 +71,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
         replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
         for secret, part in enumerate(chosen[1:])
     ]
-    return Start(Gaussians.cat(parts), tuple(_curve(secret) for secret in range(len(chosen) - 1)))
+    return Start(Gaussians.cat(parts), tuple(opacity_curve(secret) for secret in range(len(chosen) - 1)))
 
 
 def hidden_logits(logits: Tensor, secret: int) -> Tensor:
@@ -79,7 +79,7 @@ def hidden_logits(logits: Tensor, secret: int) -> Tensor:
     return HIDDEN_LOGIT + HIDDEN_STEP * secret + HIDDEN_SLOPE * logits.clamp(*SHOWN_LOGITS)
 
 
-def _curve(secret: int) -> tuple[list[float], list[float]]:
+def opacity_curve(secret: int) -> tuple[list[float], list[float]]:
     """Knots and values of the opacity curve that undoes `hidden_logits` and makes all others transparent."""
     middle = HIDDEN_LOGIT + HIDDEN_STEP * secret
     low, high = (middle + HIDDEN_SLOPE * logit for logit in SHOWN_LOGITS)
