@@ -1,6 +1,7 @@
 # Every target sets up what it needs in .venv, with the versions in requirements/constraints.txt.
 #   make demo        hide one made-up scene in another and open it again (results in out/demo)
 #   make test        lint, types and tests; `make test-slow` and `make test-cuda` run what it leaves out
+#   make benchmark-fidelity     what hiding costs (ARGS="--data FOLDER --hide COVER,SECRET ... --write FILE")
 #   make benchmark-rasterizer   time the CPU rasterizer (ARGS="--large", "--models FOLDER", "--write FILE")
 # On Linux, PyPI's torch brings the CUDA libraries, several gigabytes. For a machine without a GPU:
 #   make demo PIP_EXTRA="--extra-index-url https://download.pytorch.org/whl/cpu"
@@ -15,7 +16,7 @@ DEV := .venv/.dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt $(PIP_EXTRA)
 PINS := pyproject.toml requirements/constraints.txt
 
-.PHONY: demo test test-slow test-cuda benchmark-rasterizer lint venv clean
+.PHONY: demo test test-slow test-cuda benchmark-rasterizer benchmark-fidelity lint venv clean
 
 demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
@@ -28,6 +29,9 @@ test-slow: $(DEV)
 
 test-cuda: $(DEV)
 	$(BIN)/python -m pytest -m cuda $(ARGS)
+
+benchmark-fidelity: $(DEV)
+	$(BIN)/python benchmarks/fidelity.py $(ARGS)
 
 benchmark-rasterizer: $(DEV)
 	$(BIN)/python benchmarks/rasterizer.py $(ARGS)

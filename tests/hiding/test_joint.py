@@ -251,7 +251,7 @@ def test_the_published_presets_train(preset: str) -> None:
     hidden = hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
     for secret in hidden.secrets:
         revealed = reveal_gaussians(hidden.stego, secret)
-        assert len(revealed) == len(hidden.stego)
+        assert 0 < len(revealed) <= len(hidden.stego)
         assert all(getattr(revealed, f.name).isfinite().all() for f in fields(Gaussians))
 
 

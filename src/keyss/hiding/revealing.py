@@ -23,6 +23,7 @@ from keyss.seal.sidecar import open_slots, read_header
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
 _ROUNDED_LOGIT = -12.5  # below it an opacity was rounded to zero: those of one secret or two lie above
+LEAST_OPACITY = 1 / 255  # below it no renderer draws anything
 _DECOY_STRENGTH = 0.02  # standard deviation of a decoy's changes of opacity logits
 _DECOY_MOVE = 1e-4  # and of its turns (radians), shifts (of the model's size) and changes of scale
 
@@ -74,7 +75,7 @@ def read_sidecar(path: Path) -> bytes:
 def reveal_gaussians(
     stego: Gaussians, secret: HiddenSecret, *, frame: Frame = "secret", force: bool = False
 ) -> Gaussians:
-    """The secret as a model of its own that needs no decoder and no cover.
+    """The secret as a model of its own that needs no decoder and no cover, without what is never drawn.
 
     `frame`: "secret" gives it in its own frame, so that its cameras fit it; "cover" leaves it where it was
     hidden. `force` is for models that were quantised: it skips the check that the secret belongs to this one,
@@ -89,6 +90,9 @@ def reveal_gaussians(
     else:
         secret.check_belongs_to(stego)
     decoded = decode(stego, secret, secret.embedding)
+    drawn = decoded.opacities >= LEAST_OPACITY
+    if drawn.any():
+        decoded = decoded[drawn]
     if frame == "cover":
         return decoded
     return secret.frame.inverse().apply_gaussians(decoded.to("cpu"))
