@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 import keyss
 from keyss import FitConfig, HideConfig, Secret
+from keyss.cli import main
 
 pytestmark = pytest.mark.slow
 CONFIG = HideConfig(fit=FitConfig(max_gaussians=20_000))
@@ -28,10 +30,10 @@ def test_bonsai_hides_fox_within_the_promised_losses(run: Path) -> None:
     assert metrics["seconds"] < 45 * 60
     assert bound["cover"]["psnr"] > 26.2
     assert bound["secrets"][0]["psnr"] > 30.9
-    assert metrics["cover"]["psnr"] > bound["cover"]["psnr"] - 1.5
-    assert metrics["secrets"][0]["psnr"] > bound["secrets"][0]["psnr"] - 3.5
-    assert wrong["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 1
-    assert wrong["vs_secrets"][0]["max"] < wrong["floor"][0] + 1
+    assert metrics["cover"]["psnr"] > bound["cover"]["psnr"] - 0.3
+    assert metrics["secrets"][0]["psnr"] > bound["secrets"][0]["psnr"] - 0.8
+    assert wrong["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 0.1
+    assert wrong["vs_secrets"][0]["max"] < wrong["floor"][0] + 0.3
 
 
 @pytest.mark.parametrize(("cover", "secret"), [("miku", "lego"), ("lego", "fox"), ("fox", "miku")])
@@ -41,6 +43,18 @@ def test_other_pairs_do_not_collapse(real_data: Path, cover: str, secret: str) -
     metrics = keyss.hide(
         real_data / cover, [Secret(real_data / secret, "key")], config=config, width=160
     ).metrics
-    assert metrics["cover"]["psnr"] > metrics["bound"]["cover"]["psnr"] - 1.5
-    assert metrics["secrets"][0]["psnr"] > metrics["bound"]["secrets"][0]["psnr"] - 3.5
-    assert metrics["wrong_key"]["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 1
+    assert metrics["cover"]["psnr"] > metrics["bound"]["cover"]["psnr"] - 0.5
+    assert metrics["secrets"][0]["psnr"] > metrics["bound"]["secrets"][0]["psnr"] - 1
+    assert metrics["wrong_key"]["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 0.1
+
+
+def test_one_model_hides_in_another_without_photos(real_data: Path, tmp_path: Path) -> None:
+    """By the command's own defaults; measured from poses that were not trained on."""
+    (tmp_path / "key").write_text("a key for a robot")
+    (tmp_path / "key").chmod(0o600)
+    splats = real_data / "splats"
+    arguments = ["hide", "--cover", splats / "guitar.ply", "--secret", splats / "playbot_lod4.ply"]
+    assert main([*map(str, arguments), "--key-file", str(tmp_path / "key"), "-o", str(tmp_path / "out")]) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["cover"]["psnr"] > 50
+    assert metrics["secrets"][0]["psnr"] > 50
