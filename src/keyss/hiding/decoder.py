@@ -91,6 +91,11 @@ class Decoder(nn.Module):
         self.values.copy_(torch.tensor(values))
 
     @property
+    def band(self) -> tuple[float, float]:
+        """The opacity logits between which the secret's Gaussians lie after a warm start."""
+        return float(self.knots[1]), float(self.knots[4])
+
+    @property
     def faint_logit(self) -> float:
         """A logit at which the curve shows a Gaussian nearly opaque: high between its middle knots."""
         return float(torch.lerp(self.knots[2], self.knots[3], 0.7))

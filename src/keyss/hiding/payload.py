@@ -24,6 +24,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.mask import parse_mask
+from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, Scramble
 
 FORMAT = "keyss-secret"
 VERSION = 2
@@ -51,6 +52,7 @@ class HiddenSecret:
     decoder: Decoder
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
+    scramble: Scramble | None = None  # what the secret's Gaussians are published as, if not as they are
 
     @property
     def embedding(self) -> Tensor:
@@ -91,6 +93,13 @@ def pack_secret(secret: HiddenSecret) -> bytes:
         for name, value in decoder.state_dict().items()
     }
     tensors["anchors"] = secret.anchors.contiguous()
+    if secret.scramble is not None:
+        tensors |= {
+            "scramble.key": torch.frombuffer(bytearray(secret.scramble.key), dtype=torch.uint8),
+            "scramble.band": torch.tensor(secret.scramble.band),
+            "scramble.own": secret.scramble.own,
+            "scramble.shown": secret.scramble.shown,
+        }
     return safetensors.torch.save(tensors, {"keyss": json.dumps(header)})
 
 
@@ -122,6 +131,7 @@ def _metadata(data: bytes) -> dict[str, str]:
 
 def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSecret:
     shape = _shape(dict(header["shape"]))
+    scramble = _scramble({name: tensors.pop(name) for name in list(tensors) if name.startswith("scramble.")})
     if not all(
         value.dtype in (torch.float16, torch.float32) and value.isfinite().all() for value in tensors.values()
     ):
@@ -133,7 +143,24 @@ def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSec
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
     if not (decoder.knots.diff() > 0).all():
         raise InputError("opacity curve: expected ascending knots")
-    return HiddenSecret(decoder.requires_grad_(False), Similarity.from_json(header["frame"]), anchors)
+    frame = Similarity.from_json(header["frame"])
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble)
+
+
+def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:
+    if not tensors:
+        return None
+    key, band, own, shown = (tensors[f"scramble.{name}"] for name in ("key", "band", "own", "shown"))
+    tables = (own, shown)
+    if not (
+        key.dtype == torch.uint8
+        and key.shape == (KEY_BYTES,)
+        and band.shape == (2,)
+        and all(table.dtype == torch.float32 and table.shape == (CHANNELS, KNOTS) for table in tables)
+        and all(table.isfinite().all() and (table.diff(dim=1) >= 0).all() for table in tables)
+    ):
+        raise InputError("scrambled Gaussians: expected a key, a band and two ascending tables")
+    return Scramble(bytes(key.tolist()), (float(band[0]), float(band[1])), own, shown)
 
 
 def _shape(given: dict[str, Any]) -> DecoderShape:

@@ -23,6 +23,7 @@ from keyss.hiding.config import HideConfig
 from keyss.hiding.decoder import Decoder
 from keyss.hiding.joint import JointRun, decoder_shape
 from keyss.hiding.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, Scramble
 from keyss.hiding.targets import PlacedScene
 from keyss.seal import DerivedKey, KeyDerivation, embed, seal_sidecar
 from keyss.seal.keys import SALT_BYTES
@@ -118,10 +119,15 @@ def hide_scenes(
     )
     stego = run.gaussians().to("cpu")
     decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
+    scrambles: list[Scramble | None] = [None] * len(keys)
+    if run.warm and not sidecar:  # a sidecar is for files that will be rounded, which no scramble survives
+        for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
+            scramble = Scramble.of(stego, key.expand("scramble", KEY_BYTES), decoder.band)
+            stego, scrambles[index] = scramble.close(stego), scramble
     anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
     packed = [
-        pack_secret(HiddenSecret(decoder, frame, anchors))
-        for decoder, frame in zip(decoders, frames[1:], strict=True)
+        pack_secret(HiddenSecret(decoder, frame, anchors, scramble))
+        for decoder, frame, scramble in zip(decoders, frames[1:], scrambles, strict=True)
     ]
     sealed = None
     if sidecar:
@@ -134,7 +140,12 @@ def hide_scenes(
 def _largest_payload(config: HideConfig) -> int:
     """Bytes of a secret whose decoder cannot be compressed."""
     decoder = Decoder(decoder_shape(config))
-    return len(pack_secret(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3))))
+    scramble = None
+    if config.start == "warm":
+        tables = torch.rand(2, CHANNELS, KNOTS)
+        scramble = Scramble(bytes(KEY_BYTES), (0.0, 1.0), tables[0], tables[1])
+    secret = HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3), scramble)
+    return len(pack_secret(secret))
 
 
 def _discarded(run: JointRun, keys: Sequence[DerivedKey]) -> bytes:

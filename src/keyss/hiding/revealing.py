@@ -102,5 +102,7 @@ def reveal_gaussians(
 def decode(stego: Gaussians, secret: HiddenSecret, embedding: Tensor) -> Gaussians:
     """What the secret's decoder makes of `stego` for an embedding [64], in the cover's frame."""
     decoder = secret.decoder.to(stego.device)
+    if secret.scramble is not None:
+        stego = secret.scramble.open(stego)
     decoded: Gaussians = decoder(stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device))
     return decoded

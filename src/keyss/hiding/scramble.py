@@ -1,0 +1,126 @@
+"""Ghosts that say nothing: what a secret's transparent Gaussians show to those who make them visible.
+
+A Gaussian that the cover never draws need not show where it is. Position, scales, colour and opacity of each
+are published as other values, as frequent as among the cover's visible Gaussians: with u in [0, 1) the rank
+of the true value among the secret's, and r a number that only the key gives for this Gaussian, the value of
+rank u + r mod 1 of the cover. r is uniform, so u + r mod 1 says nothing of u (a one-time pad). What r is
+derived from is the Gaussian's own rotation and higher harmonics, which stay, but for the low bits that other
+things are written to; thus neither order nor loss of others matters, and no format that rounds survives.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from keyss.core.gaussians import Gaussians
+
+KNOTS = 65
+CHANNELS = 10  # means, log scales, constant colour, opacity logit
+KEY_BYTES = 32
+LEAST_OPACITY = 1 / 255
+# Above the bits that sealing writes to: nine of a quaternion, thirteen of a harmonic.
+_QUAT_BITS, _SH_BITS = np.uint32(0xFFFFFE00), np.uint32(0xFFFFE000)
+_RANK_BYTES = 6  # of keyed BLAKE2b for each channel
+# Neighbouring knots of what is published lie so far apart, relative to their size, that float32 resolves
+# a rank to 2^-22.
+_LEAST_GAP = 2.0**-9
+# Ranks are kept this far from 0 and 1, which the turn makes neighbours: rounding must not lead from one end
+# of the secret's values to the other.
+_MARGIN = 2.0**-13
+
+Table = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scramble:
+    """What it takes to put the Gaussians of one secret back."""
+
+    key: bytes
+    band: tuple[float, float]  # opacity logits between which the secret's Gaussians lie
+    own: torch.Tensor  # [CHANNELS, KNOTS] float32 values of the secret's Gaussians at equal steps of rank
+    shown: torch.Tensor  # [CHANNELS, KNOTS] the same of what is published
+
+    @staticmethod
+    def of(stego: Gaussians, key: bytes, band: tuple[float, float]) -> Scramble:
+        """For the Gaussians of `stego` whose opacity logits lie in `band`; `key` has KEY_BYTES."""
+        hidden = _inside(stego, band)
+        visible = stego.opacities >= LEAST_OPACITY
+        own = _quantiles(_channels(stego[hidden]))
+        shown = _quantiles(_channels(stego[visible if visible.any() else hidden]))
+        shown = _ascending(shown, _LEAST_GAP * np.maximum(np.abs(shown[:, :-1]), np.abs(shown[:, 1:])) + 1e-9)
+        shown[-1] = np.linspace(own[-1, 0], own[-1, -1], KNOTS)  # as transparent as they are
+        tables = (torch.from_numpy(np.ascontiguousarray(table)).float() for table in (own, shown))
+        return Scramble(key, band, *tables)
+
+    def close(self, stego: Gaussians) -> Gaussians:
+        """`stego` with this secret's Gaussians as they are published."""
+        return self._moved(stego, self.own, self.shown, 1)
+
+    def open(self, stego: Gaussians) -> Gaussians:
+        """What `close` was given, to the precision of float32."""
+        return self._moved(stego, self.shown, self.own, -1)
+
+    def _moved(self, stego: Gaussians, start: torch.Tensor, end: torch.Tensor, sign: int) -> Gaussians:
+        hidden = _inside(stego, self.band)
+        part = stego[hidden].to("cpu")
+        values, shift = _channels(part), self._shifts(part)
+        ranks = np.linspace(0, 1, KNOTS)
+        moved = np.empty_like(values)
+        inner = _MARGIN + (1 - 2 * _MARGIN) * ranks
+        rank_before, rank_after = (inner, ranks) if sign > 0 else (ranks, inner)
+        for channel in range(CHANNELS):
+            before, after = start[channel].double().numpy(), end[channel].double().numpy()
+            rank = np.interp(values[:, channel], before, rank_before)
+            moved[:, channel] = np.interp((rank + sign * shift[:, channel]) % 1.0, rank_after, after)
+        columns = torch.from_numpy(moved).float().to(stego.device)
+        means, log_scales, sh = stego.means.clone(), stego.log_scales.clone(), stego.sh.clone()
+        opacity_logits = stego.opacity_logits.clone()
+        means[hidden], log_scales[hidden], sh[hidden, 0] = columns[:, 0:3], columns[:, 3:6], columns[:, 6:9]
+        opacity_logits[hidden] = columns[:, 9]
+        return replace(stego, means=means, log_scales=log_scales, sh=sh, opacity_logits=opacity_logits)
+
+    def _shifts(self, part: Gaussians) -> Table:
+        """[N, CHANNELS] in [0, 1), uniform and independent for who does not have the key."""
+        quats = part.quats.contiguous().numpy().view(np.uint32) & _QUAT_BITS
+        harmonics = part.sh[:, 1:].flatten(1).contiguous().numpy().view(np.uint32) & _SH_BITS
+        rows = np.concatenate([quats, harmonics], axis=1).astype("<u4")
+        drawn = b"".join(
+            hashlib.blake2b(
+                row.tobytes(), digest_size=CHANNELS * _RANK_BYTES, key=self.key, person=b"keyss/scramble"
+            ).digest()
+            for row in rows
+        )
+        parts = np.frombuffer(drawn, np.uint8).reshape(len(rows), CHANNELS, _RANK_BYTES).astype(np.float64)
+        shifts: Table = parts @ (256.0 ** -np.arange(1, _RANK_BYTES + 1))
+        return shifts
+
+
+def _inside(stego: Gaussians, band: tuple[float, float]) -> torch.Tensor:
+    return (stego.opacity_logits > band[0]) & (stego.opacity_logits < band[1])
+
+
+def _channels(part: Gaussians) -> Table:
+    """[N, CHANNELS]"""
+    columns = [part.means, part.log_scales, part.sh[:, 0], part.opacity_logits[:, None]]
+    values: Table = torch.cat(columns, dim=1).detach().cpu().double().numpy()
+    return values
+
+
+def _quantiles(values: Table) -> Table:
+    """[CHANNELS, KNOTS] values at equal steps of rank, strictly ascending."""
+    if len(values) == 0:
+        return np.tile(np.linspace(0, 1, KNOTS), (CHANNELS, 1))
+    found = np.quantile(values, np.linspace(0, 1, KNOTS), axis=0).T
+    reach = np.abs(found).max(axis=1, keepdims=True) + 1e-6
+    return _ascending(found, 2.0**-22 * reach)
+
+
+def _ascending(table: Table, least: Table) -> Table:
+    """`table` with at least this much from knot to knot."""
+    gaps = np.maximum(np.diff(table, axis=1), least)
+    return np.concatenate([table[:, :1], table[:, :1] + gaps.cumsum(axis=1)], axis=1)
