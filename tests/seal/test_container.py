@@ -26,7 +26,7 @@ from keyss.seal.container import embed_derived, extract_derived, smallest
 from keyss.seal.keys import ALPHABET
 from keyss.seal.low_bits import identities, is_random, read_low_bits
 from keyss.seal.plan import cells_for, check_room, plan
-from seal.trained_like import keys, trained_like
+from seal.trained_like import UNNATURAL, keys, trained_like
 from tiny_scenes import ring_cameras
 
 __all__ = ["splat_transform"]  # a fixture
@@ -291,22 +291,12 @@ def test_capacity_grows_with_the_model_and_its_plan_is_kept_to() -> None:
         assert plan(need - 1, 1, 3, size) is None
 
 
-def _half_precision(model: Gaussians) -> Gaussians:
-    return model.map(lambda values: values.half().float())
-
-
-def _eight_bits(model: Gaussians) -> Gaussians:
-    return model.map(lambda values: (values * 16).round() / 16 * 1.1)
-
-
-def _moved(model: Gaussians) -> Gaussians:
-    return replace(model, log_scales=model.log_scales * 2**-14 + 3.0)
-
-
-@pytest.mark.parametrize("change", [_half_precision, _eight_bits, _moved])
-def test_models_without_random_low_bits_are_refused(change: object, plain: Gaussians) -> None:
+@pytest.mark.parametrize("change", UNNATURAL)
+def test_models_without_random_low_bits_are_refused(
+    change: Callable[[Gaussians], Gaussians], plain: Gaussians
+) -> None:
     with pytest.raises(InputError, match=r"low bits.*--sidecar"):
-        embed_derived(change(plain), [(keys(), b"x")])  # type: ignore[operator]
+        embed_derived(change(plain), [(keys(), b"x")])
 
 
 def test_values_that_are_not_random_stay_as_they_are() -> None:

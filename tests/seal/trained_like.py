@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from keyss.core import Gaussians
@@ -30,3 +32,19 @@ def keys(seed: int = 0) -> list[DerivedKey]:
     generator = torch.Generator().manual_seed(10_000 + seed)
     numbers = torch.randint(256, (SALTS, 32), generator=generator, dtype=torch.uint8)
     return [DerivedKey.of_master(row.numpy().tobytes()) for row in numbers]
+
+
+def _half_precision(model: Gaussians) -> Gaussians:
+    return model.map(lambda values: values.half().float())
+
+
+def _eight_bits(model: Gaussians) -> Gaussians:
+    return model.map(lambda values: (values * 16).round() / 16 * 1.1)
+
+
+def _moved(model: Gaussians) -> Gaussians:
+    return replace(model, log_scales=model.log_scales * 2**-14 + 3.0)
+
+
+# What leaves no natural low bits.
+UNNATURAL = (_half_precision, _eight_bits, _moved)
