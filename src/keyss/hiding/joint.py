@@ -30,7 +30,7 @@ Drawn = tuple[dict[str, Any], Tensor | None, float]
 
 
 class JointRun:
-    """The state of a hiding, and its step: the tripled loss at one pose of all scenes' poses."""
+    """The state of a hiding, and its step: the losses of all scenes, each at one pose."""
 
     def __init__(
         self,

@@ -6,6 +6,7 @@ of the true value among the secret's, and r a number that only the key gives for
 rank u + r mod 1 of the cover. r is uniform, so u + r mod 1 says nothing of u (a one-time pad). What r is
 derived from is the Gaussian's own rotation and higher harmonics, which stay, but for the low bits that other
 things are written to; thus neither order nor loss of others matters, and no format that rounds survives.
+Gaussians whose rotation and harmonics are equal (clones that training never moved) share their r.
 """
 
 from __future__ import annotations
