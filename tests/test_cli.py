@@ -494,7 +494,7 @@ class TestUnexpectedErrors:
             def info(path: Path) -> None:
                 raise error
 
-            monkeypatch.setattr(verbs, "info", info)
+            monkeypatch.setattr("keyss.describe.info", info)
 
         return fail_with
 

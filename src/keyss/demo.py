@@ -18,9 +18,11 @@ from keyss import verbs
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.files import results
 from keyss.files.atomic import write_bytes
 from keyss.files.output import OutputFolder
 from keyss.files.procedural import write_demo_scene
+from keyss.files.results import METRICS, PRIVATE, SIDECAR, STEGO
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Interrupted, Reporter, Silent
@@ -33,7 +35,7 @@ CONFIG = HideConfig(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluat
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
 _RESULTS = (
-    *(verbs.STEGO, verbs.SIDECAR, verbs.CONFIG, verbs.METRICS, verbs.PRIVATE),
+    *(STEGO, SIDECAR, results.CONFIG, METRICS, PRIVATE),
     *(SECRET_PLY, COMPARISON, KEY, SCENES),
 )
 
@@ -85,8 +87,8 @@ def run_demo(
             overwrite=True,
             reporter=reporter,
         )
-        verbs.reveal(out / verbs.STEGO, key, device=device, out=out / SECRET_PLY)
-        refused = sum(_is_refused(out / verbs.STEGO, wrong, device) for wrong in WRONG_KEYS)
+        verbs.reveal(out / STEGO, key, device=device, out=out / SECRET_PLY)
+        refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
         metrics = verbs.evaluate(out, [key], seed=seed, device=device)
         picture = io.BytesIO()
         _comparison(out, cover, secret, metrics, device).save(picture, "PNG", optimize=True)
@@ -140,7 +142,7 @@ def _comparison(
     out: Path, cover: Scene, secret: Scene, metrics: dict[str, Any], device: Backend
 ) -> Image.Image:
     """Photos and renders of three test views side by side."""
-    stego = out / verbs.STEGO
+    stego = out / STEGO
     decoy = verbs.reveal(stego, WRONG_KEYS[0], decoy=True, device=device)
     hidden, wrong = metrics["secrets"][0], metrics["wrong_key"]["vs_cover"]
     columns = [

@@ -6,13 +6,11 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -22,10 +20,25 @@ from keyss.carry.carrying import Carried
 from keyss.carry.filling import filled
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera, Scene, View
+from keyss.core.scene import Scene, View
 from keyss.files.atomic import write_bytes
 from keyss.files.output import OutputFolder, check_output_file
-from keyss.files.ply import describe_ply, read_ply, write_ply
+from keyss.files.ply import read_ply, write_ply
+from keyss.files.results import (
+    CONFIG,
+    METRICS,
+    MODEL,
+    SIDECAR,
+    STEGO,
+    bytes_writer,
+    json_bytes,
+    json_writer,
+    picture_name,
+    plain_names,
+    ply_writer,
+    png_writer,
+    read_json,
+)
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
@@ -40,21 +53,11 @@ from keyss.hiding.revealing import Frame, open_secret, read_sidecar, reveal_gaus
 from keyss.measure.hiding import measure_hiding
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering import render as render_image
-from keyss.seal.sidecar import read_header
 
 Method = Literal["learned", "carry"]
 Split = Literal["test", "train", "all"]
 Background = Tensor | Sequence[float] | None
 PathLike = str | Path
-
-STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
-    "stego.ply",
-    "decoder.sealed",
-    "config.json",
-    "metrics.json",
-    "model.ply",
-)
-PRIVATE = "private"  # plain models of cover and secrets: for measuring, never to be published
 
 
 @dataclass(frozen=True)
@@ -124,8 +127,8 @@ def fit(
         folder.fill(
             {
                 MODEL: lambda path: write_ply(path, result.gaussians),
-                CONFIG: _json_writer(settings),
-                METRICS: _json_writer(metrics),
+                CONFIG: json_writer(settings),
+                METRICS: json_writer(metrics),
             }
         )
     return result
@@ -228,13 +231,13 @@ def hide(
         }
         writers: dict[str, Callable[[Path], None]] = {
             STEGO: lambda path: write_ply(path, hidden.stego),
-            CONFIG: _json_writer(settings),
-            METRICS: _json_writer(metrics),
+            CONFIG: json_writer(settings),
+            METRICS: json_writer(metrics),
         }
         if hidden.sidecar is not None:
-            writers[SIDECAR] = _bytes_writer(hidden.sidecar)
-        for name, plain in zip(_plain_names(len(secrets)), hidden.plains, strict=True):
-            writers[name] = _ply_writer(plain)
+            writers[SIDECAR] = bytes_writer(hidden.sidecar)
+        for name, plain in zip(plain_names(len(secrets)), hidden.plains, strict=True):
+            writers[name] = ply_writer(plain)
         folder.fill(writers)
     return HideResult(hidden.stego, hidden.sidecar, metrics)
 
@@ -301,9 +304,9 @@ def render(
         for view in views[split]:
             image = render_image(gaussians, view.camera, scene.background.to(target))
             pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
-            pictures.append((_picture_name(view.camera), pixels))
+            pictures.append((picture_name(view.camera), pixels))
     if folder is not None:
-        folder.fill({name: _png_writer(image) for name, image in pictures})
+        folder.fill({name: png_writer(image) for name, image in pictures})
     return pictures
 
 
@@ -323,8 +326,8 @@ def evaluate(
     """
     target = resolve_device(device)
     folder = Path(run)
-    settings = _read_json(folder / CONFIG)
-    old = _read_json(folder / METRICS)
+    settings = read_json(folder / CONFIG)
+    old = read_json(folder / METRICS)
     try:
         sources = [settings["cover"], *settings["secrets"]]
         width, background = settings["width"], settings["background"]
@@ -346,7 +349,7 @@ def evaluate(
         metrics = carrying.evaluate(old, stego, carried, sources, width, background, target)
     else:
         scenes = [_scene(source, width, background) for source in sources]
-        bounds = [read_ply(folder / name) for name in _plain_names(len(scenes) - 1)]
+        bounds = [read_ply(folder / name) for name in plain_names(len(scenes) - 1)]
         metrics = old | measure_hiding(
             stego.to(target),
             learned,
@@ -355,61 +358,8 @@ def evaluate(
             wrong_keys=wrong_keys,
             seed=seed,
         )
-    write_bytes(folder / METRICS, _json_bytes(metrics))
+    write_bytes(folder / METRICS, json_bytes(metrics))
     return metrics
-
-
-def info(path: PathLike) -> dict[str, Any]:
-    """What is in a PLY, a sealed decoder, a scene folder or a folder of results, as JSON-able facts."""
-    path = Path(path)
-    if path.is_dir():
-        if (path / STEGO).exists():
-            return {"kind": "hiding", "path": str(path), "metrics": _read_json(path / METRICS)}
-        if (path / MODEL).exists():
-            return {"kind": "plain model", "path": str(path), "metrics": _read_json(path / METRICS)}
-        return _describe_scene(load_scene(path))
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
-    if path.suffix.lower() == ".ply":
-        facts = describe_ply(path)
-        return {
-            "kind": "3DGS model",
-            "path": str(path),
-            "bytes": facts.bytes,
-            "gaussians": facts.count,
-            "sh_degree": facts.sh_degree,
-            "bounding_box": [[round(x, 4) for x in corner] for corner in (facts.lower, facts.upper)],
-            "opacity_below_0.05": round(facts.faint_share, 4),
-        }
-    try:
-        derivation, _, _ = read_header(read_sidecar(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return {
-        "kind": "sealed decoder",
-        "path": str(path),
-        "bytes": path.stat().st_size,
-        "key_derivation": {
-            "function": "Argon2id",
-            "memory_kib": derivation.memory_kib,
-            "time_cost": derivation.time_cost,
-            "parallelism": derivation.parallelism,
-        },
-    }
-
-
-def _describe_scene(scene: Scene) -> dict[str, Any]:
-    camera = scene.train[0].camera
-    return {
-        "kind": "scene",
-        "name": scene.name,
-        "train_views": len(scene.train),
-        "test_views": len(scene.test),
-        "image_size": [camera.width, camera.height],
-        "points": len(scene.points),
-        "extent": round(scene.extent, 4),
-        "background": [round(float(x), 4) for x in scene.background],
-    }
 
 
 def _scene(source: PathLike | Scene | Gaussians, width: int | None, background: Background) -> Scene:
@@ -460,45 +410,3 @@ def _fingerprint(secret: HiddenSecret | Carried) -> str:
     if isinstance(secret, Carried):
         return secret.fingerprint()
     return hashlib.sha256(pack_secret(secret)).hexdigest()[:16]
-
-
-def _plain_names(secrets: int) -> list[str]:
-    return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
-
-
-def _picture_name(camera: Camera) -> str:
-    """A flat file name: folders in a camera's name become part of it."""
-    return Path(camera.name.replace("/", "_").replace("\\", "_")).stem + ".png"
-
-
-def _ply_writer(gaussians: Gaussians) -> Callable[[Path], None]:
-    return lambda path: write_ply(path, gaussians)
-
-
-def _bytes_writer(data: bytes) -> Callable[[Path], None]:
-    return lambda path: write_bytes(path, data)
-
-
-def _png_writer(image: Tensor) -> Callable[[Path], None]:
-    encoded = cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes()
-    return lambda path: write_bytes(path, encoded)
-
-
-def _json_writer(data: dict[str, Any]) -> Callable[[Path], None]:
-    return lambda path: write_bytes(path, _json_bytes(data))
-
-
-def _json_bytes(data: dict[str, Any]) -> bytes:
-    return (json.dumps(data, indent=2) + "\n").encode()
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing; is this a folder that keyss made?") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object")
-    return data

@@ -363,10 +363,10 @@ def info(
 
     example: keyss info runs/hidden/stego.ply
     """
-    from keyss import verbs
     from keyss.cli.tables import print_facts
+    from keyss.describe import info as describe
 
-    facts = verbs.info(path)
+    facts = describe(path)
     if json_:
         print(json.dumps(facts, indent=2))
     else:

@@ -1,0 +1,75 @@
+"""What lies in a folder of results: names of files, and what writes and reads them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+from torch import Tensor
+
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.files.atomic import write_bytes
+from keyss.files.ply import write_ply
+
+STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
+    "stego.ply",
+    "decoder.sealed",
+    "config.json",
+    "metrics.json",
+    "model.ply",
+)
+PRIVATE = "private"  # plain models of cover and secrets: for measuring, never to be published
+
+
+def plain_names(secrets: int) -> list[str]:
+    """Files of the plain models of the cover and of so many secrets."""
+    return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
+
+
+def picture_name(camera: Camera) -> str:
+    """A flat file name: folders in a camera's name become part of it."""
+    return Path(camera.name.replace("/", "_").replace("\\", "_")).stem + ".png"
+
+
+def ply_writer(gaussians: Gaussians) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes a model."""
+    return lambda path: write_ply(path, gaussians)
+
+
+def bytes_writer(data: bytes) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes bytes."""
+    return lambda path: write_bytes(path, data)
+
+
+def png_writer(image: Tensor) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes an image [H, W, 3] uint8."""
+    encoded = cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes()
+    return lambda path: write_bytes(path, encoded)
+
+
+def json_writer(data: dict[str, Any]) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes an object as JSON."""
+    return lambda path: write_bytes(path, json_bytes(data))
+
+
+def json_bytes(data: dict[str, Any]) -> bytes:
+    """JSON for people and programs."""
+    return (json.dumps(data, indent=2) + "\n").encode()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises InputError."""
+    try:
+        data = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: missing; is this a folder that keyss made?") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a JSON object")
+    return data
