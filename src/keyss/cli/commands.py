@@ -380,7 +380,7 @@ def demo(
     device: Device = "auto",
     seed: Annotated[int, arg(metavar="N", help="Seed of everything random, the demo's key included.")] = 0,
 ) -> None:
-    """Hide one made-up scene in another and open it again: everything in about three minutes.
+    """Hide one made-up scene in another and open it again: everything in under two minutes.
 
     example: keyss demo -o out/demo
     """
