@@ -128,7 +128,7 @@ def test_a_model_large_enough_carries_its_secrets() -> None:
     scenes = _scenes()[0]
     fit = replace(CONFIG.fit, iterations=30, max_gaussians=2600, grow_every=10, grow_start=0.1)
     config = replace(CONFIG, fit=fit)
-    many = [random_gaussians(2600, seed=7), None, None]
+    many = [random_gaussians(2600, seed=7), *_scenes()[1][1:]]
     hidden = hide_scenes(scenes, KEYS, config, plains=many)
     assert hidden.sidecar is None
     assert len(hidden.stego) > 1500
@@ -136,6 +136,8 @@ def test_a_model_large_enough_carries_its_secrets() -> None:
         opened = open_secret(hidden.stego, key)
         assert torch.equal(opened.embedding, secret.embedding)
         assert _same(reveal_gaussians(hidden.stego, opened), reveal_gaussians(hidden.stego, secret))
+    for secret, scene in zip(hidden.secrets, scenes[1:], strict=True):
+        assert _psnr(reveal_gaussians(hidden.stego, secret), scene) > 26
 
 
 def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: Hidden) -> None:

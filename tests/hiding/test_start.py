@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from hypothesis import given
@@ -11,7 +12,7 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.hiding.config import HideConfig
 from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.start import _shares, make_start
+from keyss.hiding.start import DRAWN_LOGIT, _shares, hidden_logits, make_start, opacity_curve
 from keyss.hiding.targets import PlacedScene
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -70,6 +71,18 @@ def test_the_key_brings_back_the_opacities_that_a_warm_start_hides() -> None:
         torch.testing.assert_close(
             revealed.opacity_logits[own], placed[secret].plain.opacity_logits, atol=1e-4, rtol=0
         )
+
+
+def test_bands_of_secrets_do_not_touch_each_other_or_what_is_drawn() -> None:
+    bands = []
+    for secret in range(6):
+        decoder = Decoder(DecoderShape())
+        decoder.set_curve(*opacity_curve(secret))
+        bands.append(decoder.band)
+        extremes = hidden_logits(torch.tensor([-100.0, 100.0]), secret)
+        assert decoder.band[0] < extremes[0] < extremes[1] < decoder.band[1]
+    assert bands[0][1] < DRAWN_LOGIT
+    assert all(below[1] < above[0] for above, below in pairwise(bands))
 
 
 def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:

@@ -22,7 +22,7 @@ from keyss.seal.sidecar import open_slots, read_header
 
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
-_ROUNDED_LOGIT = -12.5  # below it an opacity was rounded to zero: those of one secret or two lie above
+_ROUNDED_LOGIT = -13.5  # below it an opacity was rounded to zero: those of one secret or two lie above
 LEAST_OPACITY = 1 / 255  # below it no renderer draws anything
 _DECOY_STRENGTH = 0.02  # standard deviation of a decoy's changes of opacity logits
 _DECOY_MOVE = 1e-4  # and of its turns (radians), shifts (of the model's size) and changes of scale

@@ -18,9 +18,9 @@ from keyss.hiding.visibility import contributions
 
 # Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
 # higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
-# band of logits of its own.
+# band of logits of its own, from low - 0.5 to high + 0.5 of `opacity_curve`; bands must not touch.
 DRAWN_LOGIT = -5.54
-HIDDEN_LOGIT, HIDDEN_STEP = -8.2, -3.1
+HIDDEN_LOGIT, HIDDEN_STEP = -8.2, -3.7
 HIDDEN_SLOPE = 0.25
 SHOWN_LOGITS = (-4.0, 6.0)
 TRANSPARENT_LOGIT = -8.0
