@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from keyss.core import InputError
+from keyss.hiding.payload import pack_secret, unpack_secret
 from keyss.hiding.revealing import decoy_secret, reveal_gaussians
 from seal.trained_like import keys, trained_like
 
@@ -23,6 +24,25 @@ def test_opacities_that_were_rounded_to_zero_are_taken_for_faint_ones() -> None:
     assert torch.equal(
         reveal_gaussians(rounded, secret, force=True).opacity_logits,
         reveal_gaussians(faint, secret, force=True).opacity_logits,
+    )
+
+
+def test_a_sidecar_knows_the_opacities_that_were_rounded_whatever_the_order() -> None:
+    stego = trained_like(200)
+    hidden = torch.arange(200) % 2 == 0
+    faint = stego.opacity_logits.clamp(-3, 3) - 9
+    stego = replace(stego, opacity_logits=torch.where(hidden, faint, stego.opacity_logits.abs()))
+    secret = decoy_secret(stego, keys()[0])
+    kept = torch.cat([stego.means[hidden], stego.opacity_logits[hidden, None]], dim=1)
+    secret = unpack_secret(pack_secret(replace(secret, faint=kept)))
+    rounded = replace(
+        stego,
+        means=(stego.means * 1000).round() / 1000,
+        opacity_logits=stego.opacity_logits.masked_fill(hidden, -16),
+    )
+    order = torch.randperm(200)
+    assert torch.equal(
+        secret.with_faint_opacities(rounded[order]).opacity_logits, stego.opacity_logits[order]
     )
 
 

@@ -9,7 +9,7 @@ sidecar belongs to a model. A secret's bytes say nothing of other secrets.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
@@ -24,7 +24,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.mask import parse_mask
-from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, Scramble
+from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, LEAST_OPACITY, Scramble
 
 FORMAT = "keyss-secret"
 VERSION = 2
@@ -53,6 +53,18 @@ class HiddenSecret:
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
     scramble: Scramble | None = None  # what the secret's Gaussians are published as, if not as they are
+    # [M, 4] position and opacity logit of all transparent Gaussians, for files where opacities are rounded
+    faint: Tensor | None = None
+
+    def with_faint_opacities(self, stego: Gaussians) -> Gaussians:
+        """`stego` with transparent Gaussians as opaque as the nearest in `faint`, or all nearly opaque."""
+        transparent = stego.opacities < LEAST_OPACITY
+        logits = torch.full_like(stego.opacity_logits[transparent], self.decoder.faint_logit)
+        if self.faint is not None:
+            tree = cKDTree(self.faint[:, :3].double().numpy())
+            _, nearest = tree.query(stego.means[transparent].cpu().double().numpy())
+            logits = self.faint[torch.from_numpy(nearest), 3].to(logits)
+        return replace(stego, opacity_logits=stego.opacity_logits.masked_scatter(transparent, logits))
 
     @property
     def embedding(self) -> Tensor:
@@ -93,6 +105,8 @@ def pack_secret(secret: HiddenSecret) -> bytes:
         for name, value in decoder.state_dict().items()
     }
     tensors["anchors"] = secret.anchors.contiguous()
+    if secret.faint is not None:
+        tensors["faint"] = secret.faint.contiguous()
     if secret.scramble is not None:
         tensors |= {
             "scramble.key": torch.frombuffer(bytearray(secret.scramble.key), dtype=torch.uint8),
@@ -139,12 +153,15 @@ def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSec
     anchors = tensors.pop("anchors").float()
     if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
         raise InputError(f"anchors: expected up to {ANCHORS} positions, got shape {list(anchors.shape)}")
+    faint = tensors.pop("faint", None)
+    if faint is not None and (faint.dim() != 2 or faint.shape[1] != 4 or len(faint) == 0):
+        raise InputError(f"faint opacities: expected rows of 4 numbers, got shape {list(faint.shape)}")
     decoder = Decoder(shape)
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
     if not (decoder.knots.diff() > 0).all():
         raise InputError("opacity curve: expected ascending knots")
     frame = Similarity.from_json(header["frame"])
-    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble)
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble, faint)
 
 
 def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:

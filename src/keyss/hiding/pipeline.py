@@ -23,7 +23,7 @@ from keyss.hiding.config import HideConfig
 from keyss.hiding.decoder import Decoder
 from keyss.hiding.joint import JointRun, decoder_shape
 from keyss.hiding.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
-from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, Scramble
+from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, LEAST_OPACITY, Scramble
 from keyss.hiding.targets import PlacedScene
 from keyss.seal import DerivedKey, KeyDerivation, embed, seal_sidecar
 from keyss.seal.keys import SALT_BYTES
@@ -125,8 +125,12 @@ def hide_scenes(
             scramble = Scramble.of(stego, key.expand("scramble", KEY_BYTES), decoder.band)
             stego, scrambles[index] = scramble.close(stego), scramble
     anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
+    transparent = stego[stego.opacities < LEAST_OPACITY]
+    faint = None
+    if sidecar and len(transparent):
+        faint = torch.cat([transparent.means, transparent.opacity_logits[:, None]], dim=1)
     packed = [
-        pack_secret(HiddenSecret(decoder, frame, anchors, scramble))
+        pack_secret(HiddenSecret(decoder, frame, anchors, scramble, faint))
         for decoder, frame, scramble in zip(decoders, frames[1:], scrambles, strict=True)
     ]
     sealed = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +14,7 @@ from keyss.core.similarity import Similarity
 from keyss.files.reading import read_file
 from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.hiding.scramble import LEAST_OPACITY
 from keyss.seal import DerivedKey
 from keyss.seal.container import extract_derived, key_for
 from keyss.seal.low_bits import identities
@@ -23,7 +23,6 @@ from keyss.seal.sidecar import open_slots, read_header
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
 _ROUNDED_LOGIT = -13.5  # below it an opacity was rounded to zero: those of one secret or two lie above
-LEAST_OPACITY = 1 / 255  # below it no renderer draws anything
 _DECOY_STRENGTH = 0.02  # standard deviation of a decoy's changes of opacity logits
 _DECOY_MOVE = 1e-4  # and of its turns (radians), shifts (of the model's size) and changes of scale
 
@@ -79,16 +78,13 @@ def reveal_gaussians(
 
     `frame`: "secret" gives it in its own frame, so that its cameras fit it; "cover" leaves it where it was
     hidden. `force` is for models that were quantised: it skips the check that the secret belongs to this one,
-    and gives opacities that were rounded to zero, where the secret's Gaussians lie, the value that they
-    mostly had. Raises InputError for a secret of another model.
+    and where opacities were rounded to zero, it takes them from the sidecar. Raises InputError for a secret
+    of another model.
     """
-    if force:
-        rounded = stego.opacity_logits < _ROUNDED_LOGIT
-        stego = replace(
-            stego, opacity_logits=stego.opacity_logits.masked_fill(rounded, secret.decoder.faint_logit)
-        )
-    else:
+    if not force:
         secret.check_belongs_to(stego)
+    elif (stego.opacity_logits < _ROUNDED_LOGIT).any():
+        stego = secret.with_faint_opacities(stego)
     decoded = decode(stego, secret, secret.embedding)
     drawn = decoded.opacities >= LEAST_OPACITY
     if drawn.any():
