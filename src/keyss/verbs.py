@@ -62,7 +62,7 @@ PathLike = str | Path
 
 @dataclass(frozen=True)
 class Secret:
-    """A scene to hide and the key that is to open it; for carrying also a .ply file, or a model."""
+    """A scene, a .ply file or a model to hide, and the key that is to open it."""
 
     scene: PathLike | Scene | Gaussians
     key: str
@@ -126,7 +126,7 @@ def fit(
         settings = {"scene": _name(scene), "width": width, "config": asdict(config), "version": __version__}
         folder.fill(
             {
-                MODEL: lambda path: write_ply(path, result.gaussians),
+                MODEL: ply_writer(result.gaussians),
                 CONFIG: json_writer(settings),
                 METRICS: json_writer(metrics),
             }
@@ -230,7 +230,7 @@ def hide(
             "version": __version__,
         }
         writers: dict[str, Callable[[Path], None]] = {
-            STEGO: lambda path: write_ply(path, hidden.stego),
+            STEGO: ply_writer(hidden.stego),
             CONFIG: json_writer(settings),
             METRICS: json_writer(metrics),
         }

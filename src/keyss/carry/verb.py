@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -29,9 +27,9 @@ from keyss.carry.plan import Size, check_degrees, room, thinned
 from keyss.carry.thinning import most_visible
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.atomic import write_bytes
 from keyss.files.output import OutputFolder
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.ply import read_ply
+from keyss.files.results import CONFIG, METRICS, STEGO, json_writer, plain_names, ply_writer
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
@@ -189,14 +187,13 @@ def hide(
             "version": __version__,
         }
         writers: dict[str, Callable[[Path], None]] = {
-            "stego.ply": lambda path: write_ply(path, result.stego),
-            "config.json": lambda path: write_bytes(path, _json(settings)),
-            "metrics.json": lambda path: write_bytes(path, _json(metrics)),
+            STEGO: ply_writer(result.stego),
+            CONFIG: json_writer(settings),
+            METRICS: json_writer(metrics),
         }
-        for index, source in enumerate(sources):
+        for name, source in zip(plain_names(len(secrets)), sources, strict=True):
             if source.fitted:
-                name = "private/cover.ply" if index == 0 else f"private/secret-{index}.ply"
-                writers[name] = partial(write_ply, gaussians=source.gaussians)
+                writers[name] = ply_writer(source.gaussians)
         plain.folder.fill(writers)
     return result.stego, metrics
 
@@ -234,10 +231,6 @@ def _photos(
 def _name(given: Given) -> str | None:
     """Where it can be found again, None for what is in memory."""
     return None if isinstance(given, Scene | Gaussians) else str(Path(given).resolve())
-
-
-def _json(data: dict[str, Any]) -> bytes:
-    return (json.dumps(data, indent=2) + "\n").encode()
 
 
 def _quality(scene: Scene | None, gaussians: Gaussians, device: torch.device) -> Quality:
