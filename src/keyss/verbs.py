@@ -5,7 +5,6 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,8 +16,7 @@ from torch import Tensor
 from keyss._version import __version__
 from keyss.carry import verb as carrying
 from keyss.carry.carrying import Carried
-from keyss.carry.filling import filled
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.atomic import write_bytes
@@ -37,27 +35,33 @@ from keyss.files.results import (
     plain_names,
     ply_writer,
     png_writer,
-    read_json,
 )
-from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.hiding.config import HideConfig
-from keyss.hiding.from_models import is_model, scene_of_model
-from keyss.hiding.opening import open_model
-from keyss.hiding.payload import HiddenSecret, pack_secret
+from keyss.hiding.from_models import is_model
+from keyss.hiding.payload import HiddenSecret
 from keyss.hiding.pipeline import hide_scenes
-from keyss.hiding.revealing import Frame, open_secret, read_sidecar, reveal_gaussians
+from keyss.hiding.revealing import Frame
 from keyss.measure.hiding import measure_hiding
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering import render as render_image
+from keyss.runs import (
+    Background,
+    PathLike,
+    as_model,
+    as_scene,
+    fingerprint,
+    open_any,
+    open_run,
+    revealed,
+    sidecar_beside,
+)
 
 Method = Literal["learned", "carry"]
 Split = Literal["test", "train", "all"]
-Background = Tensor | Sequence[float] | None
-PathLike = str | Path
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ def fit(
     config = config or FitConfig()
     target = resolve_device(device)
     folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
-    loaded = _scene(scene, width, background)
+    loaded = as_scene(scene, width, background)
     result = fit_scene(
         loaded,
         config,
@@ -188,8 +192,8 @@ def hide(
         source if model is None and not isinstance(source, Scene) and is_model(source) else model
         for source, model in zip(sources, [cover_model, *(secret.model for secret in secrets)], strict=True)
     ]
-    plains = [None if model is None else _model(model) for model in given]
-    scenes = [_scene(source, width, background) for source in sources]
+    plains = [None if model is None else as_model(model) for model in given]
+    scenes = [as_scene(source, width, background) for source in sources]
     keys = [secret.key for secret in secrets]
     hidden = hide_scenes(
         scenes,
@@ -225,7 +229,7 @@ def hide(
             "width": width,
             "background": None if background is None else [float(x) for x in background],
             "key_encoder": "argon2" if encoder is None else type(encoder).__name__,
-            "payloads": [_fingerprint(secret) for secret in hidden.secrets],
+            "payloads": [fingerprint(secret) for secret in hidden.secrets],
             "config": asdict(config),
             "version": __version__,
         }
@@ -266,17 +270,14 @@ def reveal(
     """
     target = resolve_device(device)
     path = None if out is None else check_output_file(out, overwrite)
-    model = _model(stego)
+    model = as_model(stego)
     if decoder is None and not isinstance(stego, Gaussians):
-        decoder = _sidecar_beside(Path(stego))
-    secret = _open(model, key, decoder, decoy=decoy)
-    if isinstance(secret, Carried):
-        revealed = filled(secret.gaussians, secret.count)
-    else:
-        revealed = reveal_gaussians(model.to(target), secret, frame=frame, force=force).to("cpu")
+        decoder = sidecar_beside(Path(stego))
+    secret = open_any(model, key, decoder, decoy=decoy)
+    found = revealed(model.to(target), secret, frame=frame, force=force)
     if path is not None:
-        write_ply(path, revealed)
-    return revealed
+        write_ply(path, found)
+    return found
 
 
 def render(
@@ -296,8 +297,8 @@ def render(
     """
     target = resolve_device(device)
     folder = OutputFolder(out, overwrite=overwrite) if out is not None else None
-    gaussians = _model(model).to(target)
-    scene = _scene(cameras, width, background)
+    gaussians = as_model(model).to(target)
+    scene = as_scene(cameras, width, background)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = []
     with torch.no_grad():
@@ -325,56 +326,31 @@ def evaluate(
     UsageError for a secret without a key.
     """
     target = resolve_device(device)
-    folder = Path(run)
-    settings = read_json(folder / CONFIG)
-    old = read_json(folder / METRICS)
-    try:
-        sources = [settings["cover"], *settings["secrets"]]
-        width, background = settings["width"], settings["background"]
-        fingerprints = list(settings["payloads"])
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder / CONFIG}: not the configuration of a hiding ({error} is missing)"
-        ) from error
-    if not all(isinstance(source, str) for source in sources):
-        raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    stego, beside = read_ply(folder / STEGO), _sidecar_beside(folder / STEGO)
-    opened = {_fingerprint(secret): secret for secret in (_open(stego, key, beside) for key in keys)}
-    if set(opened) != set(fingerprints):
-        raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(opened)} of them")
-    found = [opened[fingerprint] for fingerprint in fingerprints]
-    learned = [each for each in found if isinstance(each, HiddenSecret)]
-    carried = [each for each in found if isinstance(each, Carried)]
+    opened = open_run(run, keys)
+    learned = [each for each in opened.opened if isinstance(each, HiddenSecret)]
+    carried = [each for each in opened.opened if isinstance(each, Carried)]
     if carried:
-        metrics = carrying.evaluate(old, stego, carried, sources, width, background, target)
+        metrics = carrying.evaluate(
+            opened.metrics,
+            opened.stego,
+            carried,
+            opened.sources,
+            opened.width,
+            opened.background,
+            target,
+        )
     else:
-        scenes = [_scene(source, width, background) for source in sources]
-        bounds = [read_ply(folder / name) for name in plain_names(len(scenes) - 1)]
-        metrics = old | measure_hiding(
-            stego.to(target),
+        bounds = [read_ply(opened.folder / name) for name in plain_names(len(learned))]
+        metrics = opened.metrics | measure_hiding(
+            opened.stego.to(target),
             learned,
-            scenes,
+            opened.scenes(),
             [bound.to(target) for bound in bounds],
             wrong_keys=wrong_keys,
             seed=seed,
         )
-    write_bytes(folder / METRICS, json_bytes(metrics))
+    write_bytes(opened.folder / METRICS, json_bytes(metrics))
     return metrics
-
-
-def _scene(source: PathLike | Scene | Gaussians, width: int | None, background: Background) -> Scene:
-    """A scene, the photos in a folder, or what a model or the one in a `.ply` shows from all around."""
-    if isinstance(source, Scene):
-        return source
-    if not isinstance(source, Gaussians) and not is_model(source):
-        return load_scene(source, width=width, background=background)
-    name = "model" if isinstance(source, Gaussians) else Path(source).stem
-    colour = None if background is None else torch.as_tensor(background, dtype=torch.float32)
-    return scene_of_model(_model(source), name, size=width, background=colour)
-
-
-def _model(source: PathLike | Gaussians) -> Gaussians:
-    return source.to("cpu") if isinstance(source, Gaussians) else read_ply(source)
 
 
 def _name(source: PathLike | Scene | Gaussians) -> str | None:
@@ -384,29 +360,3 @@ def _name(source: PathLike | Scene | Gaussians) -> str | None:
 
 def _width(scene: Scene) -> int:
     return scene.train[0].camera.width
-
-
-def _open(
-    stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False
-) -> HiddenSecret | Carried:
-    """What the key opens, of either method; see `open_model`. Errors name the sidecar's file."""
-    if sidecar is None:
-        return open_model(stego, key, decoy=decoy)
-    if isinstance(sidecar, bytes):
-        return open_secret(stego, key, sidecar, decoy=decoy)
-    try:
-        return open_secret(stego, key, read_sidecar(Path(sidecar)), decoy=decoy)
-    except InputError as error:
-        raise InputError(f"{sidecar}: {error}") from error
-
-
-def _sidecar_beside(stego: Path) -> Path | None:
-    path = stego.with_name(SIDECAR)
-    return path if path.exists() else None
-
-
-def _fingerprint(secret: HiddenSecret | Carried) -> str:
-    """By which `evaluate` knows whose key it was given; says nothing without the secret."""
-    if isinstance(secret, Carried):
-        return secret.fingerprint()
-    return hashlib.sha256(pack_secret(secret)).hexdigest()[:16]
