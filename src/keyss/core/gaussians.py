@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
@@ -74,6 +75,13 @@ class Gaussians:
 
     def detach(self) -> Gaussians:
         return self.map(torch.Tensor.detach)
+
+    def digest(self) -> str:
+        """SHA-256 over all values: equal for equal content only."""
+        state = hashlib.sha256(f"{len(self)} {self.sh_degree}".encode())
+        for each in fields(self):
+            state.update(getattr(self, each.name).detach().cpu().contiguous().numpy().tobytes())
+        return state.hexdigest()
 
     def with_sh_degree(self, degree: int) -> Gaussians:
         """The same Gaussians with SH of `degree`: higher coefficients dropped, or zeros added."""

@@ -48,8 +48,12 @@ def bytes_writer(data: bytes) -> Callable[[Path], None]:
 
 def png_writer(image: Tensor) -> Callable[[Path], None]:
     """For `OutputFolder.fill`: writes an image [H, W, 3] uint8."""
-    encoded = cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes()
-    return lambda path: write_bytes(path, encoded)
+    return bytes_writer(png_bytes(image))
+
+
+def png_bytes(image: Tensor) -> bytes:
+    """A PNG file of an image [H, W, 3] uint8."""
+    return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
 
 
 def json_writer(data: dict[str, Any]) -> Callable[[Path], None]:

@@ -1,0 +1,139 @@
+"""What an audit looks at: a run opened with its keys, and plain models to compare it with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from keyss.core.alignment import align
+from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.core.similarity import Similarity
+from keyss.files.ply import read_ply, write_ply
+from keyss.fitting.config import FitConfig
+from keyss.fitting.loop import Reporter
+from keyss.fitting.plain import fit_scene
+from keyss.hiding.payload import HiddenSecret
+from keyss.runs import HidingRun, Opened, revealed
+
+NULLS = "private/null"  # plain models of the cover from other seeds, in a run's folder
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Everything that the parts of an audit look at; models on `device`."""
+
+    run: HidingRun
+    scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
+    stego: Gaussians
+    revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
+    frames: tuple[Similarity, ...]  # from those to the cover's
+    original: Gaussians  # plain model of the cover
+    bounds: tuple[Gaussians | None, ...]  # plain models of the secrets, where there are some
+    nulls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
+    device: torch.device
+
+    @property
+    def cover(self) -> Scene:
+        return self.scenes[0]
+
+    @property
+    def secrets(self) -> tuple[Scene, ...]:
+        return self.scenes[1:]
+
+
+def subject_of(
+    run: HidingRun,
+    original: Path | str | None,
+    seeds: Sequence[int],
+    device: torch.device,
+    reporter: Reporter,
+) -> Subject:
+    """Read, reveal and fit what the audit needs; plain models are kept in the run's folder and used again.
+
+    `original`: a plain model of the cover, by default the run's own. Raises UsageError where there is none.
+    """
+    scenes = run.scenes()
+    plain, *bounds = run.plain_models()
+    if original is not None:
+        plain = read_ply(original)
+    if plain is None:
+        raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
+    stego, folder = run.stego.to(device), run.folder / NULLS
+    config = replace(_fit_config(run), max_gaussians=max(len(plain), 16))
+    nulls = [
+        _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
+        for seed in seeds
+    ]
+    return Subject(
+        run=run,
+        scenes=tuple(scenes),
+        stego=stego,
+        revealed=tuple(revealed(stego, secret).to(device) for secret in run.opened),
+        frames=tuple(
+            _frame(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
+        ),
+        original=plain.to(device),
+        bounds=tuple(None if bound is None else bound.to(device) for bound in bounds),
+        nulls=tuple(nulls),
+        device=device,
+    )
+
+
+def null_seeds(run: HidingRun, nulls: int, seed: int) -> list[int]:
+    """From which the plain models are trained: those after the run's own."""
+    first = _fit_config(run).seed + seed
+    return [first + index for index in range(1, nulls + 1)]
+
+
+def _frame(secret: Opened, scene: Scene, cover: Scene) -> Similarity:
+    """Where the secret lies; one that is carried lies nowhere, and is looked for where it might have been."""
+    if isinstance(secret, HiddenSecret):
+        return secret.frame
+    return align([view.camera for view in scene.train], [view.camera for view in cover.train])
+
+
+def _fit_config(run: HidingRun) -> FitConfig:
+    """How the run trained its plain models. Raises InputError."""
+    known = {field.name for field in fields(FitConfig)}
+    try:
+        values: dict[str, Any] = run.settings["config"]["fit"]
+        return FitConfig(**{name: value for name, value in values.items() if name in known})
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{run.folder}: its configuration tells nothing of plain models ({error})"
+        ) from error
+
+
+def _plain_model(
+    scene: Scene, config: FitConfig, folder: Path, device: torch.device, reporter: Reporter
+) -> Gaussians:
+    """A plain model of a scene, from `folder` if one was made there of the same, as its name tells."""
+    made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
+    name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
+    model, checkpoint = folder / f"{name}.ply", folder / f"{name}.safetensors"
+    if model.exists():
+        return read_ply(model)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot create {folder}: {error.strerror}") from error
+    result = fit_scene(
+        scene,
+        config,
+        device=device,
+        title=f"plain model of the cover, seed {config.seed}",
+        checkpoint=checkpoint,
+        resume=True,
+        reporter=reporter,
+    )
+    write_ply(model, result.gaussians)
+    checkpoint.unlink(missing_ok=True)
+    return result.gaussians
