@@ -1,0 +1,55 @@
+"""Opening a secret again in a model that was changed, as the holder of its key would."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from keyss.carry.carrying import Carried
+from keyss.carry.filling import filled
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.hiding.opening import open_model
+from keyss.hiding.payload import HiddenSecret, unpack_secret
+from keyss.hiding.revealing import reveal_gaussians
+from keyss.seal.sidecar import unseal_sidecar
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A secret as it was revealed."""
+
+    gaussians: Gaussians  # in the secret's own frame
+    frame: Similarity = field(default_factory=Similarity.identity)  # from there into the cover's
+
+
+# Raises a KeyssError when the secret cannot be opened.
+Reopen = Callable[[Gaussians], Opened]
+
+
+@dataclass(frozen=True)
+class Reopener:
+    """`reopener(stego)` is what `keyss reveal` gives, with `--force` where the model asks for it."""
+
+    key: str = field(repr=False)
+    sidecar: bytes | None = field(default=None, repr=False)
+
+    def __call__(self, stego: Gaussians) -> Opened:
+        """Raises WrongKeyError and InputError as `open_model` and `open_secret` do."""
+        stego = stego.to("cpu")
+        secret = open_model(stego, self.key) if self.sidecar is None else self._beside
+        if isinstance(secret, Carried):
+            return Opened(filled(secret.gaussians, secret.count))
+        try:
+            revealed = reveal_gaussians(stego, secret)
+        except InputError:  # no longer the model that it belongs to: its positions changed
+            revealed = reveal_gaussians(stego, secret, force=True)
+        return Opened(revealed, secret.frame)
+
+    @cached_property
+    def _beside(self) -> HiddenSecret:
+        """What a sidecar holds does not depend on what became of the model: opening it once is enough."""
+        assert self.sidecar is not None
+        return unpack_secret(unseal_sidecar(self.sidecar, self.key))
