@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 
 from keyss.carry.carrying import Carried
 from keyss.carry.filling import filled
@@ -12,9 +11,8 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.hiding.opening import open_model
-from keyss.hiding.payload import HiddenSecret, unpack_secret
-from keyss.hiding.revealing import reveal_gaussians
-from keyss.seal.sidecar import unseal_sidecar
+from keyss.hiding.payload import HiddenSecret
+from keyss.hiding.revealing import open_secret, reveal_gaussians
 
 
 @dataclass(frozen=True)
@@ -39,17 +37,15 @@ class Reopener:
     def __call__(self, stego: Gaussians) -> Opened:
         """Raises WrongKeyError and InputError as `open_model` and `open_secret` do."""
         stego = stego.to("cpu")
-        secret = open_model(stego, self.key) if self.sidecar is None else self._beside
+        secret: Carried | HiddenSecret
+        if self.sidecar is None:
+            secret = open_model(stego, self.key)
+        else:
+            secret = open_secret(stego, self.key, self.sidecar)
         if isinstance(secret, Carried):
             return Opened(filled(secret.gaussians, secret.count))
-        try:
-            revealed = reveal_gaussians(stego, secret)
-        except InputError:  # no longer the model that it belongs to: its positions changed
+        try:  # where the sidecar knows all opacities, force repairs rounded ones and changes no others
+            revealed = reveal_gaussians(stego, secret, force=secret.faint is not None)
+        except InputError:  # positions changed, so that it seems to be another model
             revealed = reveal_gaussians(stego, secret, force=True)
         return Opened(revealed, secret.frame)
-
-    @cached_property
-    def _beside(self) -> HiddenSecret:
-        """What a sidecar holds does not depend on what became of the model: opening it once is enough."""
-        assert self.sidecar is not None
-        return unpack_secret(unseal_sidecar(self.sidecar, self.key))

@@ -60,7 +60,7 @@ def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
 
 
 def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
-    """`model` after so many steps of plain 3DGS on the training views, at the rates of a run of that length."""
+    """`model` after as many steps of plain 3DGS on the training views, at the rates of such a run."""
     config = FitConfig(iterations=max(steps, 1))
     parameters = to_parameters(model, model.device)
     optimizers = make_optimizers(parameters, config, scene.extent)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from statistics import mean
 from typing import Any
 
-from keyss.core.errors import BackendError, KeyssError
+from keyss.core.errors import BackendError, KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -19,6 +20,7 @@ from keyss.measure.robustness.retraining import fine_tuning, purification
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
+DRAWS = 3  # of what is removed at random: which Gaussians they are makes a difference of a dB or two
 DEAD = 6.0  # dB: four times the squared error
 UNCHANGED = "none"
 
@@ -31,9 +33,9 @@ def default_changes(
     `cover`: its training photos serve those who train on; so many steps. `sog_iterations`: see `converters`.
     """
     return [
-        *(change.random_pruning(share, seed) for share in PRUNED),
+        *(change.random_pruning(share, seed + draw) for share in PRUNED for draw in range(DRAWS)),
         *(change.opacity_pruning(share) for share in PRUNED),
-        change.cropping(seed),
+        *(change.cropping(seed + draw) for draw in range(DRAWS)),
         *(change.fewer_harmonics(degree) for degree in (2, 1, 0)),
         change.half_floats(),
         *(change.noise(attribute, strength, seed) for attribute in change.NOISY for strength in NOISE),
@@ -59,11 +61,16 @@ def robustness(
     The first row is the unchanged model, from which losses are counted (dB of PSNR). In each row "secrets"
     has for each secret whether it still "opens", and if not, the "error"; then its quality is the floor, what
     a person has without it: the changed model itself, as seen from the secret's cameras. A row whose tool is
-    missing says so in "skipped" and has no qualities. `changes`: `default_changes` by default, about 40.
+    missing says so in "skipped" and has no qualities. `changes`: `default_changes` by default, about 50.
     `views`: at most so many test views of each scene. `progress`: called with rows done, rows in all, and the
     next row's name. Drawn on the device of `stego`. JSON-able; the same seed gives the same numbers.
-    Raises the KeyssError of a secret that does not open in the unchanged model.
+    Raises UsageError unless each secret can be reopened, and the KeyssError of one that does not open in the
+    unchanged model.
     """
+    if len(reopen) != len(secrets):
+        raise UsageError(
+            f"expected one way to reopen for each of {len(secrets)} secret(s), got {len(reopen)}"
+        )
     changes = default_changes(cover, seed=seed) if changes is None else changes
     same = Change(UNCHANGED, 0, "", "Nothing is changed.", lambda model: model)
     frames = [each(stego).frame for each in reopen]
@@ -76,6 +83,7 @@ def robustness(
             "strength": each.strength,
             "unit": each.unit,
             "sentence": each.sentence,
+            "seed": each.seed,
         }
         rows.append(row)
         try:
@@ -101,33 +109,36 @@ def verdicts(rows: Sequence[dict[str, Any]], dead: float = DEAD) -> list[dict[st
     """For each attack among `rows` its curve of losses, and whether the secret dies later than the cover.
 
     "curve": [strength, loss of the cover, loss of the secret] in dB, for the attack's strengths in their
-    order; of several secrets the one that loses most counts. A scene is dead at a strength if it has lost
-    `dead` dB or more, and a secret also if it does not open. "secret_dies_at", "cover_dies_at": the first
-    strength at which that is so, None if never. "verdict" tells who is dead at the first strength at which
-    any is: "later" the cover alone, "sooner" the secret alone, "together" both; "neither" if there is none.
-    "excess": the largest difference in dB between the secret's loss and the cover's.
+    order; means over rows of one strength, and of several secrets the one that loses most counts. A scene is
+    dead at a strength if it has lost `dead` dB or more, and a secret also if it did not open in one of the
+    rows. "secret_dies_at", "cover_dies_at": the first strength at which that is so, None if never. "verdict"
+    tells who is dead at the first strength at which any is: "later" the cover alone, "sooner" the secret
+    alone, "together" both; "neither" if there is none. "excess": by how many dB more the secret loses than
+    the cover, at most, at strengths at which the cover lives; None if there is none.
     """
-    attacks: dict[str, list[dict[str, Any]]] = {}
+    attacks: dict[str, dict[float, list[dict[str, Any]]]] = {}
     for row in rows:
         if row["attack"] != UNCHANGED and "skipped" not in row:
-            attacks.setdefault(row["attack"], []).append(row)
+            attacks.setdefault(row["attack"], {}).setdefault(row["strength"], []).append(row)
     return [_verdict(attack, own, dead) for attack, own in attacks.items()]
 
 
-def _verdict(attack: str, rows: Sequence[dict[str, Any]], dead: float) -> dict[str, Any]:
-    curve = [
-        [row["strength"], row["cover"]["loss"], max(each["loss"] for each in row["secrets"])] for row in rows
-    ]
-    opens = [all(each["opens"] for each in row["secrets"]) for row in rows]
-    cover_dead = [cover >= dead for _, cover, _ in curve]
-    secret_dead = [loss >= dead or not fine for (_, _, loss), fine in zip(curve, opens, strict=True)]
+def _verdict(attack: str, rows: Mapping[float, Sequence[dict[str, Any]]], dead: float) -> dict[str, Any]:
+    curve, cover_dead, secret_dead = [], [], []
+    for strength, same in rows.items():
+        cover = mean(row["cover"]["loss"] for row in same)
+        secret = mean(max(each["loss"] for each in row["secrets"]) for row in same)
+        opens = all(each["opens"] for row in same for each in row["secrets"])
+        curve.append([strength, cover, secret])
+        cover_dead.append(cover >= dead)
+        secret_dead.append(secret >= dead or not opens)
     return {
         "attack": attack,
-        "unit": rows[0]["unit"],
+        "unit": next(iter(rows.values()))[0]["unit"],
         "curve": curve,
         "secret_dies_at": _first(curve, secret_dead),
         "cover_dies_at": _first(curve, cover_dead),
-        "excess": max(secret - cover for _, cover, secret in curve),
+        "excess": max((secret - cover for _, cover, secret in curve if cover < dead), default=None),
         "verdict": _who_first(secret_dead, cover_dead),
     }
 
