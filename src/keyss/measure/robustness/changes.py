@@ -1,0 +1,138 @@
+"""Changes of a published model that need nothing but the model.
+
+Each is a pure function from `Gaussians` to `Gaussians`: the same change of the same model gives the same
+numbers, for whatever is random follows from its seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+
+NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harmonics")
+
+
+@dataclass(frozen=True)
+class Change:
+    """Something that may become of a model. Raises BackendError when called without a tool that it needs."""
+
+    attack: str  # changes of one attack differ in strength only
+    strength: float
+    unit: str  # of the strength
+    sentence: str  # what it does, for people
+    apply: Callable[[Gaussians], Gaussians]
+    seed: int | None = None  # what its randomness follows from, None where nothing is random
+
+    def __call__(self, model: Gaussians) -> Gaussians:
+        return self.apply(model)
+
+
+def random_pruning(share: float, seed: int = 0) -> Change:
+    """Remove a share of the Gaussians, in [0, 1), at random (KeySS, supplement: pruning)."""
+    _check_share(share)
+
+    def apply(model: Gaussians) -> Gaussians:
+        order = torch.randperm(len(model), generator=torch.Generator().manual_seed(seed))
+        return model[order[_removed(share, model) :].sort().values.to(model.device)]
+
+    sentence = f"{share:.0%} of the Gaussians, drawn at random, are removed."
+    return Change("random pruning", share, "share removed", sentence, apply, seed)
+
+
+def opacity_pruning(share: float) -> Change:
+    """Remove the share of the Gaussians, in [0, 1), whose opacity is lowest (KeySS, supplement: pruning)."""
+    _check_share(share)
+
+    def apply(model: Gaussians) -> Gaussians:
+        order = model.opacity_logits.argsort(stable=True)
+        return model[order[_removed(share, model) :].sort().values]
+
+    sentence = f"The {share:.0%} of the Gaussians with the lowest opacity are removed."
+    return Change("pruning by opacity", share, "share removed", sentence, apply)
+
+
+def noise(attribute: str, strength: float, seed: int = 0) -> Change:
+    """Add normal noise to one attribute of every Gaussian; `attribute` is one of NOISY.
+
+    Its standard deviation is `strength` times the attribute's spread: per component, half the distance
+    between the quantiles 0.159 and 0.841, which of normal numbers is their standard deviation and does not
+    mind a few Gaussians far away. Raises UsageError for another attribute.
+    """
+    if attribute not in NOISY:
+        raise UsageError(f"noise: expected one of {', '.join(NOISY)}, got {attribute!r}")
+
+    def noisy(values: Tensor) -> Tensor:
+        drawn = torch.randn(values.shape, generator=torch.Generator().manual_seed(seed)).to(values)
+        return values + strength * spread(values) * drawn
+
+    def apply(model: Gaussians) -> Gaussians:
+        match attribute:
+            case "position":
+                return replace(model, means=noisy(model.means))
+            case "log scale":
+                return replace(model, log_scales=noisy(model.log_scales))
+            case "quaternion":
+                return replace(model, quats=noisy(model.quats))
+            case "logit opacity":
+                return replace(model, opacity_logits=noisy(model.opacity_logits))
+            case "colour":
+                return replace(model, sh=torch.cat([noisy(model.sh[:, :1]), model.sh[:, 1:]], dim=1))
+        return replace(model, sh=torch.cat([model.sh[:, :1], noisy(model.sh[:, 1:])], dim=1))
+
+    sentence = f"Normal noise of {strength:g} times its spread is added to the {attribute} of every Gaussian."
+    return Change(f"noise on {attribute}", strength, "spreads of the attribute", sentence, apply, seed)
+
+
+def spread(values: Tensor) -> Tensor:
+    """[...] of values [N, ...]: half the distance between their quantiles 0.159 and 0.841."""
+    low, high = np.quantile(values.detach().cpu().numpy(), (0.158655, 0.841345), axis=0)
+    return torch.as_tensor((high - low) / 2, dtype=values.dtype, device=values.device)
+
+
+def cropping(seed: int = 0) -> Change:
+    """Keep the half of the Gaussians on one side of a plane, whose direction is drawn at random."""
+
+    def apply(model: Gaussians) -> Gaussians:
+        direction = torch.randn(3, generator=torch.Generator().manual_seed(seed)).to(model.device)
+        order = (model.means @ direction).argsort(stable=True)
+        return model[order[len(model) // 2 :].sort().values]
+
+    sentence = "Only the half of the Gaussians on one side of a plane is kept."
+    return Change("cropping", 0.5, "share removed", sentence, apply, seed)
+
+
+def fewer_harmonics(degree: int) -> Change:
+    """Drop the spherical harmonics above a degree, 0 to 3."""
+
+    def apply(model: Gaussians) -> Gaussians:
+        return model.with_sh_degree(min(degree, model.sh_degree))
+
+    sentence = f"Spherical harmonics above degree {degree} are dropped."
+    return Change("fewer harmonics", degree, "degree left", sentence, apply)
+
+
+def half_floats() -> Change:
+    """Round every number to half precision (IEEE 754 binary16) and back."""
+    sentence = "Every number is rounded to half precision."
+    return Change("half floats", 16, "bits a number", sentence, lambda model: model.map(_halved))
+
+
+def _halved(values: Tensor) -> Tensor:
+    return values.half().float()
+
+
+def _check_share(share: float) -> None:
+    if not 0 <= share < 1:
+        raise UsageError(f"pruning: expected a share of 0 or more and less than 1, got {share}")
+
+
+def _removed(share: float, model: Gaussians) -> int:
+    """How many Gaussians are removed: at least one is left."""
+    return min(round(share * len(model)), len(model) - 1)

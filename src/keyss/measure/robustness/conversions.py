@@ -1,0 +1,163 @@
+"""To other formats and back, by other people's programs: gsply (PyPI) and splat-transform (npm, PlayCanvas).
+
+pip install gsply
+npm install --no-save @playcanvas/splat-transform@2.7.1
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from keyss.core.errors import BackendError, KeyssError
+from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.files.ply import read_ply, write_ply
+from keyss.measure.robustness.changes import Change
+
+SECONDS = 600.0  # that a program may take for one way
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A model that went to another format and back."""
+
+    gaussians: Gaussians
+    bytes: int  # of the file in the other format
+
+
+@dataclass(frozen=True)
+class Converter:
+    """Takes models to a format and back."""
+
+    format: str
+    tool: str
+    note: str  # what there is to know about this way, or nothing
+    there_and_back: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
+
+    def __call__(self, model: Gaussians) -> Converted:
+        """Raises BackendError where the tool is missing or cannot do it."""
+        with tempfile.TemporaryDirectory() as folder:
+            source = Path(folder) / "source.ply"
+            write_ply(source, model)
+            try:
+                other, back = self.there_and_back(source, Path(folder))
+                return Converted(read_ply(back), other.stat().st_size)
+            except BackendError:
+                raise
+            except (KeyssError, OSError, ValueError) as error:
+                reason = (str(error) or type(error).__name__).splitlines()[0]
+                raise BackendError(f"{self.tool} failed on {self.format}: {reason}") from error
+
+    def change(self) -> Change:
+        sentence = f"Converted to {self.format} and back by {self.tool}{self.note}."
+        attack = f"conversion to {self.format} by {self.tool}"
+        return Change(attack, 1, "times", sentence, lambda model: self(model).gaussians.to(model.device))
+
+
+def converters(sog_iterations: int = 1) -> list[Converter]:
+    """All ways that are known, whether their tools are there or not.
+
+    `sog_iterations`: of the search for common harmonics in .sog, which without a GPU takes splat-transform
+    half a minute each for 20,000 Gaussians; by itself it makes ten.
+    """
+    few = ", with one round" if sog_iterations == 1 else f", with {sog_iterations} rounds"
+    return [
+        Converter("compressed .ply", "gsply", "", _gsply_compressed),
+        Converter(".spz", "gsply", " (version 3)", _gsply_spz),
+        Converter("compressed .ply", "splat-transform", "", _through("there.compressed.ply")),
+        Converter(".spz", "splat-transform", " (version 4)", _through("there.spz")),
+        Converter(
+            ".sog",
+            "splat-transform",
+            f"{few} of its search for common harmonics",
+            _through("there.sog", "-i", str(sog_iterations)),
+        ),
+        Converter(".splat", "splat-transform", ", which only reads this format", _splat),
+    ]
+
+
+def find_splat_transform() -> str:
+    """The program: KEYSS_SPLAT_TRANSFORM, else node_modules here, else on the PATH. Raises BackendError."""
+    here = Path("node_modules") / ".bin" / "splat-transform"
+    named = os.environ.get("KEYSS_SPLAT_TRANSFORM")
+    found = named or (str(here.absolute()) if here.exists() else shutil.which("splat-transform"))
+    if not found or not Path(found).exists():
+        raise BackendError(
+            "splat-transform is not installed (npm install --no-save @playcanvas/splat-transform@2.7.1, "
+            "or its path in KEYSS_SPLAT_TRANSFORM)"
+        )
+    return found
+
+
+def find_gsply() -> ModuleType:
+    """The module. Raises BackendError."""
+    try:
+        return import_module("gsply")
+    except ImportError as error:
+        raise BackendError("gsply is not installed (pip install gsply)") from error
+
+
+def transform(source: Path, target: Path, *options: str) -> Path:
+    """`target`, converted from `source` by splat-transform. Raises BackendError."""
+    tool = find_splat_transform()
+    command = [tool, "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=SECONDS)
+    except subprocess.TimeoutExpired as error:
+        raise BackendError(f"splat-transform took more than {SECONDS:.0f} s for {target.name}") from error
+    except (OSError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", None) or str(error)
+        raise BackendError(
+            f"splat-transform failed on {target.name}: {said.strip().splitlines()[-1]}"
+        ) from error
+    return target
+
+
+def _through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
+    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+        there = transform(source, folder / name, *options)
+        return there, transform(there, folder / "back.ply")
+
+    return there_and_back
+
+
+def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:
+    gsply, there, back = find_gsply(), folder / "there.compressed.ply", folder / "back.ply"
+    gsply.plywrite(there, gsply.plyread(source), compressed=True)
+    gsply.plywrite(back, gsply.plyread(there))
+    return there, back
+
+
+def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
+    gsply, there, back = find_gsply(), folder / "there.spz", folder / "back.ply"
+    gsply.write_spz(there, gsply.plyread(source), version=3)
+    gsply.plywrite(back, gsply.read_spz(there))
+    return there, back
+
+
+def _splat(source: Path, folder: Path) -> tuple[Path, Path]:
+    """antimatter15's format: positions and scales as floats, colour, opacity and rotation as bytes."""
+    model, there = read_ply(source), folder / "there.splat"
+    rows = np.zeros(len(model), dtype=[("p", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
+    rows["p"], rows["s"] = model.means.numpy(), model.scales.numpy()
+    rows["c"][:, :3] = _bytes((0.5 + SH_C0 * model.sh[:, 0]) * 255)
+    rows["c"][:, 3] = _bytes(model.opacities * 255)
+    rows["q"] = _bytes(torch.nn.functional.normalize(model.quats, dim=1) * 128 + 128)
+    there.write_bytes(rows.tobytes())
+    return there, transform(there, folder / "back.ply")
+
+
+def _bytes(values: torch.Tensor) -> npt.NDArray[np.uint8]:
+    result: npt.NDArray[np.uint8] = values.round().clamp(0, 255).to(torch.uint8).numpy()
+    return result
