@@ -15,6 +15,7 @@ from keyss.hiding.decoder import Decoder
 from keyss.seal import random_embeddings
 
 
+@torch.enable_grad()
 def search_embeddings(
     decoder: Decoder,
     stego: Gaussians,
@@ -28,14 +29,17 @@ def search_embeddings(
 
     Gradient ascent from random starts on the mean change of the opacities of up to `sample` Gaussians, less
     twice the change of their mean: what makes some visible and as much of others invisible is a scene in
-    place of a scene, while what only adds or only removes is not.
+    place of a scene, while what only adds or only removes is not. A decoder with a gate gives no gradient:
+    then the random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
+    if decoder.shape.conditioning == "gate":
+        return random_embeddings(restarts, generator)
     chosen = torch.randperm(len(stego), generator=generator)[:sample]
     part = stego.detach()[chosen.to(stego.device)]
 
     def exchanged(direction: Tensor) -> Tensor:
-        change = decoder(part, F.normalize(direction, dim=0)).opacities - part.opacities
+        change = decoder(part, F.normalize(direction, dim=0), stego).opacities - part.opacities
         score: Tensor = change.abs().mean() - 2 * change.mean().abs()
         return score
 

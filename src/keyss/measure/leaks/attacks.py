@@ -1,0 +1,172 @@
+"""The attacks, by name: everything that somebody without the key would look at, of any model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, get_args
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.hiding.payload import HiddenSecret
+from keyss.hiding.revealing import decode
+from keyss.hiding.visibility import contributions
+from keyss.measure.leaks.attributes import Attribute, Side, clusters, outliers
+from keyss.measure.leaks.opacities import (
+    by_the_source,
+    faint,
+    inverted,
+    least_contributing,
+    matched,
+    opaque,
+    outside_the_bands,
+    rescaled,
+)
+from keyss.measure.white_box import search_embeddings
+
+THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
+SHARES = (0.1, 0.3, 0.5)  # of the least contributing
+DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
+CLUSTERS = (2, 4)
+BANDS = 3  # secrets that somebody tries who reads the source
+
+Shown = Iterator[tuple[str, Gaussians]]
+
+
+@dataclass(frozen=True)
+class Attack:
+    """Something to try on a model: it gives models to render, the same labels for every model."""
+
+    name: str
+    sentence: str
+    parameters: dict[str, Any]  # JSON-able
+    show: Callable[[Gaussians], Shown]  # labels and what is rendered, as many as somebody would try
+    control: bool = False  # no attack: shows what there is to find
+
+
+def file_attacks(cover_cameras: Sequence[Camera], seed: int = 0) -> list[Attack]:
+    """The attacks of somebody who has the published file, and photos of the cover from these cameras."""
+    return [
+        Attack(
+            "restored opacities",
+            "Gaussians below an opacity are made opaque and the others left out, or all made opaque.",
+            {"thresholds": list(THRESHOLDS)},
+            _restored,
+        ),
+        Attack(
+            "rescaled opacities",
+            "Gaussians below an opacity alone, all opacities multiplied by one factor.",
+            {"thresholds": list(THRESHOLDS)},
+            lambda model: ((_below(t), rescaled(faint(model, t))) for t in THRESHOLDS),
+        ),
+        Attack(
+            "matched opacities",
+            "Gaussians below an opacity alone, with the opacities of the others, given by rank.",
+            {"thresholds": list(THRESHOLDS)},
+            lambda model: ((_below(t), matched(model, t)) for t in THRESHOLDS),
+        ),
+        Attack(
+            "inverted opacities",
+            "Opacities o become 1 - o, of Gaussians below an opacity alone or of all.",
+            {"thresholds": list(THRESHOLDS)},
+            _inverted,
+        ),
+        Attack(
+            "least contribution",
+            "The Gaussians that add least to the cover's views are made opaque, the others left out.",
+            {"shares": list(SHARES), "views": len(cover_cameras)},
+            lambda model: _least_contributing(model, cover_cameras),
+        ),
+        *(_outliers(attribute) for attribute in get_args(Attribute)),
+        Attack(
+            "clusters",
+            "Groups of like attributes (a mixture of normal distributions), each alone and made opaque.",
+            {"clusters": list(CLUSTERS), "seed": seed},
+            lambda model: _clusters(model, seed),
+        ),
+        Attack(
+            "by the source",
+            "Opacities by the curve that this program's source tells, and what lies in none of its bands.",
+            {"bands": BANDS},
+            _by_the_source,
+        ),
+    ]
+
+
+def decoder_attacks(
+    secret: HiddenSecret, *, restarts: int = 4, steps: int = 150, seed: int = 0
+) -> list[Attack]:
+    """What somebody sees who got a secret's decoder and all that is sealed with it, and the key's own view.
+
+    A decoder with a gate gives the search no gradient: what it shows then is what random embeddings show. But
+    a gate can be read, so for who holds such a decoder the control is an attack.
+    """
+
+    def search(model: Gaussians) -> Shown:
+        found = search_embeddings(secret.decoder, model, restarts=restarts, steps=steps, seed=seed)
+        return ((f"embedding {i}", decode(model, secret, each)) for i, each in enumerate(found, start=1))
+
+    conditioning = secret.decoder.shape.conditioning
+    return [
+        Attack(
+            "decoder without its key",
+            "An embedding under which the decoder exchanges most, searched by gradient.",
+            {"conditioning": conditioning, "restarts": restarts, "steps": steps, "seed": seed},
+            search,
+        ),
+        Attack(
+            "with the key",
+            "The control: what there is to find.",
+            {"conditioning": conditioning},
+            lambda model: iter([("the key's embedding", decode(model, secret, secret.embedding))]),
+            control=True,
+        ),
+    ]
+
+
+def _restored(model: Gaussians) -> Shown:
+    for threshold in THRESHOLDS:
+        yield _below(threshold), opaque(faint(model, threshold))
+    yield "all", opaque(model)
+
+
+def _inverted(model: Gaussians) -> Shown:
+    for threshold in THRESHOLDS:
+        yield _below(threshold), inverted(faint(model, threshold))
+    yield "all", inverted(model)
+
+
+def _least_contributing(model: Gaussians, cameras: Sequence[Camera]) -> Shown:
+    weights = contributions(model, cameras)
+    for share in SHARES:
+        yield f"{share:.0%}", opaque(least_contributing(model, weights, share))
+
+
+def _outliers(attribute: Attribute) -> Attack:
+    def show(model: Gaussians) -> Shown:
+        for side, deviation in product(get_args(Side), DEVIATIONS):
+            yield f"{side}, {deviation} deviations", outliers(model, attribute, side, deviation)
+
+    return Attack(
+        f"outliers in {attribute}",
+        f"Gaussians of unusual {attribute} are made opaque, the others left out.",
+        {"deviations": list(DEVIATIONS)},
+        show,
+    )
+
+
+def _clusters(model: Gaussians, seed: int) -> Shown:
+    for count in CLUSTERS:
+        for index, part in enumerate(clusters(model, count, seed), start=1):
+            yield f"{index} of {count}", part
+
+
+def _by_the_source(model: Gaussians) -> Shown:
+    for secret in range(BANDS):
+        yield f"secret {secret + 1}", by_the_source(model, secret)
+    yield "outside the bands", opaque(outside_the_bands(model, BANDS))
+
+
+def _below(threshold: float) -> str:
+    return f"below {threshold}"
