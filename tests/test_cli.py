@@ -99,7 +99,8 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        assert COMMANDS == ["keygen", "fit", "hide", "reveal", "render", "evaluate", "info", "demo"]
+        expected = ["keygen", "fit", "hide", "reveal", "render", "evaluate", "steganalyze", "info", "demo"]
+        assert expected == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)
     def test_shows_an_example_and_the_common_options(self, keyss: Callable[..., Said], command: str) -> None:

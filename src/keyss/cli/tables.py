@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from keyss.measure.stegexpose import Steganalysis
 
 Metrics = Mapping[str, Any]  # of metrics.json
 
@@ -76,6 +79,17 @@ def print_fit(metrics: Metrics, console: Console | None = None) -> None:
         f"{metrics['iterations']:,}",
         f"{metrics['seconds']:.0f}",
     )
+    (console or Console()).print(table)
+
+
+def print_steganalysis(found: Steganalysis, console: Console | None = None) -> None:
+    """How many images there are and how many of them are taken for stego images."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("images", "flagged", "mean fusion"):
+        table.add_column(name, justify="right")
+    mean = found.mean_fusion
+    flagged = sum(row.flagged for row in found.rows)
+    table.add_row(f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
     (console or Console()).print(table)
 
 

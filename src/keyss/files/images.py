@@ -16,39 +16,11 @@ _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _MAX_PIXELS = 89_000_000  # just under Pillow's own limit for decompression bombs
 
 
-def probe_image(path: Path) -> tuple[int, int, bool]:
-    """(width, height, whether it may be transparent) of an image, from its header alone.
+def open_image(path: Path) -> Image.Image:
+    """An image whose pixels are not decoded yet, for whoever needs them in another way than `read_image`.
 
-    EXIF orientation is ignored, as COLMAP does. Raises InputError when the file is missing, is not an
-    image or has more than 89 million pixels.
+    Raises InputError when the file is missing, is not an image or has more than 89 million pixels.
     """
-    with _open(path) as image:
-        transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-        return image.width, image.height, transparent
-
-
-def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """[H, W, 3] sRGB of an image file, laid over `background` ([3] in [0, 1]) where it is transparent.
-
-    16-bit grey is scaled to 8 bits; palettes, grey and CMYK are converted. Raises InputError as
-    `probe_image` does, and when the pixels cannot be decoded.
-    """
-    with _open(path) as image:
-        try:
-            return _to_rgb(image, background)
-        except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
-            raise InputError(
-                f"{path}: expected an image, but its pixels cannot be decoded: {error}"
-            ) from error
-
-
-def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """[height, width, 3] by area averaging of a larger image."""
-    # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _open(path: Path) -> Image.Image:
     try:
         image = Image.open(path, formats=_FORMATS)
     except FileNotFoundError as error:
@@ -64,6 +36,37 @@ def _open(path: Path) -> Image.Image:
             f"{path}: expected an image of at most {_MAX_PIXELS:,} pixels, found {image.width}x{image.height}"
         )
     return image
+
+
+def probe_image(path: Path) -> tuple[int, int, bool]:
+    """(width, height, whether it may be transparent) of an image, from its header alone.
+
+    EXIF orientation is ignored, as COLMAP does. Raises InputError as `open_image` does.
+    """
+    with open_image(path) as image:
+        transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+        return image.width, image.height, transparent
+
+
+def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB of an image file, laid over `background` ([3] in [0, 1]) where it is transparent.
+
+    16-bit grey is scaled to 8 bits; palettes, grey and CMYK are converted. Raises InputError as
+    `open_image` does, and when the pixels cannot be decoded.
+    """
+    with open_image(path) as image:
+        try:
+            return _to_rgb(image, background)
+        except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
+            raise InputError(
+                f"{path}: expected an image, but its pixels cannot be decoded: {error}"
+            ) from error
+
+
+def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """[height, width, 3] by area averaging of a larger image."""
+    # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _to_rgb(image: Image.Image, background: NDArray[np.float32]) -> NDArray[np.uint8]:

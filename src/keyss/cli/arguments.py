@@ -1,0 +1,41 @@
+"""Arguments that several commands take, and how one that may be left out is described."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+
+def optional(metavar: str, help: str, otherwise: str) -> Any:
+    """An argument that may be left out; `otherwise` says what happens then."""
+    return arg(metavar=metavar, help=help, help_behavior_hint=f"(default: {otherwise})")
+
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+Device = Annotated[DeviceName, arg(help="Where to compute; auto takes a CUDA GPU where there is one.")]
+Seed = Annotated[int | None, optional("N", "Seed of everything random.", "the preset's")]
+# Every command takes --seed and --device, so that scripts can pass them to all alike.
+UnusedSeed = Annotated[int, arg(metavar="N", help="Changes nothing here: nothing is random.")]
+UnusedDevice = Annotated[DeviceName, arg(help="Changes nothing here: nothing is computed.")]
+KeyFiles = Annotated[
+    UseAppendAction[tuple[Path, ...]],
+    optional("FILE", "File with the key, once for each secret.", "KEYSS_KEY, or a hidden prompt"),
+]
+Width = Annotated[
+    int | None, optional("PIXELS", "Photos wider than this are downscaled to it.", "as they are")
+]
+Background = Annotated[
+    tuple[float, float, float] | None,
+    optional(
+        "R G B",
+        "Colour behind everything, 0 to 1 each; transparent photos get it.",
+        "white if there are any, else black",
+    ),
+]
+Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
+MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
+Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
+Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
+OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
