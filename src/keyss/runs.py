@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ class HidingRun:
     stego: Gaussians
     sidecar: Path | None
     opened: tuple[Opened, ...]  # in the order of the secrets
+    keys: tuple[str, ...] = field(repr=False)  # in the same order
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
 
     @property
@@ -91,11 +92,11 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     if not all(isinstance(source, str) for source in sources):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego, sidecar = read_ply(folder / STEGO), sidecar_beside(folder / STEGO)
-    opened = {fingerprint(secret): secret for secret in (open_any(stego, key, sidecar) for key in keys)}
-    if set(opened) != set(fingerprints):
-        raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(opened)} of them")
-    found = tuple(opened[each] for each in fingerprints)
-    return HidingRun(folder, settings, metrics, stego, sidecar, found, sources)
+    found = {fingerprint(secret): (secret, key) for key in keys for secret in [open_any(stego, key, sidecar)]}
+    if set(found) != set(fingerprints):
+        raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(found)} of them")
+    opened, own = zip(*(found[each] for each in fingerprints), strict=True)
+    return HidingRun(folder, settings, metrics, stego, sidecar, opened, own, sources)
 
 
 def open_any(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:

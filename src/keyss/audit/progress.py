@@ -16,6 +16,7 @@ from keyss.files.reading import read_file
 from keyss.files.results import json_bytes, png_bytes, read_json
 from keyss.fitting.loop import Reporter
 
+PICTURES = "pictures"  # folder in that of the audit
 _MAX_PICTURE_BYTES = 1 << 26
 
 
@@ -23,7 +24,7 @@ _MAX_PICTURE_BYTES = 1 << 26
 class Found:
     """What a part of an audit returns."""
 
-    result: Any  # JSON-able
+    sections: dict[str, Any]  # of audit.json
     pictures: dict[str, Tensor] = field(default_factory=dict)  # [H, W, 3] uint8 by file name
 
 
@@ -49,16 +50,16 @@ class Kept:
         for name, picture in found.pictures.items():
             (self.folder / part).mkdir(exist_ok=True)
             write_bytes(self.folder / part / name, png_bytes(picture))
-        written = json_bytes({"result": found.result, "pictures": sorted(found.pictures)})
+        written = json_bytes({"sections": found.sections, "pictures": sorted(found.pictures)})
         write_bytes(self.folder / f"{part}.json", written)
 
-    def take(self, part: str) -> tuple[Any, dict[str, bytes]]:
-        """Result and pictures (PNG files by name) of a part that was kept."""
+    def take(self, part: str) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """Sections and pictures (PNG files by name) of a part that was kept."""
         kept = read_json(self.folder / f"{part}.json")
         pictures = {
             name: read_file(self.folder / part / name, _MAX_PICTURE_BYTES) for name in kept["pictures"]
         }
-        return kept["result"], pictures
+        return kept["sections"], pictures
 
 
 class Steps:

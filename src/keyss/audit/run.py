@@ -8,19 +8,19 @@ from collections.abc import Sequence
 from importlib.metadata import version as version_of
 from typing import Any
 
-from keyss.audit.parts import PARTS
-
 from keyss._version import __version__
-from keyss.audit.progress import Kept, Steps
+from keyss.audit.parts import PARTS
+from keyss.audit.progress import PICTURES, Kept, Steps
 from keyss.audit.subject import Subject, null_seeds, subject_of
 from keyss.core.errors import UsageError
 from keyss.files.output import OutputFolder
 from keyss.files.results import bytes_writer, json_writer
 from keyss.fitting.loop import Interrupted, Reporter, Silent
 from keyss.rendering import Backend, resolve_device
+from keyss.report import write_report
 from keyss.runs import HidingRun, PathLike, fingerprint, open_run
 
-AUDIT, FOLDER, PICTURES = "audit.json", "audit", "pictures"
+AUDIT, FOLDER = "audit.json", "audit"
 FORMAT = 1
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
 
@@ -57,7 +57,8 @@ def audit(
     seeds = null_seeds(opened, null, seed)
     subject = subject_of(opened, original, seeds, resolve_device(device), reporter)
     kept = Kept(output.checkpoints(), _inputs(subject, seeds, seed))
-    results, pictures = {}, {}
+    results: dict[str, Any] = {}
+    pictures: dict[str, bytes] = {}
     chosen = [name for name in PARTS if not only or name in only]
     for index, name in enumerate(chosen):
         if not kept.has(name):
@@ -68,7 +69,8 @@ def audit(
                 raise Interrupted(kept.folder, index) from error
             finally:
                 steps.finish()
-        results[name], shown = kept.take(name)
+        sections, shown = kept.take(name)
+        results |= sections
         pictures |= shown
     found = {
         "version": FORMAT,
@@ -76,10 +78,12 @@ def audit(
         "seconds": round(time.monotonic() - started, 1),
         "run": _facts(opened),
         "null": {"models": null, "seeds": seeds},
+        "wrong_key": opened.metrics.get("wrong_key"),
         **results,
     }
     writers = {f"{PICTURES}/{name}": bytes_writer(data) for name, data in pictures.items()}
     output.fill({AUDIT: json_writer(found), **writers})
+    write_report(opened.folder)
     return found
 
 
@@ -104,7 +108,6 @@ def _facts(run: HidingRun) -> dict[str, Any]:
         "secrets": secrets,
         "width": run.width,
         "gaussians": len(run.stego),
-        "wrong_key": run.metrics.get("wrong_key"),
         "config": run.settings.get("config"),
         "versions": {"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     }

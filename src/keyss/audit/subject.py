@@ -21,6 +21,8 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.hiding.payload import HiddenSecret
+from keyss.hiding.revealing import read_sidecar
+from keyss.measure.robustness import Reopener
 from keyss.runs import HidingRun, Opened, revealed
 
 NULLS = "private/null"  # plain models of the cover from other seeds, in a run's folder
@@ -43,6 +45,17 @@ class Subject:
     @property
     def cover(self) -> Scene:
         return self.scenes[0]
+
+    @property
+    def models(self) -> tuple[Gaussians, ...]:
+        """What shows the scenes: the published model, and what the keys make of it."""
+        return (self.stego, *self.revealed)
+
+    @property
+    def reopeners(self) -> list[Reopener]:
+        """What opens the secrets in a changed model."""
+        sidecar = None if self.run.sidecar is None else read_sidecar(self.run.sidecar)
+        return [Reopener(key, sidecar) for key in self.run.keys]
 
     @property
     def secrets(self) -> tuple[Scene, ...]:

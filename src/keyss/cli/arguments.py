@@ -39,3 +39,12 @@ MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model."
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
+
+
+def checked_seed(seed: int) -> int:
+    """The seed, if every generator takes it. Raises UsageError."""
+    from keyss.core.errors import UsageError
+
+    if not 0 <= seed < 2**32:
+        raise UsageError(f"--seed: expected 0 to {2**32 - 1}, got {seed}")
+    return seed

@@ -26,7 +26,7 @@ from keyss.cli.arguments import (
     Width,
     optional,
 )
-from keyss.cli.measuring import steganalyze
+from keyss.cli.measuring import audit, report, steganalyze
 
 if TYPE_CHECKING:
     from keyss.fitting.config import FitConfig
@@ -326,7 +326,7 @@ def evaluate(
         run,
         keys(key_file, len(key_file) or 1),
         wrong_keys=wrong_keys,
-        seed=_checked(seed),
+        seed=checked_seed(seed),
         device=device,
         reporter=reporter(),
     )
@@ -372,7 +372,7 @@ def demo(
     from keyss.demo import WRONG_KEYS, run_demo
     from keyss.progress import reporter
 
-    result = run_demo(out, seed=_checked(seed), device=device, overwrite=overwrite, reporter=reporter())
+    result = run_demo(out, seed=checked_seed(seed), device=device, overwrite=overwrite, reporter=reporter())
     print_metrics(result.metrics)
     print(f"Of {len(WRONG_KEYS)} wrong keys tried at the door, {result.refused} were refused.")
     print_files(
@@ -388,7 +388,7 @@ def demo(
     )
 
 
-ALL = (keygen, fit, hide, reveal, render, evaluate, steganalyze, info, demo)
+ALL = (keygen, fit, hide, reveal, render, evaluate, audit, report, steganalyze, info, demo)
 
 
 def _schedule(
@@ -400,18 +400,9 @@ def _schedule(
     asked: dict[str, Any] = {
         "iterations": iterations,
         "max_gaussians": max_gaussians,
-        "seed": None if seed is None else _checked(seed),
+        "seed": None if seed is None else checked_seed(seed),
     }
     return replace(config, **{name: value for name, value in asked.items() if value is not None})
-
-
-def _checked(seed: int) -> int:
-    """The seed, if every generator takes it. Raises UsageError."""
-    from keyss.core.errors import UsageError
-
-    if not 0 <= seed < 2**32:
-        raise UsageError(f"--seed: expected 0 to {2**32 - 1}, got {seed}")
-    return seed
 
 
 def _metrics(folder: Path) -> dict[str, Any]:

@@ -6,12 +6,23 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
-from keyss.cli.arguments import DeviceName, Overwrite, UnusedSeed
+from keyss.cli.arguments import (
+    Device,
+    DeviceName,
+    KeyFiles,
+    Overwrite,
+    Resume,
+    UnusedDevice,
+    UnusedSeed,
+    checked_seed,
+    optional,
+)
 
+PartName = Literal["images", "parameters", "stegexpose", "leaks", "robustness", "speed"]
 CpuOnly = Annotated[DeviceName, arg(help="Changes nothing here: the CPU computes.")]
 
 
@@ -47,6 +58,75 @@ def steganalyze(
     print(f"{csv}: {len(found.rows)} image{'' if len(found.rows) == 1 else 's'}")
     if found.skipped:
         print(f"keyss: skipped what is no readable image: {_listed(found.skipped)}", file=sys.stderr)
+
+
+def audit(
+    run: Annotated[Positional[Path], arg(metavar="RUN", help="Result folder of `keyss hide`.")],
+    *,
+    key_file: KeyFiles = (),
+    original: Annotated[
+        Path | None, optional("FILE", "Plain 3DGS model of the cover to compare with.", "the run's own")
+    ] = None,
+    null: Annotated[
+        int, arg(metavar="N", help="Plain models of the cover from other seeds, to compare with; 2 or more.")
+    ] = 3,
+    only: Annotated[
+        UseAppendAction[tuple[PartName, ...]],
+        optional("PART", "A part of the audit, once for each.", "all of them"),
+    ] = (),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: Annotated[int, arg(metavar="N", help="Seed of everything random.")] = 0,
+) -> None:
+    """Judge a hiding: quality, stealth, attacks with and without a key, robustness, speed. Takes minutes.
+
+    example: keyss audit runs/hidden --key-file key.txt
+    """
+    from keyss.audit import audit as judge
+    from keyss.cli.keys import keys
+    from keyss.cli.tables import print_files, print_verdicts
+    from keyss.progress import reporter
+
+    chosen = keys(key_file, len(key_file) or 1)
+    judge(
+        run,
+        chosen,
+        original=original,
+        null=null,
+        only=only,
+        seed=checked_seed(seed),
+        device=device,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
+    print_verdicts(run)
+    print_files(
+        run,
+        {
+            "report.html": "all of it, for people: look here first; it shows the secret",
+            "audit/audit.json": "all of it, for programs",
+        },
+    )
+
+
+def report(
+    run: Annotated[Positional[Path], arg(metavar="RUN", help="Result folder that `keyss audit` has judged.")],
+    *,
+    device: UnusedDevice = "auto",
+    seed: UnusedSeed = 0,
+) -> None:
+    """Write what an audit found as one HTML file that needs no network.
+
+    example: keyss report runs/hidden
+    """
+    from keyss.cli.tables import print_files, print_verdicts
+    from keyss.report import write_report
+
+    path = write_report(run)
+    print_verdicts(run)
+    print_files(path.parent, {path.name: "open it in a browser; it shows the secret"})
 
 
 def _listed(names: list[str], most: int = 5) -> str:

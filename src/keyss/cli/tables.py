@@ -93,6 +93,22 @@ def print_steganalysis(found: Steganalysis, console: Console | None = None) -> N
     (console or Console()).print(table)
 
 
+def print_verdicts(run: Path, console: Console | None = None) -> None:
+    """What an audit comes to: a line for each measure, beside its bound or null."""
+    from keyss.report.reading import read_audit
+    from keyss.report.verdicts import headline, verdicts
+
+    lines = verdicts(read_audit(run))
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("", "value", "beside", "limit", ""):
+        table.add_column(name)
+    for line in lines:
+        table.add_row(line.measure, line.value, line.beside, line.limit, line.word)
+    console = console or Console()
+    console.print(table)
+    console.print(headline(lines), highlight=False)
+
+
 def print_facts(facts: Mapping[str, Any]) -> None:
     """Names and values, a nested one per line: `points.count`."""
     _print_columns(_flat(facts))

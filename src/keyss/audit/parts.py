@@ -1,0 +1,174 @@
+"""The parts of an audit: which measure looks at what, beside which bound or null."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from keyss.audit.histograms import histograms
+from keyss.audit.progress import PICTURES, Found, Steps
+from keyss.audit.subject import Subject
+from keyss.core.errors import BackendError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene, View
+from keyss.files.results import STEGO, picture_name
+from keyss.fitting.image_metrics import thin
+from keyss.hiding.payload import HiddenSecret
+from keyss.measure.distances import against_null
+from keyss.measure.images import compare_images
+from keyss.measure.leaks import look_for_secret
+from keyss.measure.robustness import robustness as survival
+from keyss.measure.robustness import verdicts
+from keyss.measure.roc import stegexpose_roc
+from keyss.measure.sealwatch_detectors import sealwatch_roc
+from keyss.measure.sinkhorn import sinkhorn_3d
+from keyss.measure.speed import speed as measure_speed
+from keyss.measure.two_sample import two_sample_against_null
+from keyss.rendering import render
+
+PICTURED_VIEWS = 3
+STEGANALYSED_VIEWS = 64
+
+Part = Callable[[Subject, int, Steps], Found]
+Images = list[tuple[str, Tensor]]
+
+
+def images(subject: Subject, seed: int, steps: Steps) -> Found:
+    """Cover and secrets against the test photos, beside plain models, and some of the pictures."""
+    names = ["cover", *(f"secret-{index}" for index in range(1, len(subject.scenes)))]
+    plains = [subject.original, *subject.bounds]
+    pairs = list(zip(names, subject.scenes, subject.models, plains, strict=True))
+    compared, bounds, pictures, shown = [], [], {}, []
+    for index, (name, scene, model, bound) in enumerate(pairs):
+        steps(index, len(pairs))
+        photos = [(picture_name(view.camera), view.image) for view in scene.test]
+        renders = {"published" if index == 0 else "revealed": renders_of(model, scene, scene.test)}
+        if bound is not None:
+            renders["plain 3DGS"] = renders_of(bound, scene, scene.test)
+        if index:
+            without = subject.frames[index - 1].inverse().apply_gaussians(subject.stego)
+            renders["without the key"] = renders_of(without, scene, scene.test)
+        compared.append(compare_images(photos, next(iter(renders.values()))))
+        bounds.append(compare_images(photos, renders["plain 3DGS"]) if bound is not None else None)
+        for view in range(len(photos))[:: -(-len(photos) // PICTURED_VIEWS)]:
+            items = []
+            for label, pictured in {"photo": photos, **renders}.items():
+                file = f"{name}-{view + 1}-{label.replace(' ', '-')}.png"
+                pictures[file] = pictured[view][1]
+                items.append({"label": label, "file": f"{PICTURES}/{file}"})
+            shown.append(
+                {"title": f"{name.replace('-', ' ').capitalize()}, {photos[view][0]}", "items": items}
+            )
+    result = {
+        "cover": compared[0],
+        "cover_bound": bounds[0],
+        "secrets": compared[1:],
+        "secret_bounds": bounds[1:],
+    }
+    return Found({"images": result, "pictures": shown}, pictures)
+
+
+def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
+    """Distances of the parameters from a plain model's: as published, and such as see something."""
+    nulls = subject.nulls
+    steps(0, 4)
+    published = {
+        "stego": sinkhorn_3d(subject.original, subject.stego),
+        "null": [sinkhorn_3d(subject.original, plain) for plain in nulls],
+    }
+    steps(1, 4)
+    distances = against_null(subject.stego, nulls, seed=seed)
+    steps(2, 4)
+    two_sample = two_sample_against_null(subject.stego, nulls, seed=seed)
+    steps(3, 4)
+    return Found(
+        {
+            "sinkhorn": published,
+            "distances": distances,
+            "two_sample": two_sample,
+            "histograms": histograms(subject.stego, nulls),
+        }
+    )
+
+
+def stegexpose(subject: Subject, seed: int, steps: Steps) -> Found:
+    """Whether detectors of hidden bits tell pictures of the published model from those of a plain one."""
+    # In the order of the photos' names, which is that of the camera's path more often than not.
+    ordered = sorted(subject.cover.views, key=lambda view: view.camera.name)
+    views = thin(ordered, STEGANALYSED_VIEWS)
+    pictures = [
+        [image.numpy() for _, image in renders_of(model, subject.cover, views)]
+        for model in (subject.nulls[0], subject.stego)
+    ]
+    sections = {"stegexpose": stegexpose_roc(*pictures)}
+    sections["stegexpose"]["views"] = [picture_name(view.camera) for view in views]
+    steps(1, 2)
+    try:
+        sections["sealwatch"] = sealwatch_roc(*pictures, seed=seed)
+    except BackendError as error:
+        sections["sealwatch"] = {"missing": str(error)}
+    return Found(sections)
+
+
+def leaks(subject: Subject, seed: int, steps: Steps) -> Found:
+    """What somebody without the key sees of each secret, in the file or with its decoder."""
+    found, pictures = [], {}
+    for index, (secret, frame, opened) in enumerate(
+        zip(subject.secrets, subject.frames, subject.run.opened, strict=True), start=1
+    ):
+        steps(index - 1, len(subject.secrets))
+        rows, shown = look_for_secret(
+            subject.stego,
+            subject.nulls,
+            subject.cover,
+            secret,
+            frame,
+            opened=opened if isinstance(opened, HiddenSecret) else None,
+            seed=seed,
+        )
+        for number, row in enumerate(rows, start=1):
+            file = f"leak-{index}-{number:02}.png"
+            pictures[file] = shown[row["attack"]]
+            row["picture"] = f"{PICTURES}/{file}"
+        found.append(rows)
+    return Found({"leaks": found}, pictures)
+
+
+def robustness(subject: Subject, seed: int, steps: Steps) -> Found:
+    """What changes of the published model cost the cover, and what they cost the secrets."""
+    rows = survival(
+        subject.stego, subject.reopeners, subject.cover, subject.secrets, seed=seed, progress=steps
+    )
+    return Found({"robustness": rows, "survival": verdicts(rows)})
+
+
+def speed(subject: Subject, seed: int, steps: Steps) -> Found:
+    """How fast everything is for who uses it, and whether other people's programs read it."""
+    plains = [subject.original, *subject.bounds]
+    measured = measure_speed(
+        subject.run.folder / STEGO,
+        subject.reopeners,
+        subject.scenes,
+        [plain if plain is not None else model for plain, model in zip(plains, subject.models, strict=True)],
+        sidecar=subject.run.sidecar,
+        device=subject.device,
+        progress=steps,
+    )
+    return Found({"speed": measured})
+
+
+PARTS: dict[str, Part] = {
+    part.__name__: part for part in (images, parameters, stegexpose, leaks, robustness, speed)
+}
+
+
+def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> Images:
+    """Names and uint8 pictures [H, W, 3] from the cameras of the views."""
+    found = []
+    with torch.no_grad():
+        for view in views:
+            image = render(model, view.camera, scene.background.to(model.device))
+            found.append((picture_name(view.camera), (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()))
+    return found

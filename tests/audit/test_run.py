@@ -1,0 +1,121 @@
+"""An audit from files: what it writes, how it goes on, what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import keyss
+from keyss import Secret
+from keyss.audit import parts
+from keyss.audit.progress import Found, Steps
+from keyss.audit.run import audit
+from keyss.audit.subject import Subject
+from keyss.core import InputError, OutputError, UsageError, WrongKeyError
+from keyss.fitting.loop import Interrupted
+from test_verbs import CONFIG, write_nerfstudio
+from tiny_scenes import tiny_scene
+
+KEY = "the key"
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("audit")
+    cover, secret = (write_nerfstudio(root / name, tiny_scene(seed)) for seed, name in enumerate("ab"))
+    keyss.hide(cover, [Secret(secret, KEY)], config=CONFIG, sidecar=True, out=root / "run")
+    return root / "run"
+
+
+@pytest.fixture
+def run(hidden: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(hidden, tmp_path / "run"))
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Two parts that only note that they were called; the second can be told to fail."""
+    called: list[str] = []
+
+    def first(subject: Subject, seed: int, steps: Steps) -> Found:
+        called.append("first")
+        steps(1, 2)
+        return Found(
+            {"first": {"gaussians": len(subject.stego)}}, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)}
+        )
+
+    def second(subject: Subject, seed: int, steps: Steps) -> Found:
+        called.append("second")
+        if called.count("second") == 1 and "fail" in called:
+            raise KeyboardInterrupt
+        return Found({"second": [float(len(subject.nulls))]})
+
+    monkeypatch.setattr("keyss.audit.run.PARTS", {"first": first, "second": second})
+    return called
+
+
+def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
+    found = audit(run, [KEY], null=2)
+    assert calls == ["first", "second"]
+    written = json.loads((run / "audit" / "audit.json").read_text())
+    assert written == found
+    assert found["first"] == {"gaussians": len(keyss.read_ply(run / "stego.ply"))}
+    assert found["second"] == [2.0]
+    assert found["null"] == {"models": 2, "seeds": [1, 2]}
+    assert (run / "audit" / "pictures" / "a.png").exists()
+    assert not (run / "audit" / "checkpoint").exists()
+    assert KEY not in (run / "audit" / "audit.json").read_text()
+
+
+def test_plain_models_are_made_once_and_differ(run: Path, calls: list[str]) -> None:
+    audit(run, [KEY], null=2)
+    models = sorted((run / "private" / "null").glob("*.ply"))
+    times = [path.stat().st_mtime_ns for path in models]
+    assert len(models) == 2
+    assert models[0].read_bytes() != models[1].read_bytes()
+    audit(run, [KEY], null=2, overwrite=True)
+    assert [path.stat().st_mtime_ns for path in models] == times
+
+
+def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[str]) -> None:
+    calls.append("fail")
+    with pytest.raises(Interrupted):
+        audit(run, [KEY], null=2)
+    assert not (run / "audit" / "audit.json").exists()
+    with pytest.raises(OutputError, match="--resume continues it"):
+        audit(run, [KEY], null=2)
+    with pytest.raises(InputError, match="other settings"):
+        audit(run, [KEY], null=3, resume=True)
+    found = audit(run, [KEY], null=2, resume=True)
+    assert calls == ["fail", "first", "second", "second"]
+    assert found["first"]["gaussians"] > 0
+    assert (run / "audit" / "pictures" / "a.png").exists()
+
+
+def test_results_are_not_replaced_by_accident(run: Path, calls: list[str]) -> None:
+    audit(run, [KEY], null=2, only=["second"])
+    with pytest.raises(OutputError, match="--overwrite"):
+        audit(run, [KEY], null=2)
+    assert "first" not in json.loads((run / "audit" / "audit.json").read_text())
+
+
+def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
+    with pytest.raises(WrongKeyError):
+        audit(run, ["another"])
+    with pytest.raises(UsageError, match="at least 2"):
+        audit(run, [KEY], null=1)
+    with pytest.raises(UsageError, match="no such part"):
+        audit(run, [KEY], only=["looks"])
+    with pytest.raises(InputError):
+        audit(tmp_path, [KEY])
+    (run / "private" / "cover.ply").unlink()
+    with pytest.raises(UsageError, match="--original"):
+        audit(run, [KEY], null=2)
+
+
+def test_every_part_has_a_sentence() -> None:
+    assert all((part.__doc__ or "").strip() for part in parts.PARTS.values())
