@@ -24,6 +24,7 @@ from keyss.cli.arguments import (
     UnusedDevice,
     UnusedSeed,
     Width,
+    checked_seed,
     optional,
 )
 from keyss.cli.measuring import audit, report, steganalyze
