@@ -1,0 +1,131 @@
+"""How far apart the Gaussians of two models are as distributions, and how much of that is chance.
+
+Beside 3D-Sinkhorn, which does not see most changes (`keyss.measure.sinkhorn`): exact 1-D Wasserstein
+distances along axes and along random directions (sliced Wasserstein, Bonneel et al. 2015) of features that
+do not depend on how the same Gaussian was written down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.measure.features import ATTRIBUTES, Floats, features
+
+SLICES = 32
+MOST = 100_000  # Gaussians of a model that are compared; of larger ones a random subset
+_RESOLUTION = 1e-6  # of a row's largest magnitude: what float32 can hardly tell apart is no range
+
+
+def attribute_distances(
+    reference: Gaussians, other: Gaussians, *, seed: int = 0, slices: int = SLICES
+) -> dict[str, float]:
+    """Wasserstein distances of two models' attributes, in units of the reference's 5 to 95 % range.
+
+    Keys: those of `keyss.measure.features.features`, and `joint`, over all of them at once. An attribute's
+    value is the mean over its axes and `slices` random directions in it; that of `joint` is the mean over
+    random directions in the space of everything, where each attribute has the same weight. Directions
+    depend on `seed` alone, so that all comparisons share them.
+    What does not vary in the reference is measured in units of both models' whole range; what is one
+    constant in both is left out. Models may differ in size and SH degree; of one with more than `MOST`
+    Gaussians, a random subset of so many is taken (by `seed`). Raises UsageError for an empty model.
+    """
+    one, two = (features(model, most=MOST, seed=seed) for model in (reference, other))
+    return _distances(one, two, seed, slices)
+
+
+def against_null(
+    model: Gaussians, plain_models: Sequence[Gaussians], *, seed: int = 0, slices: int = SLICES
+) -> dict[str, Any]:
+    """How far `model` is from plain models of the same scene, beside how far these are from each other.
+
+    `attributes` has for each key of `attribute_distances`: `distance`, the mean over the plain models of
+    what `model` is away from them; `null`, the mean over their pairs; and `ratio` of the two, None where
+    `null` is 0. A ratio of 1 is what one more training seed would give.
+    Raises UsageError for fewer than two plain models and for an empty model.
+    """
+    if len(plain_models) < 2:
+        raise UsageError(f"a null needs at least two plain models of the scene, got {len(plain_models)}")
+    ours, *plain = (features(each, most=MOST, seed=seed) for each in (model, *plain_models))
+    distances = [_distances(each, ours, seed, slices) for each in plain]
+    nulls = [_distances(one, two, seed, slices) for one, two in combinations(plain, 2)]
+    attributes = {}
+    for name in distances[0]:
+        distance = sum(each[name] for each in distances) / len(distances)
+        null = sum(each[name] for each in nulls) / len(nulls)
+        attributes[name] = {"distance": distance, "null": null, "ratio": distance / null if null else None}
+    return {"attributes": attributes}
+
+
+def _distances(
+    reference: dict[str, Floats], other: dict[str, Floats], seed: int, slices: int
+) -> dict[str, float]:
+    generator = np.random.default_rng(seed)
+    result, rows = {}, []
+    for name in ATTRIBUTES:
+        axes = reference[name].T, other[name].T
+        along_axes, units = _along(*axes)
+        scaled = [_in_units(each, units[:, None]) for each in axes]
+        directions = _directions(generator, slices, len(units))
+        along_slices, widths = _along(directions @ scaled[0], directions @ scaled[1])
+        result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
+        weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
+        rows.append([weight * each for each in scaled])
+    one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    directions = _directions(generator, slices, len(one))
+    result["joint"] = _mean(*_along(directions @ one, directions @ two))
+    return result
+
+
+def _directions(generator: np.random.Generator, count: int, size: int) -> Floats:
+    """[count, size] random unit vectors; none in one dimension, which has its axis only."""
+    vectors = generator.standard_normal((count if size > 1 else 0, size))
+    unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return unit
+
+
+def _mean(distances: Floats, units: Floats) -> float:
+    """Over what varies at all."""
+    return float(distances[units > 0].mean()) if (units > 0).any() else 0.0
+
+
+def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
+    """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and these units [D].
+
+    Both are 0 where there is one constant in both.
+    """
+    one, two = np.sort(reference, axis=1), np.sort(other, axis=1)
+    last = one.shape[1] - 1
+    span = np.maximum(one[:, -1], two[:, -1]) - np.minimum(one[:, 0], two[:, 0])
+    least = np.float32(_RESOLUTION) * np.abs(np.stack([one[:, 0], one[:, -1], two[:, 0], two[:, -1]])).max(
+        axis=0
+    )
+    units = one[:, round(0.95 * last)] - one[:, round(0.05 * last)]
+    units = np.where(units > least, units, np.where(span > least, span, 0))
+    return _in_units(_wasserstein(one, two), units), units
+
+
+def _in_units(values: Floats, units: Floats) -> Floats:
+    """`values` divided by units that broadcast to them, 0 where the unit is."""
+    divisors: Floats = np.where(units > 0, units, np.inf)
+    return values / divisors
+
+
+def _wasserstein(one: Floats, two: Floats) -> Floats:
+    """[D] exact 1-D Wasserstein distances of samples sorted along the rows of [D, N] and [D, M].
+
+    The area between their quantile functions, which are steps of 1 / N and of 1 / M, counted in 1 / (N M).
+    """
+    n, m = one.shape[1], two.shape[1]
+    if n == m:
+        means: Floats = np.abs(one - two).mean(axis=1)
+        return means
+    ends = np.union1d(np.arange(1, n + 1) * m, np.arange(1, m + 1) * n)
+    widths = np.diff(ends, prepend=0) / (n * m)
+    areas: Floats = np.abs(one[:, (ends - 1) // m] - two[:, (ends - 1) // n]) @ widths.astype(np.float32)
+    return areas
