@@ -1,4 +1,4 @@
-"""How well a score tells stego from plain: ROC curves, and those of StegExpose on renders of the same views."""
+"""How well a score tells stego from plain: ROC curves, and StegExpose's on renders of the same views."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def stegexpose_roc(plain_images: Sequence[Image], stego_images: Sequence[Image])
     """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
 
     `plain` and `stego`: the fused scores, NaN as None; `roc`: of these; `detectors`: the AUC of each alone,
-    None where it takes no image (Chi Square: those of less than about 87,700 pixels; Sample Pairs: odd sizes).
+    None where it takes no image (Chi Square: less than about 87,700 pixels; Sample Pairs: odd sizes).
     The AUC of a renderer's output should be near 0.5, whatever is hidden: no pixel's last bit is replaced.
     Raises UsageError when the views are not the same in number or size.
     """
@@ -111,7 +111,9 @@ def _numbers(
     negatives: Sequence[Score], positives: Sequence[Score]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Both as ranks, which decide all, with what is missing below."""
-    scores = np.array([math.nan if score is None else score for score in (*negatives, *positives)], dtype=float)
+    scores = np.array(
+        [math.nan if score is None else score for score in (*negatives, *positives)], dtype=float
+    )
     scores[np.isnan(scores)] = -np.inf
     ranks = np.unique(scores, return_inverse=True)[1].astype(np.float64)
     return ranks[: len(negatives)], ranks[len(negatives) :]

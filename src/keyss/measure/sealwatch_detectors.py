@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from keyss.core.errors import BackendError, UsageError
 from keyss.measure.roc import check_same_views, roc
@@ -33,7 +34,7 @@ Features = NDArray[np.float64]  # [N, 686]
 def sealwatch_roc(
     plain_images: Sequence[Image], stego_images: Sequence[Image], *, seed: int = 0
 ) -> dict[str, Any]:
-    """`spa`, `ws` and `spam` on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
+    """`spa`, `ws` and `spam` on renders of the same views by a plain and a stego model, [H, W, 3] uint8 each.
 
     Each has `plain` and `stego`, the scores of the images, and `roc`. SPA: Dumitrescu, Wu and Memon (2003),
     the rate of embedding; WS: Fridrich and Goljan (2004), the rate of changed pixels; both are means over
@@ -58,9 +59,7 @@ def sealwatch_roc(
     result["spam"] = None
     if len(plain_images) >= LEAST_VIEWS:
         result["spam"] = _judged(
-            *_held_out_votes(
-                sealwatch, _spam(sealwatch, plain_images), _spam(sealwatch, stego_images), seed
-            )
+            *_held_out_votes(sealwatch, _spam(sealwatch, plain_images), _spam(sealwatch, stego_images), seed)
         )
     return result
 
@@ -93,7 +92,9 @@ def _spam(sealwatch: Any, images: Sequence[Image]) -> Features:
     with sealwatch.BACKEND_RUST:
         return np.array(
             [
-                np.mean([sealwatch.tools.flatten(sealwatch.spam.extract(x)) for x in _channels(image)], axis=0)
+                np.mean(
+                    [sealwatch.tools.flatten(sealwatch.spam.extract(x)) for x in _channels(image)], axis=0
+                )
                 for image in images
             ]
         )
@@ -106,13 +107,14 @@ def _held_out_votes(
     views = len(plain)
     fold_of = np.arange(views) * FOLDS // views
     votes = np.zeros((2, views))
-    for fold in range(FOLDS):
-        held_out = fold_of == fold
-        ensemble, _ = sealwatch.ensemble_classifier.FldEnsembleTrainer(
-            plain[~held_out], stego[~held_out], seed=seed, L=_LEARNERS, d_sub=_SUBSPACE, verbose=0
-        ).train()
-        votes[0, held_out] = ensemble.predict_confidence(plain[held_out])
-        votes[1, held_out] = ensemble.predict_confidence(stego[held_out])
+    with threadpool_limits(1):  # such small matrices take several times as long on several threads
+        for fold in range(FOLDS):
+            held_out = fold_of == fold
+            ensemble, _ = sealwatch.ensemble_classifier.FldEnsembleTrainer(
+                plain[~held_out], stego[~held_out], seed=seed, L=_LEARNERS, d_sub=_SUBSPACE, verbose=0
+            ).train()
+            votes[0, held_out] = ensemble.predict_confidence(plain[held_out])
+            votes[1, held_out] = ensemble.predict_confidence(stego[held_out])
     return votes[0].tolist(), votes[1].tolist()
 
 
