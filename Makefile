@@ -61,4 +61,5 @@ $(DEV): $(PINS) | $(BIN)/python
 	$(PIP) setuptools
 	$(PIP) --no-build-isolation --editable ".[dev]"
 	$(PIP) --no-deps clip-anytorch  # ships the vocabulary of CLIP, which is all that the tests take from it
+	$(PIP) --no-deps sealwatch jpeglib  # without torchvision, which does not load beside every torch
 	@touch $@ $(PACKAGE)
