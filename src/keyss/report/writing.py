@@ -1,0 +1,26 @@
+"""From the folder of a run to its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from keyss.files.atomic import write_bytes
+from keyss.report.page import page
+from keyss.report.reading import Pictures, read_audit
+from keyss.report.sections import facts, sections, title
+
+REPORT = "report.html"
+
+
+def write_report(run_folder: Path | str) -> Path:
+    """Write RUN/report.html from RUN/audit, atomically, and return its path.
+
+    One file that needs no network: pictures, figures, style and script are in it, and so it shows the secret.
+    The same audit gives the same bytes. Raises InputError when there is no audit, or it is broken, too large
+    or names pictures outside RUN/audit; OutputError when the file cannot be written.
+    """
+    run = Path(run_folder)
+    audit = read_audit(run)
+    html = page(title(audit), facts(audit), sections(audit, Pictures(run)))
+    write_bytes(run / REPORT, html.encode())
+    return run / REPORT
