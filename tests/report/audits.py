@@ -62,6 +62,7 @@ def audit() -> dict[str, Any]:
         "sealwatch": {"missing": "sealwatch is not installed: `pip install sealwatch`."},
         "leaks": [[_leak("restored", 0.4), _leak("inverted", -0.1)], [_leak("restored", 0.2)]],
         "robustness": [
+            _attack("none", 0, 0.0, [0.0, 0.0]),
             _attack("random pruning", 0.1, 1.0, [1.5, 1.6]),
             _attack("random pruning", 0.25, 2.5, [3.5, 3.7]),
             _attack("half floats", None, 0.0, [22.0, 20.0], opens=False),

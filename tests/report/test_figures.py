@@ -11,9 +11,10 @@ import pytest
 
 from keyss.core.errors import InputError
 from keyss.report import figures, plots
-from keyss.report.figures import Curve, Interval
+from keyss.report.figures import Curve, Interval, Losses
 from keyss.report.markup import Html
 from keyss.report.reading import Part
+from keyss.report.survival import survivals
 from report.pages import Parsed
 
 HOSTILE = "--></text><script>alert(1)</script> $\\frac$ 狐 & #010101"
@@ -22,7 +23,7 @@ DRAWN: dict[str, Callable[[], Html]] = {
     "intervals": lambda: figures.intervals([Interval(HOSTILE, 0.5, 0.4, 0.6, True)], 0.6, HOSTILE),
     "histogram": lambda: figures.histogram(HOSTILE, [0, 1, 2], [0.5, 0.5], [[0.4, 0.6]], HOSTILE),
     "roc": lambda: figures.roc([Curve(HOSTILE, [0, 0.5, 1], [0, 0.8, 1])], HOSTILE),
-    "losses": lambda: figures.losses(HOSTILE, [Curve(HOSTILE, [0, 1], [1, 3], [True, False])], HOSTILE),
+    "losses": lambda: figures.losses(HOSTILE, [Losses(HOSTILE, [(0, 1), (1, None)])], HOSTILE),
 }
 
 
@@ -51,7 +52,7 @@ def test_the_same_data_give_the_same_bytes(draw: Callable[[], Html], monkeypatch
 
 @pytest.mark.parametrize("draw", DRAWN.values(), ids=DRAWN)
 def test_all_colours_are_the_page_s(draw: Callable[[], Html]) -> None:
-    style = files("keyss.report").joinpath("report.css").read_text()
+    style = files("keyss.report").joinpath("assets", "page.css").read_text()
     styles = " ".join(Parsed(draw()).values("style"))
     assert not re.search(r"(fill|stroke): (?!none|var)", styles)
     used = set(re.findall(r"var\((--[\w-]+)\)", styles))
@@ -72,9 +73,23 @@ def test_extreme_ratios_can_be_drawn(value: float) -> None:
 
 
 def test_extreme_losses_can_be_drawn() -> None:
-    curve = Curve("noise", [-1e15, 0, 1e15], [1e15, -1e15, 0], [True, True, False])
-    many = [Curve(f"attack {index}", [index], [index], [True]) for index in range(70)]
+    curve = Losses("noise", [(-1e15, 1e15), (0, -1e15), (1e15, None)])
+    many = [Losses(f"attack {index}", [(index, index)]) for index in range(70)]
     assert figures.losses("secret", [curve, *many], "").count("<svg") == 1
+
+
+def test_secrets_that_do_not_open_are_marked() -> None:
+    def texts(*curves: Losses) -> list[str]:
+        return Parsed(figures.losses("secret", curves, "")).texts
+
+    lives = Losses("noise", [(0, 0.5), (1, 2)])
+    dies = Losses("cropping", [(0, 0.5), (1, None)])
+    dead = [Losses("half floats", [(0, None)]), Losses(".splat", [(0, None)])]
+    assert not {"does not open", "opens at no strength"} & set(texts(lives))
+    assert {"noise", "cropping", "does not open"} <= set(texts(lives, dies))
+    assert "opens at no strength" not in texts(lives, dies)
+    assert texts(lives, *dead).count("opens at no strength") == 1
+    assert "half floats" not in texts(lives, *dead)
 
 
 def test_nothing_is_drawn_from_nothing() -> None:
@@ -83,11 +98,10 @@ def test_nothing_is_drawn_from_nothing() -> None:
     assert plots.distances({"position": Part("", {"ratio": 0})}) is None
     assert plots.two_sample(empty) is None
     assert plots.histograms({"opacity": empty}) is None
-    assert plots.roc(empty, empty) is None
+    assert plots.roc(empty) is None
     assert plots.losses([]) is None
-    assert (
-        plots.losses([Part("", {"attack": "a", "cover": {"loss": None}, "secrets": [{"loss": 1}]})]) is None
-    )
+    unknown = {"attack": "a", "cover": {"loss": None}, "secrets": [{"loss": 1}]}
+    assert plots.losses(survivals(Part("audit.json: ", {"robustness": [unknown]}))) is None
 
 
 @pytest.mark.parametrize(
@@ -106,4 +120,4 @@ def test_histograms_that_do_not_fit_are_refused(entries: dict[str, object]) -> N
 
 def test_a_curve_that_does_not_fit_is_refused() -> None:
     with pytest.raises(InputError, match="as many fpr as tpr, found 2 and 1"):
-        plots.roc(Part("", {"roc": {"fpr": [0, 1], "tpr": [0]}}), Part("", {}))
+        plots.roc(Part("audit.json: ", {"sealwatch": {"spam": {"roc": {"fpr": [0, 1], "tpr": [0]}}}}))

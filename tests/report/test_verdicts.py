@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from keyss.report.reading import Part
+from keyss.report.survival import survivals
 from keyss.report.verdicts import Verdict, headline, verdicts
 from report.audits import audit
 
@@ -67,14 +69,14 @@ def _set(*path: str | int) -> Callable[[dict[str, Any], Any], None]:
         ("StegExpose on renders", _set("stegexpose", "roc", "high"), 0.75, 0.45, "visible"),
         (
             "loss of a random 25% of the Gaussians",
-            _set("robustness", 1, "secrets", 1, "loss"),
+            _set("robustness", 2, "secrets", 1, "loss"),
             4.0,
             4.1,
             "missed",
         ),
         (
             "loss of a random 25% of the Gaussians",
-            _set("robustness", 1, "secrets", 0, "opens"),
+            _set("robustness", 2, "secrets", 0, "opens"),
             True,
             False,
             "missed",
@@ -102,15 +104,44 @@ def test_a_detector_near_a_half_is_fine_however_narrow_its_interval() -> None:
 
 def test_the_loss_may_be_unknown_where_the_secret_does_not_open() -> None:
     data = audit()
-    data["robustness"][1]["secrets"] = [{"psnr": None, "loss": None, "opens": False}]
+    data["robustness"][2]["secrets"] = [{"psnr": None, "loss": None, "opens": False}]
     line = judged(data)["loss of a random 25% of the Gaussians"]
     assert (line.word, line.value) == ("missed", "the secret does not open")
+
+
+def test_draws_are_taken_together() -> None:
+    data = audit()
+    data["robustness"].append(copy.deepcopy(data["robustness"][2]))
+    data["robustness"][-1]["cover"]["loss"] = 3.5
+    data["robustness"][-1]["secrets"][1]["loss"] = 4.7
+    line = judged(data)["loss of a random 25% of the Gaussians"]
+    assert (line.value, line.beside) == ("secret −4.20 dB", "cover −3.00 dB")
+    rows = survivals(Part("audit.json: ", data))
+    assert [row.draws for row in rows] == [1, 1, 2, 1, 1]
+    data["robustness"][-1]["secrets"][1] = {"opens": False, "error": "too few Gaussians"}
+    secret = survivals(Part("audit.json: ", data))[2].secrets[1]
+    assert (secret.opens, secret.error, secret.loss) == (False, "too few Gaussians", 3.7)
+
+
+def test_controls_are_expected_to_leak() -> None:
+    data = audit()
+    data["leaks"][0][1].update(control=True, leak={"psnr": 20.0, "ssim": 0.7})
+    assert judged(data)["leaks without the key"].word == "fine"
+
+
+def test_of_several_detectors_the_most_suspicious_counts() -> None:
+    data = audit()
+    near, far = {"auc": 0.45, "low": 0.4, "high": 0.6}, {"auc": 0.2, "low": 0.1, "high": 0.3}
+    wide = {"auc": 0.95, "low": 0.4, "high": 1.0}
+    data["sealwatch"] = {"spa": {"roc": near}, "ws": {"roc": far}, "spam": {"roc": wide}}
+    line = judged(data)["sealwatch on renders"]
+    assert (line.word, line.value) == ("visible", "AUC 0.20 (0.10 to 0.30), sealwatch WS")
 
 
 def test_what_was_not_measured_is_not_judged() -> None:
     assert judged({}) == {}
     data = audit()
-    data["robustness"][1]["strength"] = 0.3
+    data["robustness"][2]["strength"] = 0.3
     data["distances"]["attributes"] = {"position": {"distance": 0.1, "null": None, "ratio": None}}
     missing = {"loss of a random 25% of the Gaussians", "attributes of the Gaussians"}
     assert set(judged(audit())) - set(judged(data)) == missing

@@ -7,7 +7,7 @@ from keyss.report.reading import Part, Picture, Pictures
 
 
 def comparison(group: Part, pictures: Pictures) -> Html | None:
-    """Pictures of the same view, which report.js turns into a slider. Raises InputError."""
+    """Pictures of the same view, which slider.js turns into a slider. Raises InputError."""
     title = group.text("title") or "Pictures"
     shots = [
         (item.text("label") or "picture", picture)
@@ -66,7 +66,7 @@ def _choices(title: str, labels: list[str]) -> Html:
         "div",
         element("label", "left ", _select(f"{title}: left picture", labels, 0)),
         element("label", "right ", _select(f"{title}: right picture", labels, 1)),
-        element("label", element("input", type="checkbox"), " difference, 8 times as bright"),
+        element("label", element("input", type="checkbox"), " difference, 4 times as bright"),
         class_="choices",
     )
 

@@ -20,8 +20,15 @@ from matplotlib.figure import Figure
 from keyss.report.markup import Html, element
 from keyss.report.numbers import times
 
-# Each stands for the CSS variable of this name; report.css says what it looks like in light and dark.
-_INK, _MUTED, _GRID, _STEGO, _LIMIT = "#010101", "#020202", "#030303", "#040404", "#050505"
+# Each stands for the CSS variable of this name; page.css says what it looks like in light and dark.
+_INK, _MUTED, _GRID, _STEGO, _LIMIT, _PAGE = (
+    "#010101",
+    "#020202",
+    "#030303",
+    "#040404",
+    "#050505",
+    "#060609",
+)
 _LINES = ("#060601", "#060602", "#060603", "#060604", "#060605", "#060606", "#060607", "#060608")
 _VARIABLES = {
     _INK: "--ink",
@@ -29,12 +36,14 @@ _VARIABLES = {
     _GRID: "--grid",
     _STEGO: "--accent",
     _LIMIT: "--limit",
+    _PAGE: "--page",
     **{color: f"--line-{index}" for index, color in enumerate(_LINES, start=1)},
 }
 _MARKERS = "osD^vPX*"
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # names are other people's: a $ is a $
+    "font.sans-serif": ["DejaVu Sans"],  # what room is left for text; page.css has the page's font instead
     "font.size": 9,
     "text.color": _INK,
     "axes.edgecolor": _MUTED,
@@ -51,6 +60,7 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.5,
+    "lines.markersize": 5,
     "xtick.color": _MUTED,
     "ytick.color": _MUTED,
     "xtick.labelsize": 8.5,
@@ -75,12 +85,19 @@ class Interval:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points joined by a line; those that are not `solid` are drawn hollow."""
+    """Points joined by a line."""
 
     name: str
     x: Sequence[float]
     y: Sequence[float]
-    solid: Sequence[bool] = ()
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What an attack costs, from strength to strength."""
+
+    name: str
+    points: Sequence[tuple[float, float | None]]  # dB of the cover and of the secret; None: it does not open
 
 
 def ratio_bars(ratios: Sequence[tuple[str, float]], limit: float, description: str) -> Html:
@@ -120,7 +137,7 @@ def intervals(rows: Sequence[Interval], limit: float, description: str) -> Html:
         for index, row in enumerate(rows):
             color = _MUTED if row.innocent else _STEGO
             axes.plot([row.low, row.high], [index, index], color=color, linewidth=1.5, solid_capstyle="butt")
-            axes.plot([row.value], [index], "o", color=color, markersize=5)
+            axes.plot([row.value], [index], "o", color=color)
         axes.axvline(0.5, color=_INK, linewidth=1)
         axes.axvline(limit, color=_LIMIT, linewidth=1, linestyle="--")
         _note(axes, 0.5, "guessing", "right")
@@ -176,29 +193,49 @@ def roc(curves: Sequence[Curve], description: str) -> Html:
     return _figure("roc", 3.6, description, draw)
 
 
-def losses(name: str, curves: Sequence[Curve], description: str) -> Html:
-    """What attacks cost the secret (y), against what they cost the cover (x), both in dB."""
-    points = [(x, y) for curve in curves for x, y in zip(curve.x, curve.y, strict=True)]
-    right = max(1.0, *(x for x, _ in points))
-    top = max(1.0, *(y for _, y in points))
+def losses(name: str, curves: Sequence[Losses], description: str) -> Html:
+    """What attacks cost the secret (y), against what they cost the cover (x), both in dB.
+
+    Where the secret does not open a hollow mark stands above all others; attacks after which it never does
+    are one grey row of them.
+    """
+    right = max([1.0, *(x for curve in curves for x, _ in curve.points)])
+    top = max([1.0, *(y for curve in curves for _, y in curve.points if y is not None)])
+    lost = 1.15 * top
+    survived = [curve for curve in curves if any(y is not None for _, y in curve.points)]
+    fatal = [x for curve in curves if curve not in survived for x, _ in curve.points]
 
     def draw(axes: Axes) -> None:
         end = min(right, top)
         axes.plot([0, end], [0, end], color=_INK, linewidth=1)
         axes.annotate("equal", (end, end), (4, 0), textcoords="offset points", va="center", color=_MUTED)
-        for index, curve in enumerate(curves):
+        if fatal:
+            label = "opens at no strength"
+            axes.plot(fatal, [lost] * len(fatal), "o", color=_MUTED, markerfacecolor=_PAGE, label=label)
+        for index, curve in enumerate(survived):
             color, marker = _LINES[index % len(_LINES)], _MARKERS[index // len(_LINES) % len(_MARKERS)]
-            axes.plot(curve.x, curve.y, color=color, linewidth=1.3)
-            for x, y, solid in zip(curve.x, curve.y, curve.solid, strict=True):
-                axes.plot(
-                    [x], [y], marker, color=color, markersize=5, markerfacecolor=color if solid else "none"
-                )
-            axes.plot([], [], marker, linestyle="-", color=color, markersize=5, label=_short(curve.name))
+            x, y = [x for x, _ in curve.points], [lost if y is None else y for _, y in curve.points]
+            axes.plot(x, y, marker=marker, color=color, linewidth=1.3, label=_short(curve.name))
+            hollow = [x for x, y in curve.points if y is None]
+            axes.plot(hollow, [lost] * len(hollow), marker, color=color, markerfacecolor=_PAGE)
+        if any(y is None for curve in curves for _, y in curve.points):
+            _mark_lost(axes, top, lost)
         axes.set_xlabel("cover loses, dB")
         axes.set_ylabel(f"{_short(name)} loses, dB", rotation_mode="anchor")
         axes.figure.legend(loc="outside lower left", ncols=2, columnspacing=1.2, handlelength=1.6)
 
-    return _figure(f"losses-{name}", 3.1 + 0.19 * math.ceil(len(curves) / 2), description, draw)
+    rows = math.ceil((len(survived) + bool(fatal)) / 2)
+    return _figure(f"losses-{name}", 3.1 + 0.19 * rows, description, draw)
+
+
+def _mark_lost(axes: Axes, top: float, lost: float) -> None:
+    """A line for secrets that do not open, above an axis that ends at `top`."""
+    bottom, _ = axes.get_ylim()
+    axes.set_yticks([tick for tick in axes.get_yticks() if bottom <= tick <= top])
+    axes.set_ylim(bottom, 1.1 * lost)
+    axes.axhline(lost, color=_GRID, linewidth=0.6, zorder=0)
+    where = ("axes fraction", "data")
+    axes.annotate("does not open", (1, 1.02 * lost), xycoords=where, ha="right", va="bottom", color=_MUTED)
 
 
 def _figure(
@@ -222,10 +259,9 @@ def _for_a_page(svg: str) -> Html:
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r' (?:width|height)="[\d.]+pt"', "", svg, count=2)
     svg = re.sub(r"\s*<(metadata|style)\b.*?</\1>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r" font-family: [^;<]*;", "", svg)
     used = set(re.findall(r"#([\w-]+)", svg))
     svg = re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", svg)
-    svg = re.sub("#0[1-6]0[1-6]0[1-8]", lambda match: f"var({_VARIABLES[match[0]]})", svg)
+    svg = re.sub("#0[1-6]0[1-6]0[1-9]", lambda match: f"var({_VARIABLES[match[0]]})", svg)
     return Html(svg.strip())
 
 

@@ -13,7 +13,8 @@ from keyss.report.sections import Section
 
 def page(title: str, facts: Html, sections: Sequence[Section]) -> str:
     """A whole HTML document."""
-    script, style = _file("report.js"), _file("report.css")
+    script = _asset("slider.js")
+    style = "".join(_asset(name) for name in ("page.css", "pictures.css", "print.css"))
     # Should markup ever slip through the escaping, browsers run no script but this one and fetch nothing.
     policy = (
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
@@ -52,8 +53,8 @@ def _section(section: Section) -> Html:
     )
 
 
-def _file(name: str) -> str:
-    return files("keyss.report").joinpath(name).read_text(encoding="utf-8")
+def _asset(name: str) -> str:
+    return files("keyss.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _digest(script: str) -> str:

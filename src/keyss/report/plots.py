@@ -8,12 +8,13 @@ from itertools import pairwise
 
 from keyss.core.errors import InputError
 from keyss.report import figures
-from keyss.report.figures import Curve, Interval
+from keyss.report.figures import Curve, Interval, Losses
 from keyss.report.markup import Html, element
 from keyss.report.numbers import number, times
 from keyss.report.reading import Part
+from keyss.report.survival import UNCHANGED, Survival
 from keyss.report.tables import numbered
-from keyss.report.verdicts import DISTANCE_RATIO, TWO_SAMPLE_AUC, auc_text
+from keyss.report.verdicts import DISTANCE_RATIO, PROGRAMS, TWO_SAMPLE_AUC, auc_text, rocs
 
 _MOST_MODELS = 100
 
@@ -72,10 +73,10 @@ def histograms(attributes: Mapping[str, Part]) -> Html | None:
     return element("div", *drawn, class_="plots") if drawn else None
 
 
-def roc(stegexpose: Part, sealwatch: Part) -> Html | None:
-    """The curves of detectors on renders."""
+def roc(audit: Part) -> Html | None:
+    """The curves of detectors on renders. Raises InputError when fpr and tpr do not fit each other."""
     curves, values = [], []
-    for name, part in (("StegExpose", stegexpose.part("roc")), ("sealwatch", sealwatch.part("roc"))):
+    for name, part in [found for key in PROGRAMS for found in rocs(audit, key)]:
         x, y = part.numbers("fpr"), part.numbers("tpr")
         if len(x) != len(y):
             raise InputError(f"{part.place}: expected as many fpr as tpr, found {len(x)} and {len(y)}")
@@ -87,12 +88,12 @@ def roc(stegexpose: Part, sealwatch: Part) -> Html | None:
     return figures.roc(curves, f"ROC curves: {', '.join(values)}.") if curves else None
 
 
-def losses(attacks: Sequence[Part]) -> Html | None:
+def losses(rows: Sequence[Survival]) -> Html | None:
     """For each secret, what attacks cost it against what they cost the cover."""
-    count = max((len(attack.parts("secrets", 100)) for attack in attacks), default=0)
+    count = max((len(row.secrets) for row in rows), default=0)
     drawn = []
     for index in range(count):
-        curves = _curves(attacks, index)
+        curves = _curves(rows, index)
         if curves:
             name = numbered("secret", index, count)
             names = ", ".join(curve.name for curve in curves[:20])
@@ -100,20 +101,18 @@ def losses(attacks: Sequence[Part]) -> Html | None:
     return element("div", *drawn, class_="plots") if drawn else None
 
 
-def _curves(attacks: Sequence[Part], index: int) -> list[Curve]:
+def _curves(rows: Sequence[Survival], index: int) -> list[Losses]:
     """One for each kind of attack, through its strengths."""
-    points: dict[str, list[tuple[float, float, bool]]] = {}
-    for attack in attacks:
-        secrets = attack.parts("secrets", 100)
-        x = attack.part("cover").number("loss")
-        y = secrets[index].number("loss") if index < len(secrets) else None
-        if x is not None and y is not None and math.isfinite(x) and math.isfinite(y):
-            opens = secrets[index].flag("opens") is not False
-            points.setdefault(attack.text("attack"), []).append((x, y, opens))
-    return [
-        Curve(name, [p[0] for p in found], [p[1] for p in found], [p[2] for p in found])
-        for name, found in points.items()
-    ]
+    points: dict[str, list[tuple[float, float | None]]] = {}
+    for row in rows:
+        if row.attack == UNCHANGED or index >= len(row.secrets):
+            continue
+        x, secret = row.cover.loss, row.secrets[index]
+        y = secret.loss if secret.opens else None
+        if x is None or not math.isfinite(x) or (secret.opens and (y is None or not math.isfinite(y))):
+            continue
+        points.setdefault(row.attack, []).append((x, y))
+    return [Losses(name, found) for name, found in points.items()]
 
 
 def _share(value: float) -> float:

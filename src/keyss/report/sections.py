@@ -12,6 +12,7 @@ from keyss.report.markup import Content, Html, element, join, prose
 from keyss.report.meanings import Meaning
 from keyss.report.numbers import integer, seconds_text
 from keyss.report.reading import Part, Pictures
+from keyss.report.survival import survivals
 from keyss.report.verdicts import headline, verdicts
 
 
@@ -195,25 +196,25 @@ def _statistics(audit: Part, _: Pictures) -> Section | None:
 
 
 def _renders(audit: Part, _: Pictures) -> Section | None:
-    stegexpose, sealwatch = audit.part("stegexpose"), audit.part("sealwatch")
+    stegexpose = audit.part("stegexpose")
     return _section(
         "renders",
         "Detectors on renders",
         meanings.RENDERS,
-        _beside(plots.roc(stegexpose, sealwatch), tables.detector_table(stegexpose)),
+        _beside(plots.roc(audit), tables.detector_table(audit)),
         tables.score_table("StegExpose's scores, plain models", stegexpose.parts("plain")),
         tables.score_table("StegExpose's scores, published model", stegexpose.parts("stego")),
     )
 
 
 def _robustness(audit: Part, _: Pictures) -> Section | None:
-    attacks = audit.parts("robustness", 500)
+    rows = survivals(audit)
     return _section(
         "robustness",
         "What survives",
         meanings.ROBUSTNESS,
-        plots.losses(attacks),
-        tables.robustness_table(attacks) if attacks else None,
+        plots.losses(rows),
+        tables.robustness_table(rows),
     )
 
 

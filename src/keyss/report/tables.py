@@ -17,7 +17,8 @@ from keyss.report.numbers import (
     times,
 )
 from keyss.report.reading import Part
-from keyss.report.verdicts import Verdict, auc_text
+from keyss.report.survival import UNCHANGED, Fate, Survival
+from keyss.report.verdicts import PROGRAMS, Verdict, auc_text, rocs
 
 # What a key of a comparison is called, and its digits; in this order.
 _IMAGE_METRICS = {
@@ -38,6 +39,7 @@ _LEAK_SCORES = {
     "psnr": ("PSNR, dB", 2),
     "psnr_fitted": ("PSNR, colours fitted, dB", 2),
     "ssim": ("SSIM", 3),
+    "ssim_fitted": ("SSIM, colours fitted", 3),
     "gradient": ("gradients", 3),
 }
 
@@ -177,17 +179,16 @@ def distance_table(attributes: Mapping[str, Part]) -> Html | None:
     return table("Wasserstein distances, in units of the cover's range", head, rows) if rows else None
 
 
-def detector_table(stegexpose: Part) -> Html | None:
-    """AUC of each detector of StegExpose."""
-    detectors = stegexpose.part("detectors")
+def detector_table(audit: Part) -> Html | None:
+    """AUC of each detector on renders."""
+    detectors = audit.part("stegexpose").part("detectors")
     rows = [
-        (label, number(detectors.number(key), 2))
+        (f"StegExpose, {label}", number(detectors.number(key), 2))
         for key, label in _DETECTORS.items()
         if key in detectors.entries
     ]
-    if stegexpose.part("roc"):
-        rows.append((_DETECTORS["fusion"], auc_text(stegexpose.part("roc"))))
-    return table("StegExpose: AUC of each detector", ("", "AUC"), rows) if rows else None
+    rows += [(name, auc_text(roc)) for key in PROGRAMS for name, roc in rocs(audit, key)]
+    return table("AUC of each detector", ("", "AUC"), rows) if rows else None
 
 
 def score_table(name: str, scores: Sequence[Part]) -> Html | None:
@@ -203,7 +204,8 @@ def leak_table(caption: str, attacks: Sequence[Part]) -> Html:
     scores = _measured(_LEAK_SCORES, attacks)
     rows: list[list[Content]] = []
     for attack in attacks:
-        row: list[Content] = [_attack_name(attack)]
+        control = " (control)" if attack.flag("control") else ""
+        row: list[Content] = [join([attack.text("attack"), control, _small(attack.text("sentence"))])]
         for key, (_, digits) in scores.items():
             leak = attack.part("leak").number(key)
             found = number(attack.number(key), digits)
@@ -212,22 +214,22 @@ def leak_table(caption: str, attacks: Sequence[Part]) -> Html:
     return table(caption, ["what is done", *(label for label, _ in scores.values())], rows)
 
 
-def robustness_table(attacks: Sequence[Part]) -> Html:
+def robustness_table(rows: Sequence[Survival]) -> Html | None:
     """What each attack costs, in dB."""
-    secrets = max((len(attack.parts("secrets", 100)) for attack in attacks), default=0)
+    if not rows:
+        return None
+    secrets = max(len(row.secrets) for row in rows)
     head = ["what is done", "strength", "cover, PSNR", "cover loses"]
     for index in range(secrets):
         name = numbered("secret", index, secrets)
         head += [f"{name}, PSNR", f"{name} loses"]
-    rows = []
-    for attack in attacks:
-        cover = attack.part("cover")
-        row: list[Content] = [_attack_name(attack), _strength(attack)]
-        row += [number(cover.number("psnr"), 2), number(cover.number("loss"), 2)]
-        for secret in attack.parts("secrets", 100):
-            row += _secret_cells(secret)
-        rows.append(row + [NOTHING] * (len(head) - len(row)))
-    return table("What attacks on the file cost, in dB", head, rows)
+    body = []
+    for row in rows:
+        cells = [_named(row), _strength(row), number(row.cover.psnr, 2), number(row.cover.loss, 2)]
+        for secret in row.secrets:
+            cells += _secret_cells(secret)
+        body.append(cells + [NOTHING] * (len(head) - len(cells)))
+    return table("What attacks on the file cost, in dB", head, body, texts=2)
 
 
 def speed_tables(speed: Part) -> list[Html]:
@@ -266,23 +268,23 @@ def _measured(metrics: Mapping[str, tuple[str, int]], parts: Sequence[Part]) -> 
     return {key: how for key, how in metrics.items() if any(part.number(key) is not None for part in parts)}
 
 
-def _secret_cells(secret: Part) -> list[Content]:
-    psnr, loss = number(secret.number("psnr"), 2), number(secret.number("loss"), 2)
-    if secret.flag("opens") is not False:
+def _secret_cells(secret: Fate) -> list[Content]:
+    psnr, loss = number(secret.psnr, 2), number(secret.loss, 2)
+    if secret.opens:
         return [psnr, loss]
-    return [element("span", "does not open", title=secret.text("error") or None), loss]
+    return [element("span", "does not open", title=secret.error or None), loss]
 
 
-def _attack_name(attack: Part) -> Content:
-    name, sentence = attack.text("attack"), attack.text("sentence")
-    skipped = attack.text("skipped")
-    note = f"left out: {skipped}" if skipped else sentence
-    return join([name, _small(note)]) if note else name
+def _named(row: Survival) -> Content:
+    note = f"left out: {row.skipped}" if row.skipped else row.sentence
+    draws = f"Mean of {row.draws} draws." if row.draws > 1 else ""
+    return join([row.attack, _small(" ".join(text for text in (note, draws) if text))])
 
 
-def _strength(attack: Part) -> str:
-    strength, unit = attack.number("strength"), attack.text("unit")
-    return NOTHING if strength is None else f"{strength:g} {unit}".strip()
+def _strength(row: Survival) -> str:
+    if row.strength is None or row.attack == UNCHANGED:
+        return NOTHING
+    return f"{row.strength:g} {row.unit}".strip()
 
 
 def _small(text: str) -> Html:

@@ -12,6 +12,7 @@ from typing import Literal
 
 from keyss.report.numbers import decibel, difference, integer, number, times
 from keyss.report.reading import Part
+from keyss.report.survival import survivals
 
 QUALITY_LOSS = 1.0  # dB that cover or secret may be below plain 3DGS of the same photos
 DISTANCE_RATIO = 1.5  # of a distance from a plain model, to the one between two plain models
@@ -19,8 +20,11 @@ TWO_SAMPLE_AUC = 0.6  # of a classifier that tells the Gaussians of two models a
 IMAGE_AUC = 0.1  # distance from 0.5 of a detector's AUC on renders
 LEAK_PSNR = 1.0  # dB nearer to the secret's photos than an innocent model comes
 LEAK_SSIM = 0.05
-PRUNED = 0.25  # share of Gaussians removed at random ...
+PRUNING, PRUNED = "random pruning", 0.25  # the share of the Gaussians that is removed ...
 PRUNING_LOSS = 1.5  # ... and the dB that it may cost the secret more than the cover
+
+PROGRAMS = {"stegexpose": "StegExpose", "sealwatch": "sealwatch"}
+_SEALWATCH = ("spa", "ws", "spam")  # each with a ROC of its own
 
 Word = Literal["fine", "visible", "missed"]
 
@@ -46,8 +50,8 @@ def verdicts(audit: Part) -> list[Verdict]:
         _leaks(audit),
         _distances(audit),
         _two_sample(audit),
-        _detector(audit, "stegexpose", "StegExpose on renders"),
-        _detector(audit, "sealwatch", "sealwatch on renders"),
+        _detectors(audit, "stegexpose"),
+        _detectors(audit, "sealwatch"),
         _pruning(audit),
         _readers(audit),
     )
@@ -78,6 +82,14 @@ def auc_text(part: Part) -> str:
     low, high = part.number("low"), part.number("high")
     interval = "" if low is None or high is None else f" ({number(low, 2)} to {number(high, 2)})"
     return number(part.number("auc"), 2) + interval
+
+
+def rocs(audit: Part, key: str) -> list[tuple[str, Part]]:
+    """The ROCs that a program's detectors have in an audit, with their names."""
+    program, name = audit.part(key), PROGRAMS[key]
+    found = [(name, program.part("roc"))]
+    found += [(f"{name} {each.upper()}", program.part(each).part("roc")) for each in _SEALWATCH]
+    return [(name, roc) for name, roc in found if roc]
 
 
 def _cover(audit: Part) -> Verdict | None:
@@ -128,7 +140,8 @@ def _wrong_keys(audit: Part) -> Verdict | None:
 
 
 def _leaks(audit: Part) -> Verdict | None:
-    leaks = [attack.part("leak") for attacks in audit.lists("leaks", 500) for attack in attacks]
+    attacks = [attack for attacks in audit.lists("leaks", 500) for attack in attacks]
+    leaks = [attack.part("leak") for attack in attacks if not attack.flag("control")]
     psnr = _largest(leaks, lambda leak: leak.number("psnr"))
     ssim = _largest(leaks, lambda leak: leak.number("ssim"))
     if psnr is None or ssim is None:
@@ -175,38 +188,43 @@ def _two_sample(audit: Part) -> Verdict | None:
     )
 
 
-def _detector(audit: Part, key: str, measure: str) -> Verdict | None:
-    roc = audit.part(key).part("roc")
-    auc, low, high = roc.number("auc"), roc.number("low"), roc.number("high")
-    if auc is None:
+def _detectors(audit: Part, key: str) -> Verdict | None:
+    """One line for all detectors of a program: the one that finds most."""
+    curves = [(name, roc) for name, roc in rocs(audit, key) if roc.number("auc") is not None]
+    if not curves:
         return None
-    undecided = low is not None and high is not None and low <= 0.5 <= high
+    name, roc = max(curves, key=lambda curve: _suspicion(curve[1]))
     return Verdict(
-        measure,
-        f"AUC {auc_text(roc)}",
+        f"{PROGRAMS[key]} on renders",
+        f"AUC {auc_text(roc)}" + (f", {name}" if len(curves) > 1 else ""),
         "0.5, guessing",
         f"0.5 ± {IMAGE_AUC}, or within interval",
-        "fine" if undecided or abs(auc - 0.5) <= IMAGE_AUC else "visible",
+        "visible" if _suspicion(roc)[0] else "fine",
         "renders",
     )
 
 
+def _suspicion(roc: Part) -> tuple[bool, float]:
+    """Whether an AUC is too far from guessing, and how far it is."""
+    auc, low, high = roc.number("auc") or 0.0, roc.number("low"), roc.number("high")
+    undecided = low is not None and high is not None and low <= 0.5 <= high
+    return abs(auc - 0.5) > IMAGE_AUC and not undecided, abs(auc - 0.5)
+
+
 def _pruning(audit: Part) -> Verdict | None:
-    attack = next((attack for attack in audit.parts("robustness", 500) if _is_random_pruning(attack)), None)
-    if attack is None or attack.text("skipped") or not attack.parts("secrets"):
+    found = (each for each in survivals(audit) if (each.attack, each.strength) == (PRUNING, PRUNED))
+    pruned = next(found, None)
+    if pruned is None or pruned.cover.loss is None or not pruned.secrets:
         return None
-    cover = attack.part("cover").number("loss")
-    losses = [secret.number("loss") for secret in attack.parts("secrets")]
-    opens = all(secret.flag("opens") is not False for secret in attack.parts("secrets"))
-    measured = [loss for loss in losses if loss is not None]
-    if cover is None or (opens and not measured):
+    opens = all(secret.opens for secret in pruned.secrets)
+    worst = max((secret.loss for secret in pruned.secrets if secret.loss is not None), default=None)
+    if opens and worst is None:
         return None
-    worst = max(measured, default=None)
-    within = opens and worst is not None and worst - cover <= PRUNING_LOSS
+    within = opens and worst is not None and worst - pruned.cover.loss <= PRUNING_LOSS
     return Verdict(
         f"loss of a random {PRUNED:.0%} of the Gaussians",
         f"secret {_change(worst)}" if opens else "the secret does not open",
-        f"cover {_change(cover)}",
+        f"cover {_change(pruned.cover.loss)}",
         f"at most {decibel(PRUNING_LOSS, 1)} more",
         "fine" if within else "missed",
         "robustness",
@@ -215,11 +233,6 @@ def _pruning(audit: Part) -> Verdict | None:
 
 def _change(loss: float | None) -> str:
     return f"{difference(None if loss is None else -loss)} dB"
-
-
-def _is_random_pruning(attack: Part) -> bool:
-    words = f"{attack.text('attack')} {attack.text('sentence')}".lower()
-    return "prun" in words and "random" in words and attack.number("strength") in (PRUNED, 100 * PRUNED)
 
 
 def _readers(audit: Part) -> Verdict | None:
