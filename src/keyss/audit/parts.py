@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,7 +88,7 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
         {
             "sinkhorn": published,
             "distances": distances,
-            "two_sample": two_sample,
+            "two_sample": {"stego": two_sample["against_plain"], "null": two_sample["between_plain"]},
             "histograms": histograms(subject.stego, nulls),
         }
     )
@@ -102,8 +103,13 @@ def stegexpose(subject: Subject, seed: int, steps: Steps) -> Found:
         [image.numpy() for _, image in renders_of(model, subject.cover, views)]
         for model in (subject.nulls[0], subject.stego)
     ]
-    sections = {"stegexpose": stegexpose_roc(*pictures)}
-    sections["stegexpose"]["views"] = [picture_name(view.camera) for view in views]
+    names = [picture_name(view.camera) for view in views]
+    found = stegexpose_roc(*pictures)
+    for model in ("plain", "stego"):
+        found[model] = [
+            {"name": name, "fusion": fusion} for name, fusion in zip(names, found[model], strict=True)
+        ]
+    sections: dict[str, Any] = {"stegexpose": found}
     steps(1, 2)
     try:
         sections["sealwatch"] = sealwatch_roc(*pictures, seed=seed)
@@ -156,7 +162,27 @@ def speed(subject: Subject, seed: int, steps: Steps) -> Found:
         device=subject.device,
         progress=steps,
     )
-    return Found({"speed": measured})
+    rendering = [
+        {"model": each["model"], "seconds": each["milliseconds"] / 1000, "ratio": each["ratio"]}
+        for each in measured["render"]
+    ]
+    readers = [
+        {
+            "reader": each["reader"],
+            "file": each["model"],
+            "loads": each.get("equal", None if "skipped" in each else False),
+            "gaussians": each.get("gaussians"),
+            "note": each.get("skipped", each.get("error")),
+        }
+        for each in measured["readers"]
+    ]
+    result = {
+        "render": rendering,
+        "reveal_seconds": max(each["seconds"] for each in measured["reveal"]),
+        "files": [{"name": name, "bytes": size} for name, size in measured["files"].items()],
+        "readers": readers,
+    }
+    return Found({"speed": result})
 
 
 PARTS: dict[str, Part] = {

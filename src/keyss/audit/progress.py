@@ -66,14 +66,16 @@ class Steps:
     """Progress of one part: call it with (done, of how many, at what)."""
 
     def __init__(self, reporter: Reporter, title: str) -> None:
-        self._reporter, self._title, self._started = reporter, title, False
+        self._reporter, self._title, self._total = reporter, title, 0
 
     def __call__(self, done: int, total: int, at: str = "") -> None:
-        if not self._started:
+        if not self._total:
             self._reporter.start(self._title, total, 0)
-            self._started = True
+        self._total = total
         self._reporter.update(done, 0, {})
 
-    def finish(self) -> None:
-        if self._started:
+    def finish(self, complete: bool) -> None:
+        if self._total:
+            if complete:
+                self._reporter.update(self._total, 0, {})
             self._reporter.finish()

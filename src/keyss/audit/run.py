@@ -68,7 +68,7 @@ def audit(
             except KeyboardInterrupt as error:
                 raise Interrupted(kept.folder, index) from error
             finally:
-                steps.finish()
+                steps.finish(kept.has(name))
         sections, shown = kept.take(name)
         results |= sections
         pictures |= shown

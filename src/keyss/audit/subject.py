@@ -80,7 +80,9 @@ def subject_of(
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
     stego, folder = run.stego.to(device), run.folder / NULLS
-    config = replace(_fit_config(run), max_gaussians=max(len(plain), 16))
+    config = _fit_config(run)
+    if original is not None or run.settings["models_given"][0]:  # whose size is not that of this run
+        config = replace(config, max_gaussians=max(len(plain), 16))
     nulls = [
         _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
         for seed in seeds
