@@ -93,3 +93,23 @@ def test_few_hidden_gaussians_are_no_special_case(count: int) -> None:
     scramble = Scramble.of(stego, b"k" * 32, BAND)
     opened = scramble.open(scramble.close(stego))
     torch.testing.assert_close(opened.means, stego.means, atol=1e-3, rtol=1e-3)
+
+
+def test_round_and_grey_covers_get_round_and_grey_ghosts() -> None:
+    """What goes together in the cover does in what is published, and opens all the same."""
+    stego = _stego()
+    noise = torch.randn(2000, 1, generator=torch.Generator().manual_seed(2))
+    round_grey = replace(
+        stego,
+        log_scales=stego.log_scales.mean(1, keepdim=True) + noise + 1e-3 * stego.log_scales,
+        sh=torch.cat([noise[:, :, None] + 1e-3 * stego.sh[:, :1], stego.sh[:, 1:]], dim=1),
+    )
+    cover = Gaussians.cat([round_grey[:1000], stego[1000:]])
+    scramble = Scramble.of(cover, b"k" * 32, BAND)
+    ghosts = scramble.close(cover)[1000:]
+    for values in (ghosts.log_scales, ghosts.sh[:, 0]):
+        assert float(np.corrcoef(values.numpy().T)[0, 1:].min()) > 0.95
+    opened = scramble.open(scramble.close(cover))
+    for name in ("log_scales", "sh"):
+        error = (getattr(opened, name) - getattr(cover, name)).abs()
+        assert float(error.max()) < 2e-2, name

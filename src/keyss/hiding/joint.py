@@ -17,7 +17,8 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.fitting.sampling import Shuffle
 from keyss.hiding.config import HideConfig, chosen_scenes
 from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.start import HIDDEN_SLOPE, make_start
+from keyss.hiding.scramble import LEAST_OPACITY
+from keyss.hiding.start import HIDDEN_SLOPE, logit_limits, make_start
 from keyss.hiding.targets import CombinedPoses, PlacedScene
 from keyss.hiding.visibility import possibly_seen
 from keyss.rendering import render_with_meta
@@ -63,6 +64,7 @@ class JointRun:
             self.rates = {name: config.warm_rate * rate for name, rate in self.rates.items()}
             # The hidden opacities are drawn together: what moves them moves the secret's 1 / slope as far.
             self.rates["opacities"] *= HIDDEN_SLOPE
+            self.logit_limits = logit_limits(self.parameters["opacities"].detach(), len(embeddings))
         self.strategy = CappedStrategy(
             config.fit,
             self._largest_opacity if config.prune_by == "all" else None,
@@ -123,6 +125,9 @@ class JointRun:
             if optimizer is not None:
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
+        if self.warm:
+            with torch.no_grad():
+                self.parameters["opacities"].clamp_(*self.logit_limits)
         if not self.warm:  # what a warm start chose from whole models, growth would only make worse
             asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
             combined = combine_densification(asking, len(self))
@@ -169,6 +174,10 @@ class JointRun:
         opacities = [gaussians.opacities]
         opacities += [self._decoded(secret, gaussians).opacities for secret in range(len(self.decoders))]
         return torch.stack(opacities).amax(0)
+
+    def drawn(self) -> Tensor:
+        """[N] whether a Gaussian is drawn in any scene: what is not would only give away where it lies."""
+        return self._largest_opacity() >= LEAST_OPACITY
 
     def _decoded(self, secret: int, gaussians: Gaussians) -> Gaussians:
         decoded: Gaussians = self.decoders[secret](gaussians, self.embeddings[secret])

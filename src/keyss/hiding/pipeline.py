@@ -119,6 +119,8 @@ def hide_scenes(
     )
     stego = run.gaussians().to("cpu")
     decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
+    if run.warm:
+        stego = stego[run.drawn().cpu()]
     scrambles: list[Scramble | None] = [None] * len(keys)
     if run.warm and not sidecar:  # a sidecar is for files that will be rounded, which no scramble survives
         for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):

@@ -33,6 +33,10 @@ _LEAST_GAP = 2.0**-9
 # Ranks are kept this far from 0 and 1, which the turn makes neighbours: rounding must not lead from one end
 # of the secret's values to the other.
 _MARGIN = 2.0**-13
+# Log scales and colours of a Gaussian go together: large ones are large along all axes, bright ones bright in
+# all channels. Taken apart into their sum and two differences, each of which is turned by itself, what is
+# published looks like Gaussians and colours of the cover. Orthonormal.
+_APART = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3.0], [2.0], [6.0]])
 
 Table = npt.NDArray[np.float64]
 
@@ -53,7 +57,7 @@ class Scramble:
         visible = stego.opacities >= LEAST_OPACITY
         own = _quantiles(_channels(stego[hidden]))
         shown = _quantiles(_channels(stego[visible if visible.any() else hidden]))
-        shown = _ascending(shown, _LEAST_GAP * np.maximum(np.abs(shown[:, :-1]), np.abs(shown[:, 1:])) + 1e-9)
+        shown = _ascending(shown, _least_gaps(shown))
         shown[-1] = np.linspace(own[-1, 0], own[-1, -1], KNOTS)  # as transparent as they are
         tables = (torch.from_numpy(np.ascontiguousarray(table)).float() for table in (own, shown))
         return Scramble(key, band, *tables)
@@ -78,7 +82,7 @@ class Scramble:
             before, after = start[channel].double().numpy(), end[channel].double().numpy()
             rank = np.interp(values[:, channel], before, rank_before)
             moved[:, channel] = np.interp((rank + sign * shift[:, channel]) % 1.0, rank_after, after)
-        columns = torch.from_numpy(moved).float().to(stego.device)
+        columns = torch.from_numpy(_together(moved)).float().to(stego.device)
         means, log_scales, sh = stego.means.clone(), stego.log_scales.clone(), stego.sh.clone()
         opacity_logits = stego.opacity_logits.clone()
         means[hidden], log_scales[hidden], sh[hidden, 0] = columns[:, 0:3], columns[:, 3:6], columns[:, 6:9]
@@ -106,9 +110,17 @@ def _inside(stego: Gaussians, band: tuple[float, float]) -> torch.Tensor:
 
 
 def _channels(part: Gaussians) -> Table:
-    """[N, CHANNELS]"""
+    """[N, CHANNELS] positions, log scales and colours taken apart, opacity logits."""
     columns = [part.means, part.log_scales, part.sh[:, 0], part.opacity_logits[:, None]]
     values: Table = torch.cat(columns, dim=1).detach().cpu().double().numpy()
+    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ _APART.T, values[:, 6:9] @ _APART.T
+    return values
+
+
+def _together(channels: Table) -> Table:
+    """The inverse of `_channels`: [N, CHANNELS] positions, log scales, colours, opacity logits."""
+    values = channels.copy()
+    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ _APART, values[:, 6:9] @ _APART
     return values
 
 
@@ -119,6 +131,17 @@ def _quantiles(values: Table) -> Table:
     found = np.quantile(values, np.linspace(0, 1, KNOTS), axis=0).T
     reach = np.abs(found).max(axis=1, keepdims=True) + 1e-6
     return _ascending(found, 2.0**-22 * reach)
+
+
+def _least_gaps(shown: Table) -> Table:
+    """[CHANNELS, KNOTS - 1] what must lie between neighbouring knots for float32 to resolve ranks.
+
+    What was taken apart is rounded together: the largest value of the three counts, however small the others.
+    """
+    sizes = np.maximum(np.abs(shown[:, :-1]), np.abs(shown[:, 1:]))
+    for group in (slice(3, 6), slice(6, 9)):
+        sizes[group] = np.median(np.abs(shown[group]), axis=1).max()
+    return _LEAST_GAP * sizes + 1e-9
 
 
 def _ascending(table: Table, least: Table) -> Table:

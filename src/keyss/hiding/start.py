@@ -19,7 +19,7 @@ from keyss.hiding.visibility import contributions
 # Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
 # higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
 # band of logits of its own, from low - 0.5 to high + 0.5 of `opacity_curve`; bands must not touch.
-DRAWN_LOGIT = -5.54
+DRAWN_LOGIT, UNDRAWN_LOGIT = -5.54, -5.6
 HIDDEN_LOGIT, HIDDEN_STEP = -8.2, -3.7
 HIDDEN_SLOPE = 0.25
 SHOWN_LOGITS = (-4.0, 6.0)
@@ -88,6 +88,20 @@ def opacity_curve(secret: int) -> tuple[list[float], list[float]]:
         [TRANSPARENT_LOGIT] * 2 + [(x - middle) / HIDDEN_SLOPE for x in knots[2:4]] + [TRANSPARENT_LOGIT] * 2
     )
     return knots, [y - x for x, y in zip(knots, shown, strict=True)]
+
+
+def logit_limits(logits: Tensor, secrets: int) -> tuple[Tensor, Tensor]:
+    """[N] least and [N] largest opacity logits that leave each Gaussian to the scene that it starts with.
+
+    A secret's stays where its opacity curve shows it: one that left the band would be transparent in every
+    scene, where nothing scrambles it. One of the cover's stays above all bands.
+    """
+    low, high = torch.full_like(logits, UNDRAWN_LOGIT), torch.full_like(logits, torch.inf)
+    for secret in range(secrets):
+        knots, _ = opacity_curve(secret)
+        own = (logits > knots[1]) & (logits < knots[4])
+        low[own], high[own] = knots[2], knots[3]
+    return low, high
 
 
 def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
