@@ -26,8 +26,9 @@ def sinkhorn_3d(original: Gaussians, other: Gaussians) -> dict[str, float]:
 
     The histograms, of 100 bins, are of opacities and of the lengths of scales (as standard deviations), raw
     quaternions, positions and constant colour coefficients, each model's divided by its own maximum. The
-    range of `original`'s values is divided into bins; what of `other` lies outside it is dropped. Cost: the
-    difference of the bins' centres. Entropic regularisation: 0.01, so d(p, p) > 0. Not symmetric.
+    range of `original`'s values is divided into bins; what of `other` lies outside it is dropped, and if that
+    is all of it, the distance is 1. Cost: the difference of the bins' centres. Entropic regularisation: 0.01,
+    so d(p, p) > 0; at most 1,000 iterations, as is POT's default. Not symmetric.
     The paper's tables give sums. Raises UsageError for an empty model.
     """
     if not (len(original) and len(other)):
@@ -69,6 +70,8 @@ def _sinkhorn(original: Doubles, other: Doubles) -> float:
     ours, edges = np.histogram(original, BINS)
     theirs, _ = np.histogram(other, edges)
     centres = (edges[:-1] + edges[1:]) / 2
+    if not theirs.any():
+        return 1.0
     # Empty bins take no part in the problem, but POT divides by them and returns what it started from.
     i, j = np.flatnonzero(ours), np.flatnonzero(theirs)
     cost = np.abs(centres[i, None] - centres[None, j])

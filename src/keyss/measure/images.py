@@ -1,0 +1,131 @@
+"""How near pictures are to others of the same views, by the usual measures, each named for what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.ndimage import correlate1d
+from torch import Tensor
+
+from keyss.core.errors import BackendError, InputError, KeyssError
+from keyss.files.images import read_image
+from keyss.fitting.image_metrics import psnr
+from keyss.measure.lpips import lpips_alex
+
+Pixels = npt.NDArray[np.uint8]
+Doubles = npt.NDArray[np.float64]
+Pictures = Path | str | Sequence[tuple[str, Tensor | Pixels]]
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+RADIUS = 5  # SSIM's 11 x 11 window
+_WINDOW = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * 1.5**2))
+_WINDOW /= _WINDOW.sum()
+
+
+def compare_images(
+    reference: Pictures, other: Pictures, *, lpips: bool = True, flip: bool = True
+) -> dict[str, Any]:
+    """Pictures against those of the same names: `views` with `name` and values of each, and their `mean`.
+
+    Give folders of pictures, whose suffixes do not matter (transparent ones are laid over black), or
+    sequences of names and uint8 images [H, W, 3], such as `keyss.render` returns.
+
+    - `psnr`: dB; the mean is over pictures (Mip-NeRF 360's protocol). 120, the most, where nothing differs.
+    - `ssim_3dgs`: as 3DGS computes it, with zeros around the picture.
+    - `ssim_standard`: without the border of 5 pixels that the window does not fit in (Wang et al. 2004; what
+      scikit-image and pytorch-msssim give). Both SSIMs: 11 x 11 Gaussian window of sigma 1.5, mean over RGB.
+    - `lpips_alex`: LPIPS 0.1 with AlexNet, from 0; of pictures of at least 31 x 31 pixels.
+    - `flip`: the mean of LDR-FLIP (Andersson et al. 2020), 0 to 1, at its usual 67 pixels per degree.
+
+    The last two are left out where `lpips` or `flip` is false or what they need is not installed;
+    `missing` then says, by name, how to get it. Raises InputError for what has no partner, for pictures of
+    different or less than 11 x 11 pixels, and for what cannot be read as pictures.
+    """
+    ours, theirs = _by_stem(reference), _by_stem(other)
+    alone = sorted(ours.keys() ^ theirs.keys())
+    if alone or not ours:
+        raise InputError(
+            f"expected pictures of the same names on both sides, got {len(ours)} and {len(theirs)}; "
+            f"without a partner: {', '.join(alone[:5])}{', ...' if len(alone) > 5 else ''}"
+        )
+    optional: dict[str, Callable[[Tensor, Tensor], float]] = {}
+    optional |= {"lpips_alex": lpips_alex} if lpips else {}
+    optional |= {"flip": _flip} if flip else {}
+    views, missing = [], {}
+    for name in sorted(ours):
+        a, b = _unit_range(name, ours[name], theirs[name])
+        view: dict[str, Any] = {"name": name, "psnr": psnr(a, b), **_ssim(a.numpy(), b.numpy())}
+        for measure, function in optional.items():
+            try:
+                view[measure] = function(a, b)
+            except KeyssError as error:
+                missing[measure] = str(error)
+        views.append(view)
+    views = [{key: value for key, value in view.items() if key not in missing} for view in views]
+    mean = {key: fmean(view[key] for view in views) for key in views[0] if key != "name"}
+    return {"views": views, "mean": mean, "missing": missing}
+
+
+def _by_stem(pictures: Pictures) -> dict[str, Path | Tensor | Pixels]:
+    """Files or images by name, without its suffix and with folders made part of it, as of `keyss render`."""
+    if isinstance(pictures, str | Path):
+        folder = Path(pictures)
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected a folder of pictures")
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        named: list[tuple[str, Path | Tensor | Pixels]] = [(path.name, path) for path in files]
+    else:
+        named = list(pictures)
+    found: dict[str, Path | Tensor | Pixels] = {}
+    for name, picture in named:
+        flat = Path(name.replace("/", "_").replace("\\", "_"))
+        stem = flat.stem if flat.suffix.lower() in SUFFIXES else flat.name
+        if stem in found:
+            raise InputError(f"expected one picture of each name, got two called {stem}")
+        found[stem] = picture
+    return found
+
+
+def _unit_range(name: str, *pair: Path | Tensor | Pixels) -> list[Tensor]:
+    """Two pictures as float64 [H, W, 3] in [0, 1]."""
+    black = np.zeros(3, np.float32)
+    a, b = (read_image(each, black) if isinstance(each, Path) else np.asarray(each) for each in pair)
+    for each in (a, b):
+        if each.dtype != np.uint8 or each.ndim != 3 or each.shape[2] != 3:
+            raise InputError(f"{name}: expected uint8 [H, W, 3], got {each.dtype} {list(each.shape)}")
+    if a.shape != b.shape or min(a.shape[:2]) <= 2 * RADIUS:
+        sizes = f"{a.shape[1]}x{a.shape[0]} and {b.shape[1]}x{b.shape[0]}"
+        raise InputError(f"{name}: expected two pictures of one size, at least 11x11, got {sizes}")
+    return [torch.from_numpy(each / 255) for each in (a, b)]
+
+
+def _ssim(a: Doubles, b: Doubles) -> dict[str, float]:
+    def blur(values: Doubles) -> Doubles:
+        rows = correlate1d(values, _WINDOW, axis=0, mode="constant")
+        blurred: Doubles = correlate1d(rows, _WINDOW, axis=1, mode="constant")
+        return blurred
+
+    c1, c2 = 0.01**2, 0.03**2
+    mean_a, mean_b = blur(a), blur(b)
+    variances = blur(a * a) - mean_a**2 + blur(b * b) - mean_b**2
+    covariance = blur(a * b) - mean_a * mean_b
+    numerator = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    values = numerator / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
+    inside = values[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    return {"ssim_3dgs": float(values.mean()), "ssim_standard": float(inside.mean())}
+
+
+def _flip(a: Tensor, b: Tensor) -> float:
+    try:
+        flip = import_module("flip_evaluator")
+    except ImportError as error:
+        raise BackendError("FLIP needs the package flip-evaluator: pip install flip-evaluator") from error
+    pair = a.float().numpy(), b.float().numpy()
+    return float(flip.evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
