@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from keyss.core.errors import InputError, UsageError
 from keyss.files import images
 from keyss.measure.stegexpose import DETECTORS, Scores, read_pixels, score_file, score_image
+from keyss.measure.stegexpose.rs import _rate
 from measure import stegexpose_literal as literal
 
 Pixels = npt.NDArray[np.uint8]
@@ -111,6 +112,10 @@ class TestByHand:
             others, this = scale, scale * (1 + filled // 2)
             p_values.append(chi2.sf(127 * (1 - others) ** 2 / others + (observed - this) ** 2 / this, 127))
         assert scores.chi_square == pytest.approx(np.mean(p_values), abs=1e-9)
+
+    def test_rs_at_its_pole(self) -> None:
+        """4 x² - 1 = 0: of the roots -1/2 and 1/2 the positive, at which x / (x - 1/2) is taken for 0."""
+        assert _rate(np.array([[1, 0], [2, 0]]), np.array([[1, 0], [0, 2]])) == 0
 
     def test_nothing_answers(self) -> None:
         scores = score_image(grey([[7]]))
