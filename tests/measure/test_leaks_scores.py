@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from keyss.fitting.image_metrics import psnr, quality
-from keyss.measure.leaks import fit_colours, gradient_correlation, scores
+from keyss.measure.leaks import coarse, fit_colours, gradient_correlation, scores
 from tiny_scenes import random_gaussians, tiny_scene
 
 
@@ -43,6 +43,26 @@ def test_ramps_at_an_angle_correlate_by_its_cosine() -> None:
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
     straight, tilted = x[:, :, None].expand(-1, -1, 3), (x + 3**0.5 * y)[:, :, None].expand(-1, -1, 3)
     assert gradient_correlation(straight, tilted) == pytest.approx(0.5)
+
+
+def test_coarse_images_are_means_over_blocks_and_keep_their_shape() -> None:
+    image = torch.rand(192, 96, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(coarse(image), image.reshape(64, 3, 32, 3, 3).mean(dim=(1, 3)))
+    assert coarse(image[:, :70]).shape == (64, 23, 3)
+    assert torch.equal(coarse(_noise(1)[:50, :64]), _noise(1)[:50, :64])
+
+
+def test_what_is_out_of_place_by_a_little_is_seen_in_coarse_images_alone() -> None:
+    shapes = (
+        coarse(_noise(3)[:, :, :1].expand(-1, -1, 3))[:16, :12]
+        .repeat_interleave(20, 0)
+        .repeat_interleave(20, 1)
+    )
+    lines = torch.zeros(320, 240, 3)
+    lines[::5] = 0.5
+    image, photo = shapes + lines.roll(2, 0), shapes + lines
+    assert gradient_correlation(image, photo) < 0.1
+    assert gradient_correlation(coarse(image), coarse(photo)) > 0.9
 
 
 def test_fitting_undoes_any_exposure_of_each_channel() -> None:

@@ -23,14 +23,16 @@ def search_embeddings(
     restarts: int = 8,
     steps: int = 150,
     sample: int = 4000,
+    balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
     """[restarts, 64] unit vectors under which the decoder seems to show another scene, the best first.
 
     Gradient ascent from random starts on the mean change of the opacities of up to `sample` Gaussians, less
-    twice the change of their mean: what makes some visible and as much of others invisible is a scene in
-    place of a scene, while what only adds or only removes is not. A decoder with a gate gives no gradient:
-    then the random starts come back.
+    `balance` times the change of their mean: what makes some visible and as much of others invisible is a
+    scene in place of a scene, while what only adds or only removes is not. With 0 all change counts, which
+    finds a secret that needs more Gaussians than the cover. A decoder with a gate gives no gradient: then the
+    random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
     if decoder.shape.conditioning == "gate":
@@ -40,7 +42,7 @@ def search_embeddings(
 
     def exchanged(direction: Tensor) -> Tensor:
         change = decoder(part, F.normalize(direction, dim=0), stego).opacities - part.opacities
-        score: Tensor = change.abs().mean() - 2 * change.mean().abs()
+        score: Tensor = change.abs().mean() - balance * change.mean().abs()
         return score
 
     found = []

@@ -2,12 +2,13 @@
 
 from keyss.measure.leaks.attacks import Attack, decoder_attacks, file_attacks
 from keyss.measure.leaks.looking import attack, look_for_secret
-from keyss.measure.leaks.scores import SCORES, fit_colours, gradient_correlation, scores
+from keyss.measure.leaks.scores import SCORES, coarse, fit_colours, gradient_correlation, scores
 
 __all__ = [
     "SCORES",
     "Attack",
     "attack",
+    "coarse",
     "decoder_attacks",
     "file_attacks",
     "fit_colours",

@@ -20,7 +20,7 @@ from keyss.measure.leaks.scores import SCORES, scores
 from keyss.rendering import render
 
 _GAP = 4  # pixels between the parts of a picture
-_JUDGE = "gradient"  # the score by which the view that a picture shows is chosen
+_JUDGE = "gradient_coarse"  # the score by which the view that a picture shows is chosen
 
 
 def look_for_secret(
@@ -33,7 +33,7 @@ def look_for_secret(
     opened: HiddenSecret | None = None,
     test_views: int = 8,
     cover_views: int = 32,
-    restarts: int = 4,
+    restarts: int = 2,
     seed: int = 0,
 ) -> tuple[list[dict[str, Any]], dict[str, Tensor]]:
     """Every attack on one secret: rows for JSON, and a picture of each by its name.
@@ -41,8 +41,9 @@ def look_for_secret(
     `stego` and `plains`, one or more plain models of the cover, are in the cover's frame, `cover` and
     `secret` in their own, and `frame` leads from the secret's into the cover's. `opened` adds the attack on
     an unsealed decoder, and what the key shows. Of the secret's test views at most `test_views` are used and
-    of the cover's training views `cover_views`, evenly spread; `restarts` are the searches on a decoder. See
-    `attack` for what comes back. Raises UsageError for no plain model and for a secret without test views.
+    of the cover's training views `cover_views`, evenly spread; `restarts` are those of each search on a
+    decoder. See `attack` for what comes back. Raises UsageError for no plain model and for a secret without
+    test views.
     """
     attacks = file_attacks([view.camera for view in thin(cover.train, cover_views)], seed)
     if opened is not None:
@@ -64,7 +65,7 @@ def attack(
     The strictest assumption: the attacker stands where the secret was photographed. For each attack a row:
 
     - attack, sentence, parameters, control: see `Attack`.
-    - views: how many the attacker looks at; best: the one with the largest gradient correlation.
+    - views: how many the attacker looks at; best: the one with the largest `gradient_coarse`.
     - SCORES (`scores`), each the largest over the attack's views, for the attacker knows when he sees it.
     - null: the same numbers on the plain models, their mean, and null_max the largest of any.
     - leak: the differences from the mean. More views are thus no more leak.

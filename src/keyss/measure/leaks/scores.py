@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
@@ -13,7 +14,8 @@ from keyss.fitting.image_metrics import psnr
 from keyss.fitting.losses import Target, ssim
 from keyss.rendering import render
 
-SCORES = ("psnr", "ssim", "gradient", "psnr_fitted", "ssim_fitted")
+SCORES = ("psnr", "ssim", "gradient", "gradient_coarse", "psnr_fitted", "ssim_fitted")
+COARSE = 64  # pixels of the longer side, at which ghosts that are slightly out of place still count
 
 
 def gradient_correlation(image: Tensor, reference: Tensor) -> float:
@@ -26,6 +28,14 @@ def gradient_correlation(image: Tensor, reference: Tensor) -> float:
     first, second = _gradients(image), _gradients(reference)
     size = (first.square().sum() * second.square().sum()).sqrt()
     return float((first * second).sum() / size) if size > 0 else 0.0
+
+
+def coarse(image: Tensor) -> Tensor:
+    """[h, w, 3] the image shrunk to COARSE pixels on its longer side, each a mean; a small one as it is."""
+    height, width = image.shape[:2]
+    scale = min(1.0, COARSE / max(height, width))
+    size = (max(1, round(scale * height)), max(1, round(scale * width)))
+    return F.adaptive_avg_pool2d(image.permute(2, 0, 1), size).permute(1, 2, 0)
 
 
 def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
@@ -43,8 +53,9 @@ def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
 def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> dict[str, float]:
     """How well a model shows the views' photos: means over the views of SCORES.
 
-    PSNR in dB, SSIM as in 3DGS, `gradient_correlation`, and the first two after `fit_colours`. Without the
-    fit a light cloud shows more of any photo than black does.
+    PSNR in dB, SSIM as in 3DGS; `gradient_correlation`, of whole and of `coarse` images; and the first two
+    after `fit_colours`. Without the fit any light cloud is nearer to a photo than black: plain PSNR and SSIM
+    tell that something is seen, not that it is the secret.
     """
     rows = []
     for view in views:
@@ -56,6 +67,7 @@ def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> dict[
                 psnr(image, photo),
                 float(ssim(image, target)),
                 gradient_correlation(image, photo),
+                gradient_correlation(coarse(image), coarse(photo)),
                 psnr(fitted, photo),
                 float(ssim(fitted, target)),
             )
