@@ -42,44 +42,31 @@ def speed(
     "render": for the published model and each revealed one what `render_ratio` says, beside the plain model
     of its scene. "reveal": seconds from file to file for each secret (median of three), reading, key
     derivation and writing included. "files": bytes. "readers": see `readers`, of the published and the
-    revealed files. Raises KeyssError where a secret does not open.
+    revealed files. `progress`: called with models done, models in all, and the next one's name. Raises
+    KeyssError where a secret does not open.
     """
-    names = ["stego", *(f"secret {index}" for index in range(1, len(scenes)))]
-    steps = [f"reveal {name}" for name in names[1:]] + [
-        f"{what} {n}" for n in names for what in ("render", "read")
-    ]
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        if progress is not None:
-            progress(done, len(steps), steps[done] if done < len(steps) else "")
-        done += 1
-
-    result: dict[str, Any] = {
-        "render": [],
-        "reveal": [],
-        "files": {"stego": stego.stat().st_size},
-        "readers": [],
-    }
+    names = ["stego", *(f"secret {number}" for number in range(1, len(scenes)))]
+    files: dict[str, int] = {}
     if sidecar is not None:
-        result["files"]["sidecar"] = sidecar.stat().st_size
+        files["sidecar"] = sidecar.stat().st_size
+    rendered, revealed, read = [], [], []
     with tempfile.TemporaryDirectory() as folder:
-        files = [stego]
-        for number, each in enumerate(reopen, 1):
-            step()
-            files.append(Path(folder) / f"secret-{number}.ply")
-            result["reveal"].append({"secret": number, "seconds": reveal_seconds(stego, each, files[-1])})
-            result["files"][names[number]] = files[-1].stat().st_size
-        for name, file, scene, plain in zip(names, files, scenes, plains, strict=True):
-            step()
-            model = read_ply(file).to(device)
-            ratio = render_ratio(model, plain.to(device), scene, views=views, rounds=rounds)
-            result["render"].append({"model": name, **ratio})
-            step()
-            result["readers"] += [{"model": name, **found} for found in readers(file)]
-    step()
-    return result
+        for number, (name, scene, plain) in enumerate(zip(names, scenes, plains, strict=True)):
+            if progress is not None:
+                progress(number, len(names), name)
+            file = stego
+            if number > 0:
+                file = Path(folder) / f"{number}.ply"
+                revealed.append({"model": name, "seconds": reveal_seconds(stego, reopen[number - 1], file)})
+            files[name] = file.stat().st_size
+            ratio = render_ratio(
+                read_ply(file).to(device), plain.to(device), scene, views=views, rounds=rounds
+            )
+            rendered.append({"model": name, **ratio})
+            read += [{"model": name, **found} for found in readers(file)]
+    if progress is not None:
+        progress(len(names), len(names), "")
+    return {"render": rendered, "reveal": revealed, "files": files, "readers": read}
 
 
 @torch.no_grad()

@@ -6,6 +6,7 @@ numbers, for whatever is random follows from its seed.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -39,7 +40,7 @@ def random_pruning(share: float, seed: int = 0) -> Change:
     _check_share(share)
 
     def apply(model: Gaussians) -> Gaussians:
-        order = torch.randperm(len(model), generator=torch.Generator().manual_seed(seed))
+        order = torch.randperm(len(model), generator=_generator("pruning", seed))
         return model[order[_removed(share, model) :].sort().values.to(model.device)]
 
     sentence = f"{share:.0%} of the Gaussians, drawn at random, are removed."
@@ -69,7 +70,7 @@ def noise(attribute: str, strength: float, seed: int = 0) -> Change:
         raise UsageError(f"noise: expected one of {', '.join(NOISY)}, got {attribute!r}")
 
     def noisy(values: Tensor) -> Tensor:
-        drawn = torch.randn(values.shape, generator=torch.Generator().manual_seed(seed)).to(values)
+        drawn = torch.randn(values.shape, generator=_generator(f"noise on {attribute}", seed)).to(values)
         return values + strength * spread(values) * drawn
 
     def apply(model: Gaussians) -> Gaussians:
@@ -100,7 +101,7 @@ def cropping(seed: int = 0) -> Change:
     """Keep the half of the Gaussians on one side of a plane, whose direction is drawn at random."""
 
     def apply(model: Gaussians) -> Gaussians:
-        direction = torch.randn(3, generator=torch.Generator().manual_seed(seed)).to(model.device)
+        direction = torch.randn(3, generator=_generator("cropping", seed)).to(model.device)
         order = (model.means @ direction).argsort(stable=True)
         return model[order[len(model) // 2 :].sort().values]
 
@@ -126,6 +127,15 @@ def half_floats() -> Change:
 
 def _halved(values: Tensor) -> Tensor:
     return values.half().float()
+
+
+def _generator(use: str, seed: int) -> torch.Generator:
+    """Random numbers that have nothing to do with those of a training with the same seed, nor of another use.
+
+    Removing just what some training chose, such as a secret's anchors, would not be random.
+    """
+    digest = hashlib.sha256(f"keyss/robustness/{use} {seed}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
 
 
 def _check_share(share: float) -> None:
