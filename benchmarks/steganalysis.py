@@ -1,7 +1,7 @@
 """How well a classifier tells embedded models from ordinary ones, on models that you have.
 
     python benchmarks/steganalysis.py bonsai=runs/a/model.ply bonsai=runs/b/model.ply fox=runs/c/model.ply ...
-    python benchmarks/steganalysis.py --carry bonsai=...     # each carries half as many Gaussians of the next instead
+    python benchmarks/steganalysis.py --carry bonsai=...     # each carries half as many of the next
 
 Each model is cut into up to four spatially disjoint parts of at least 1,000 Gaussians, and each part is
 embedded into. The classifiers learn from all scenes but one and are tried on that one; a scene is the name

@@ -89,7 +89,7 @@ def _held_out(
 ) -> tuple[float, float]:
     """AUC on the Gaussians held out, of trees that learn from the others, and its variance."""
     from sklearn.ensemble import HistGradientBoostingClassifier  # slow to import
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+    from threadpoolctl import threadpool_limits
 
     trees = HistGradientBoostingClassifier(
         max_iter=_TREES, max_leaf_nodes=_LEAVES, early_stopping=False, random_state=seed

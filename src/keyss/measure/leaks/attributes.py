@@ -62,7 +62,7 @@ def clusters(model: Gaussians, count: int, seed: int = 0) -> list[Gaussians]:
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+    from threadpoolctl import threadpool_limits
 
     if len(model) < _LEAST_CLUSTERED:
         return [opaque(model)] + [model[:0]] * (count - 1)
