@@ -95,26 +95,29 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
 
 
 def stegexpose(subject: Subject, seed: int, steps: Steps) -> Found:
-    """Whether detectors of hidden bits tell pictures of the published model from those of a plain one."""
+    """Whether detectors of hidden bits tell pictures of the published model from those of a plain one.
+
+    Beside it, whether they tell those of two plain models apart: some learn any difference.
+    """
     # In the order of the photos' names, which is that of the camera's path more often than not.
     ordered = sorted(subject.cover.views, key=lambda view: view.camera.name)
     views = thin(ordered, STEGANALYSED_VIEWS)
-    pictures = [
-        [image.numpy() for _, image in renders_of(model, subject.cover, views)]
-        for model in (subject.nulls[0], subject.stego)
-    ]
+    models = (subject.nulls[0], subject.stego, subject.nulls[1])
+    plain, stego, null = (
+        [image.numpy() for _, image in renders_of(model, subject.cover, views)] for model in models
+    )
     names = [picture_name(view.camera) for view in views]
-    found = stegexpose_roc(*pictures)
-    for model in ("plain", "stego"):
-        found[model] = [
-            {"name": name, "fusion": fusion} for name, fusion in zip(names, found[model], strict=True)
-        ]
-    sections: dict[str, Any] = {"stegexpose": found}
-    steps(1, 2)
-    try:
-        sections["sealwatch"] = sealwatch_roc(*pictures, seed=seed)
-    except BackendError as error:
-        sections["sealwatch"] = {"missing": str(error)}
+    sections: dict[str, Any] = {}
+    for index, (ending, others) in enumerate((("", stego), ("_null", null))):
+        steps(index, 2)
+        found = stegexpose_roc(plain, others)
+        for scores in ("plain", "stego"):
+            found[scores] = [{"name": name} | row for name, row in zip(names, found[scores], strict=True)]
+        sections[f"stegexpose{ending}"] = found
+        try:
+            sections[f"sealwatch{ending}"] = sealwatch_roc(plain, others, seed=seed)
+        except BackendError as error:
+            sections["sealwatch"] = {"missing": str(error)}
     return Found(sections)
 
 

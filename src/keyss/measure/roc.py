@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from keyss.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from keyss.measure.stegexpose import Scores
 
 INTERVAL = "DeLong 1988, on the logit scale, 95 %"
 _Z = 1.959963984540054  # standard normal quantile of 0.975
@@ -52,8 +56,9 @@ def roc(negatives: Sequence[Score], positives: Sequence[Score]) -> dict[str, Any
 def stegexpose_roc(plain_images: Sequence[Image], stego_images: Sequence[Image]) -> dict[str, Any]:
     """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
 
-    `plain` and `stego`: the fused scores, NaN as None; `roc`: of these; `detectors`: the AUC of each alone,
-    None where it takes no image (Chi Square: less than about 87,700 pixels; Sample Pairs: odd sizes).
+    `plain` and `stego`: the scores of each image, `fusion` among them, NaN as None; `roc`: of the fused ones;
+    `detectors`: the AUC of each alone, None where it takes no image (Chi Square: less than about 87,700
+    pixels; Sample Pairs: odd sizes).
     The AUC of a renderer's output should be near 0.5, whatever is hidden: no pixel's last bit is replaced.
     Raises UsageError when the views are not the same in number or size.
     """
@@ -67,8 +72,9 @@ def stegexpose_roc(plain_images: Sequence[Image], stego_images: Sequence[Image])
         negatives, positives = ([getattr(scores, name) for scores in each] for each in (plain, stego))
         silent = all(map(_is_missing, negatives + positives))
         detectors[name] = None if silent else roc(negatives, positives)["auc"]
-    fused = [[_none_if_nan(scores.fusion) for scores in each] for each in (plain, stego)]
-    return {"plain": fused[0], "stego": fused[1], "roc": roc(*fused), "detectors": detectors}
+    rows = [[_row(scores) for scores in each] for each in (plain, stego)]
+    fused = [[row["fusion"] for row in each] for each in rows]
+    return {"plain": rows[0], "stego": rows[1], "roc": roc(*fused), "detectors": detectors}
 
 
 def check_same_views(plain_images: Sequence[Image], stego_images: Sequence[Image]) -> None:
@@ -127,5 +133,5 @@ def _unanswered(scores: Sequence[Score]) -> int:
     return sum(map(_is_missing, scores))
 
 
-def _none_if_nan(score: float) -> Score:
-    return None if math.isnan(score) else score
+def _row(scores: Scores) -> dict[str, Score]:
+    return {name: None if _is_missing(score) else score for name, score in asdict(scores).items()}

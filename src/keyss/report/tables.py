@@ -180,15 +180,20 @@ def distance_table(attributes: Mapping[str, Part]) -> Html | None:
 
 
 def detector_table(audit: Part) -> Html | None:
-    """AUC of each detector on renders."""
-    detectors = audit.part("stegexpose").part("detectors")
+    """AUC of each detector on renders of the published model against a plain one's, and of two plain ones."""
+    detectors, null = (audit.part(key).part("detectors") for key in ("stegexpose", "stegexpose_null"))
     rows = [
-        (f"StegExpose, {label}", number(detectors.number(key), 2))
+        (f"StegExpose, {label}", number(detectors.number(key), 2), number(null.number(key), 2))
         for key, label in _DETECTORS.items()
         if key in detectors.entries
     ]
-    rows += [(name, auc_text(roc)) for key in PROGRAMS for name, roc in rocs(audit, key)]
-    return table("AUC of each detector", ("", "AUC"), rows) if rows else None
+    for program in PROGRAMS:
+        nulls = dict(rocs(audit, program, "_null"))
+        rows += [
+            (name, auc_text(roc), auc_text(nulls[name]) if name in nulls else NOTHING)
+            for name, roc in rocs(audit, program)
+        ]
+    return table("AUC of each detector", ("", "AUC", "between plain models"), rows) if rows else None
 
 
 def score_table(name: str, scores: Sequence[Part]) -> Html | None:

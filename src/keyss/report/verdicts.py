@@ -84,9 +84,9 @@ def auc_text(part: Part) -> str:
     return number(part.number("auc"), 2) + interval
 
 
-def rocs(audit: Part, key: str) -> list[tuple[str, Part]]:
-    """The ROCs that a program's detectors have in an audit, with their names."""
-    program, name = audit.part(key), PROGRAMS[key]
+def rocs(audit: Part, key: str, which: Literal["", "_null"] = "") -> list[tuple[str, Part]]:
+    """The ROCs that a program's detectors have in an audit, with their names; null: between plain models."""
+    program, name = audit.part(key + which), PROGRAMS[key]
     found = [(name, program.part("roc"))]
     found += [(f"{name} {each.upper()}", program.part(each).part("roc")) for each in _SEALWATCH]
     return [(name, roc) for name, roc in found if roc]
@@ -189,26 +189,29 @@ def _two_sample(audit: Part) -> Verdict | None:
 
 
 def _detectors(audit: Part, key: str) -> Verdict | None:
-    """One line for all detectors of a program: the one that finds most."""
-    curves = [(name, roc) for name, roc in rocs(audit, key) if roc.number("auc") is not None]
+    """One line for all detectors of a program: the one that finds most beyond its null."""
+    nulls = dict(rocs(audit, key, "_null"))
+    curves = [(name, roc, nulls.get(name)) for name, roc in rocs(audit, key) if roc.number("auc") is not None]
     if not curves:
         return None
-    name, roc = max(curves, key=lambda curve: _suspicion(curve[1]))
+    name, roc, null = max(curves, key=lambda curve: _suspicion(*curve[1:]))
     return Verdict(
         f"{PROGRAMS[key]} on renders",
         f"AUC {auc_text(roc)}" + (f", {name}" if len(curves) > 1 else ""),
-        "0.5, guessing",
-        f"0.5 ± {IMAGE_AUC}, or within interval",
-        "visible" if _suspicion(roc)[0] else "fine",
+        "0.5, guessing" if null is None else f"{auc_text(null)}, between plain models",
+        f"{IMAGE_AUC} further from 0.5, or within interval",
+        "visible" if _suspicion(roc, null)[0] else "fine",
         "renders",
     )
 
 
-def _suspicion(roc: Part) -> tuple[bool, float]:
-    """Whether an AUC is too far from guessing, and how far it is."""
+def _suspicion(roc: Part, null: Part | None) -> tuple[bool, float]:
+    """Whether an AUC is too much further from guessing than that between plain models, and by how much."""
     auc, low, high = roc.number("auc") or 0.0, roc.number("low"), roc.number("high")
+    plain = 0.5 if null is None else null.number("auc")
+    beyond = abs(auc - 0.5) - (0.0 if plain is None else abs(plain - 0.5))
     undecided = low is not None and high is not None and low <= 0.5 <= high
-    return abs(auc - 0.5) > IMAGE_AUC and not undecided, abs(auc - 0.5)
+    return beyond > IMAGE_AUC and not undecided, beyond
 
 
 def _pruning(audit: Part) -> Verdict | None:
