@@ -10,7 +10,7 @@ import torch
 from scipy.stats import kstest
 
 from keyss.core import Gaussians
-from keyss.hiding.scramble import Scramble
+from keyss.hiding.scramble import Scramble, with_lengths_of_the_cover
 from keyss.seal.low_bits import is_random, read_low_bits, write_low_bits
 from seal.trained_like import trained_like
 
@@ -113,3 +113,15 @@ def test_round_and_grey_covers_get_round_and_grey_ghosts() -> None:
     for name in ("log_scales", "sh"):
         error = (getattr(opened, name) - getattr(cover, name)).abs()
         assert float(error.max()) < 2e-2, name
+
+
+def test_quaternions_get_lengths_of_the_cover_and_keep_their_directions() -> None:
+    stego = _stego()
+    stego = replace(stego, quats=torch.cat([stego.quats[:1000], 3 * stego.quats[1000:]]))
+    changed = with_lengths_of_the_cover(stego, BAND)
+    lengths = changed.quats.norm(dim=1)
+    torch.testing.assert_close(lengths[1000:].sort().values, stego.quats[:1000].norm(dim=1).sort().values)
+    turned = torch.nn.functional.cosine_similarity(changed.quats, stego.quats)
+    torch.testing.assert_close(turned, torch.ones(2000))
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        assert torch.equal(getattr(changed, name), getattr(stego, name))

@@ -56,6 +56,21 @@ def test_with_a_sidecar_they_show_the_secret_without_a_key(
     assert _gain(*pair, sidecar=True) > 20
 
 
+def test_what_is_transparent_in_the_cover_is_scrambled_or_left_out(
+    pair: tuple[list[Scene], list[Gaussians]],
+) -> None:
+    """Gaussians that left their band in training would lie where the secret is, for everybody to see."""
+    scenes, models = pair
+    rates = replace(CONFIG.fit, iterations=40, max_gaussians=2000, opacities_rate=2.0)
+    hidden = hide_scenes(scenes, ["a key"], replace(CONFIG, fit=rates), plains=models)
+    scramble = hidden.secrets[0].scramble
+    assert scramble is not None
+    logits = hidden.stego.opacity_logits
+    scrambled = (logits > scramble.band[0]) & (logits < scramble.band[1])
+    assert 0 < int(scrambled.sum()) <= 200
+    assert (scrambled | (hidden.stego.opacities >= 1 / 255)).all()
+
+
 def test_carrying_has_no_ghosts() -> None:
     cover, secret = random_gaussians(1500, seed=0), random_gaussians(200, seed=2)
     carried = keyss.hide(cover, [keyss.Secret(secret, "a key")], method="carry").stego

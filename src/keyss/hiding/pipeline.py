@@ -23,7 +23,14 @@ from keyss.hiding.config import HideConfig
 from keyss.hiding.decoder import Decoder
 from keyss.hiding.joint import JointRun, decoder_shape
 from keyss.hiding.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
-from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, LEAST_OPACITY, Scramble
+from keyss.hiding.scramble import (
+    CHANNELS,
+    KEY_BYTES,
+    KNOTS,
+    LEAST_OPACITY,
+    Scramble,
+    with_lengths_of_the_cover,
+)
 from keyss.hiding.targets import PlacedScene
 from keyss.seal import DerivedKey, KeyDerivation, embed, seal_sidecar
 from keyss.seal.keys import SALT_BYTES
@@ -124,6 +131,8 @@ def hide_scenes(
     scrambles: list[Scramble | None] = [None] * len(keys)
     if run.warm and not sidecar:  # a sidecar is for files that will be rounded, which no scramble survives
         for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
+            if config.decoder == "curve":  # a network would see the difference
+                stego = with_lengths_of_the_cover(stego, decoder.band)
             scramble = Scramble.of(stego, key.expand("scramble", KEY_BYTES), decoder.band)
             stego, scrambles[index] = scramble.close(stego), scramble
     anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))

@@ -105,6 +105,22 @@ class Scramble:
         return shifts
 
 
+def with_lengths_of_the_cover(stego: Gaussians, band: tuple[float, float]) -> Gaussians:
+    """`stego` with quaternions in `band` as long as those of visible Gaussians, the n-th longest as their n-th.
+
+    A length changes nothing that is drawn, but training leaves other ones in another scene.
+    """
+    hidden, visible = _inside(stego, band), stego.opacities >= LEAST_OPACITY
+    if not hidden.any() or not visible.any():
+        return stego
+    lengths = stego.quats.norm(dim=1)
+    own, shown = lengths[hidden], lengths[visible].sort().values
+    ranks = own.argsort().argsort() * (len(shown) - 1) // max(len(own) - 1, 1)
+    quats = stego.quats.clone()
+    quats[hidden] *= (shown[ranks] / own.clamp_min(1e-12))[:, None]
+    return replace(stego, quats=quats)
+
+
 def _inside(stego: Gaussians, band: tuple[float, float]) -> torch.Tensor:
     return (stego.opacity_logits > band[0]) & (stego.opacity_logits < band[1])
 
