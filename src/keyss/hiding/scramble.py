@@ -106,7 +106,7 @@ class Scramble:
 
 
 def with_lengths_of_the_cover(stego: Gaussians, band: tuple[float, float]) -> Gaussians:
-    """`stego` with quaternions in `band` as long as those of visible Gaussians, the n-th longest as their n-th.
+    """`stego` with quaternions in `band` as long as those of visible Gaussians: the n-th longest as theirs.
 
     A length changes nothing that is drawn, but training leaves other ones in another scene.
     """
