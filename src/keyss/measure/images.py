@@ -56,17 +56,21 @@ def compare_images(
             f"without a partner: {', '.join(alone[:5])}{', ...' if len(alone) > 5 else ''}"
         )
     optional: dict[str, Callable[[Tensor, Tensor], float]] = {}
-    optional |= {"lpips_alex": lpips_alex} if lpips else {}
-    optional |= {"flip": _flip} if flip else {}
-    views, missing = [], {}
+    if lpips:
+        optional["lpips_alex"] = lpips_alex
+    if flip:
+        optional["flip"] = _flip
+    views: list[dict[str, Any]] = []
+    missing: dict[str, str] = {}
     for name in sorted(ours):
         a, b = _unit_range(name, ours[name], theirs[name])
-        view: dict[str, Any] = {"name": name, "psnr": psnr(a, b), **_ssim(a.numpy(), b.numpy())}
+        view = {"name": name, "psnr": psnr(a, b), **_ssim(a.numpy(), b.numpy())}
         for measure, function in optional.items():
-            try:
-                view[measure] = function(a, b)
-            except KeyssError as error:
-                missing[measure] = str(error)
+            if measure not in missing:
+                try:
+                    view[measure] = function(a, b)
+                except KeyssError as error:
+                    missing[measure] = str(error)
         views.append(view)
     views = [{key: value for key, value in view.items() if key not in missing} for view in views]
     mean = {key: fmean(view[key] for view in views) for key in views[0] if key != "name"}

@@ -1,4 +1,4 @@
-"""3D-Sinkhorn as published (KeySS, section 3.3 and supplement B): a measure to be comparable by.
+"""3D-Sinkhorn as published (KeySS, section 3.3): a measure to be comparable by.
 
 It is blind to most changes. A norm says nothing of direction, and dividing each model by its own maximum
 cancels any common factor: doubled scales, turned Gaussians or colours with red and blue exchanged give
@@ -22,7 +22,7 @@ Doubles = npt.NDArray[np.float64]
 
 
 def sinkhorn_3d(original: Gaussians, other: Gaussians) -> dict[str, float]:
-    """Sinkhorn distances of five histograms, in [0, 1]; their `sum` (KeySS, eq. 8) and their `mean`.
+    """Sinkhorn distances of five histograms, in [0, 1]; their `sum` (KeySS, eq. 9) and their `mean`.
 
     The histograms, of 100 bins, are of opacities and of the lengths of scales (as standard deviations), raw
     quaternions, positions and constant colour coefficients, each model's divided by its own maximum. The
@@ -40,7 +40,7 @@ def sinkhorn_3d(original: Gaussians, other: Gaussians) -> dict[str, float]:
 
 
 def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> float:
-    """The paper's one number for fidelity and stealth, the greater the better (KeySS, eq. 9).
+    """The paper's one number for fidelity and stealth, the greater the better (KeySS, eq. 10).
 
     `distance` is the `sum` of `sinkhorn_3d`; PSNRs in dB.
     """
