@@ -108,10 +108,11 @@ def decoder_attacks(
     """
 
     def search(model: Gaussians) -> Shown:
+        decoder = secret.decoder.to(model.device)
         found = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
             found[name] = search_embeddings(
-                secret.decoder,
+                decoder,
                 model,
                 restarts=restarts,
                 steps=steps,
