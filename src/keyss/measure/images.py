@@ -130,6 +130,6 @@ def _flip(a: Tensor, b: Tensor) -> float:
     try:
         flip = import_module("flip_evaluator")
     except ImportError as error:
-        raise BackendError("FLIP needs the package flip-evaluator: pip install flip-evaluator") from error
+        raise BackendError("FLIP needs the package flip-evaluator: pip install 'keyss[metrics]'") from error
     pair = a.float().numpy(), b.float().numpy()
     return float(flip.evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
