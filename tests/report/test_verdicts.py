@@ -157,3 +157,27 @@ def test_the_headline() -> None:
         "8 of 10 measures are within their limits. Visible: attributes of the Gaussians. "
         "Missed: secret 2 on test photos."
     )
+
+
+def test_fog_and_shapes_are_told_apart() -> None:
+    data = audit()
+    assert "the secret's shapes in them" not in judged(data)  # an audit without these scores
+    leak = data["leaks"][0][0]["leak"]
+    leak |= {"psnr": 4.0, "psnr_fitted": 0.3, "ssim_fitted": 0.01, "gradient_coarse": 0.02}
+    lines = judged(data)
+    assert lines["leaks without the key"].word == "visible"
+    assert lines["the secret's shapes in them"].word == "fine"
+    for score in ("psnr_fitted", "ssim_fitted", "gradient_coarse"):
+        before = leak[score]
+        leak[score] = 2.0
+        assert judged(data)["the secret's shapes in them"].word == "visible"
+        leak[score] = before
+
+
+def test_a_detector_is_judged_beside_what_it_finds_between_plain_models() -> None:
+    data = audit()
+    data["sealwatch"] = {"spam": {"roc": {"auc": 0.73, "low": 0.68, "high": 0.78}}}
+    assert judged(data)["sealwatch on renders"].word == "visible"
+    data["sealwatch_null"] = {"spam": {"roc": {"auc": 0.70, "low": 0.65, "high": 0.75}}}
+    line = judged(data)["sealwatch on renders"]
+    assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")

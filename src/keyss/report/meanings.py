@@ -36,7 +36,10 @@ WRONG_KEYS = Meaning(
 LEAKS = Meaning(
     "Somebody who knows this program but not the key changes the published file until something shows, "
     "and holds that against the secret's photos. Below each number stands how much better that is than "
-    "the same done to a plain model of the cover: about 0 means that nothing of the secret was seen.",
+    "the same done to a plain model of the cover: about 0 means that nothing of the secret was seen. "
+    "PSNR and SSIM also count fog: a bright cloud is nearer to most photos than darkness. What tells the "
+    "secret's shapes are the correlation of gradients, and PSNR and SSIM after the best fit of colours. In "
+    "the pictures: the attack on the published file, the same on a plain model, the photo.",
     "These are the attacks that were thought of; they do not prove that there are no others.",
 )
 DISTANCES = Meaning(

@@ -20,6 +20,7 @@ TWO_SAMPLE_AUC = 0.6  # of a classifier that tells the Gaussians of two models a
 IMAGE_AUC = 0.1  # distance from 0.5 of a detector's AUC on renders
 LEAK_PSNR = 1.0  # dB nearer to the secret's photos than an innocent model comes
 LEAK_SSIM = 0.05
+LEAK_GRADIENT = 0.1  # correlation of coarse gradients with the photos', above an innocent model's
 PRUNING, PRUNED = "random pruning", 0.25  # the share of the Gaussians that is removed ...
 PRUNING_LOSS = 1.5  # ... and the dB that it may cost the secret more than the cover
 
@@ -48,6 +49,7 @@ def verdicts(audit: Part) -> list[Verdict]:
         *_secrets(audit),
         _wrong_keys(audit),
         _leaks(audit),
+        _shapes(audit),
         _distances(audit),
         _two_sample(audit),
         _detectors(audit, "stegexpose"),
@@ -140,10 +142,7 @@ def _wrong_keys(audit: Part) -> Verdict | None:
 
 
 def _leaks(audit: Part) -> Verdict | None:
-    attacks = [attack for attacks in audit.lists("leaks", 500) for attack in attacks]
-    leaks = [attack.part("leak") for attack in attacks if not attack.flag("control")]
-    psnr = _largest(leaks, lambda leak: leak.number("psnr"))
-    ssim = _largest(leaks, lambda leak: leak.number("ssim"))
+    psnr, ssim = _largest_leak(audit, "psnr"), _largest_leak(audit, "ssim")
     if psnr is None or ssim is None:
         return None
     return Verdict(
@@ -154,6 +153,29 @@ def _leaks(audit: Part) -> Verdict | None:
         "fine" if psnr <= LEAK_PSNR and ssim <= LEAK_SSIM else "visible",
         "leaks",
     )
+
+
+def _shapes(audit: Part) -> Verdict | None:
+    """Fog is nearer to most photos than darkness is. What is left when colours are fitted is the secret."""
+    psnr, ssim = _largest_leak(audit, "psnr_fitted"), _largest_leak(audit, "ssim_fitted")
+    gradient = _largest_leak(audit, "gradient_coarse")
+    if psnr is None or ssim is None or gradient is None:
+        return None
+    within = psnr <= LEAK_PSNR and ssim <= LEAK_SSIM and gradient <= LEAK_GRADIENT
+    return Verdict(
+        "the secret's shapes in them",
+        f"{difference(psnr)} dB, {difference(ssim, 3)} SSIM, {difference(gradient)} gradients",
+        "0, plain model; colours fitted",
+        f"at most {decibel(LEAK_PSNR, 1)}, {LEAK_SSIM} and {LEAK_GRADIENT}",
+        "fine" if within else "visible",
+        "leaks",
+    )
+
+
+def _largest_leak(audit: Part, score: str) -> float | None:
+    attacks = [attack for attacks in audit.lists("leaks", 500) for attack in attacks]
+    leaks = [attack.part("leak") for attack in attacks if not attack.flag("control")]
+    return _largest(leaks, lambda leak: leak.number(score))
 
 
 def _distances(audit: Part) -> Verdict | None:
