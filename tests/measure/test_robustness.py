@@ -411,7 +411,7 @@ def pair() -> tuple[list[Scene], list[Gaussians]]:
 @pytest.mark.parametrize("sidecar", [False, True])
 def test_a_learned_secret_without_low_bits(sidecar: bool, pair: tuple[list[Scene], list[Gaussians]]) -> None:
     scenes, models = pair
-    config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=20, max_gaussians=2000))
+    config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=5, max_gaussians=2000))
     hidden = hide_scenes(scenes, [KEY], config, plains=models, sidecar=sidecar)
     reopen = Reopener(KEY, hidden.sidecar)
     assert KEY not in repr(reopen)
