@@ -27,7 +27,7 @@ from keyss import read_ply, write_ply
 from keyss.carry import embed, extract
 from keyss.carry.carrying import usable_carriers
 from keyss.carry.dither import cost
-from keyss.carry.filling import filled
+from keyss.core.filling import filled
 from keyss.carry.plan import Size, room
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.files.scenes import load_scene

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from keyss.carry.carrying import Carried
-from keyss.carry.filling import filled
 from keyss.core.errors import InputError, UsageError
+from keyss.core.filling import filled
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.ply import read_ply

@@ -261,7 +261,7 @@ def reveal(
     """The secret that `key` opens in a stego model, as an ordinary model; see `reveal_gaussians`.
 
     Which method hid it shows itself. A carried one was never in the cover's frame and comes in its own; if
-    Gaussians were lost, the others are enlarged to make up for them (`keyss.carry.filling`).
+    Gaussians were lost, the others are enlarged to make up for them (`keyss.core.filling`).
 
     `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
     lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that

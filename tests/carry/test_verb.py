@@ -13,10 +13,10 @@ import torch
 import keyss
 from keyss import FitConfig, Gaussians, HideConfig, Secret
 from keyss.carry.carrying import embed_derived
-from keyss.carry.filling import filled
 from keyss.carry.thinning import most_visible
 from keyss.cli import main
 from keyss.core import UsageError, WrongKeyError
+from keyss.core.filling import filled
 from keyss.files.ply import read_ply, write_ply
 from keyss.hiding.opening import open_model
 from keyss.hiding.payload import HiddenSecret, pack_secret

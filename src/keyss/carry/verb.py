@@ -22,9 +22,9 @@ from keyss.carry.carrying import (
     usable_carriers,
 )
 from keyss.carry.dither import cost, dither
-from keyss.carry.filling import filled
 from keyss.carry.plan import Size, check_degrees, room, thinned
 from keyss.carry.thinning import most_visible
+from keyss.core.filling import filled
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.output import OutputFolder

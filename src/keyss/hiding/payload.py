@@ -27,7 +27,8 @@ from keyss.hiding.mask import parse_mask
 from keyss.hiding.scramble import CHANNELS, KEY_BYTES, KNOTS, LEAST_OPACITY, Scramble
 
 FORMAT = "keyss-secret"
-VERSION = 2
+VERSION = 3
+MOST_GAUSSIANS = 2**31
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
@@ -53,18 +54,23 @@ class HiddenSecret:
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
     scramble: Scramble | None = None  # what the secret's Gaussians are published as, if not as they are
-    # [M, 4] position and opacity logit of all transparent Gaussians, for files where opacities are rounded
+    # [M, 7] position, opacity logit and constant colour of all transparent Gaussians: formats round their
+    # opacities to nothing, and some drop the colours of what is transparent.
     faint: Tensor | None = None
+    count: int = 0  # Gaussians that the secret has when it is revealed from a whole file; 0: not known
 
-    def with_faint_opacities(self, stego: Gaussians) -> Gaussians:
-        """`stego` with transparent Gaussians as opaque as the nearest in `faint`, or all nearly opaque."""
+    def with_faint(self, stego: Gaussians) -> Gaussians:
+        """`stego` with transparent Gaussians as the nearest in `faint` are, or all nearly opaque."""
         transparent = stego.opacities < LEAST_OPACITY
-        logits = torch.full_like(stego.opacity_logits[transparent], self.decoder.faint_logit)
-        if self.faint is not None:
+        opacity_logits, sh = stego.opacity_logits.clone(), stego.sh.clone()
+        if self.faint is None:
+            opacity_logits[transparent] = self.decoder.faint_logit
+        else:
             tree = cKDTree(self.faint[:, :3].double().numpy())
             _, nearest = tree.query(stego.means[transparent].cpu().double().numpy())
-            logits = self.faint[torch.from_numpy(nearest), 3].to(logits)
-        return replace(stego, opacity_logits=stego.opacity_logits.masked_scatter(transparent, logits))
+            known = self.faint[torch.from_numpy(nearest)].to(stego.device)
+            opacity_logits[transparent], sh[transparent, 0] = known[:, 3], known[:, 4:]
+        return replace(stego, opacity_logits=opacity_logits, sh=sh)
 
     @property
     def embedding(self) -> Tensor:
@@ -98,6 +104,7 @@ def pack_secret(secret: HiddenSecret) -> bytes:
         "version": VERSION,
         "shape": {**asdict(decoder.shape), "mask": ",".join(decoder.shape.mask)},
         "frame": secret.frame.to_json(),
+        "count": secret.count,
     }
     halved = {name for name, _ in decoder.named_parameters()}
     tensors = {
@@ -154,14 +161,17 @@ def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSec
     if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
         raise InputError(f"anchors: expected up to {ANCHORS} positions, got shape {list(anchors.shape)}")
     faint = tensors.pop("faint", None)
-    if faint is not None and (faint.dim() != 2 or faint.shape[1] != 4 or len(faint) == 0):
-        raise InputError(f"faint opacities: expected rows of 4 numbers, got shape {list(faint.shape)}")
+    if faint is not None and (faint.dim() != 2 or faint.shape[1] != 7 or len(faint) == 0):
+        raise InputError(f"transparent Gaussians: expected rows of 7 numbers, got shape {list(faint.shape)}")
     decoder = Decoder(shape)
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
     if not (decoder.knots.diff() > 0).all():
         raise InputError("opacity curve: expected ascending knots")
     frame = Similarity.from_json(header["frame"])
-    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble, faint)
+    count = header["count"]
+    if type(count) is not int or not 0 <= count <= MOST_GAUSSIANS:
+        raise InputError(f"number of Gaussians: expected 0 to {MOST_GAUSSIANS:,}, got {count!r}")
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble, faint, count)
 
 
 def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -23,11 +23,11 @@ from keyss.hiding.config import HideConfig
 from keyss.hiding.decoder import Decoder
 from keyss.hiding.joint import JointRun, decoder_shape
 from keyss.hiding.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.hiding.revealing import decode, is_drawn
 from keyss.hiding.scramble import (
     CHANNELS,
     KEY_BYTES,
     KNOTS,
-    LEAST_OPACITY,
     Scramble,
     with_lengths_of_the_cover,
 )
@@ -136,14 +136,17 @@ def hide_scenes(
             scramble = Scramble.of(stego, key.expand("scramble", KEY_BYTES), decoder.band)
             stego, scrambles[index] = scramble.close(stego), scramble
     anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
-    transparent = stego[stego.opacities < LEAST_OPACITY]
+    transparent = stego[~is_drawn(stego)]
     faint = None
     if sidecar and len(transparent):
-        faint = torch.cat([transparent.means, transparent.opacity_logits[:, None]], dim=1)
-    packed = [
-        pack_secret(HiddenSecret(decoder, frame, anchors, scramble, faint))
+        columns = [transparent.means, transparent.opacity_logits[:, None], transparent.sh[:, 0]]
+        faint = torch.cat(columns, dim=1)
+    hidden = [
+        HiddenSecret(decoder, frame, anchors, scramble, faint)
         for decoder, frame, scramble in zip(decoders, frames[1:], scrambles, strict=True)
     ]
+    counts = [int(is_drawn(decode(stego, secret, secret.embedding)).sum()) for secret in hidden]
+    packed = [pack_secret(replace(secret, count=count)) for secret, count in zip(hidden, counts, strict=True)]
     sealed = None
     if sidecar:
         sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(run, derived))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.errors import WrongKeyError
+from keyss.core.filling import filled
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.reading import read_file
@@ -22,7 +23,7 @@ from keyss.seal.sidecar import open_slots, read_header
 
 Frame = Literal["secret", "cover"]
 MAX_SIDECAR_BYTES = 1 << 30
-_ROUNDED_LOGIT = -13.5  # below it an opacity was rounded to zero: those of one secret or two lie above
+_ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
 _DECOY_STRENGTH = 0.02  # standard deviation of a decoy's changes of opacity logits
 _DECOY_MOVE = 1e-4  # and of its turns (radians), shifts (of the model's size) and changes of scale
 
@@ -77,21 +78,32 @@ def reveal_gaussians(
     """The secret as a model of its own that needs no decoder and no cover, without what is never drawn.
 
     `frame`: "secret" gives it in its own frame, so that its cameras fit it; "cover" leaves it where it was
-    hidden. `force` is for models that were quantised: it skips the check that the secret belongs to this one,
-    and where opacities were rounded to zero, it takes them from the sidecar. Raises InputError for a secret
-    of another model.
+    hidden. `force` is for models that were quantised: it skips the check that the secret belongs to this one.
+    Where opacities were rounded to nothing, they are taken from the sidecar. If Gaussians were lost, the
+    others make up for them. Raises InputError for a secret of another model.
     """
     if not force:
         secret.check_belongs_to(stego)
-    elif (stego.opacity_logits < _ROUNDED_LOGIT).any():
-        stego = secret.with_faint_opacities(stego)
+    if (force or secret.faint is not None) and _is_rounded(stego):
+        stego = secret.with_faint(stego)
     decoded = decode(stego, secret, secret.embedding)
-    drawn = decoded.opacities >= LEAST_OPACITY
-    if drawn.any():
+    if (drawn := is_drawn(decoded)).any():
         decoded = decoded[drawn]
+    decoded = filled(decoded, secret.count)
     if frame == "cover":
         return decoded
     return secret.frame.inverse().apply_gaussians(decoded.to("cpu"))
+
+
+def is_drawn(gaussians: Gaussians) -> Tensor:
+    """[N] which Gaussians are opaque enough to be drawn at all."""
+    return gaussians.opacities >= LEAST_OPACITY
+
+
+def _is_rounded(stego: Gaussians) -> bool:
+    """Whether the opacities of transparent Gaussians are so few that a format must have rounded them."""
+    logits = stego.opacity_logits[~is_drawn(stego)]
+    return len(logits.unique()) < _ROUNDED_SHARE * len(logits)
 
 
 @torch.no_grad()

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from keyss.carry.carrying import Carried
-from keyss.carry.filling import filled
 from keyss.core.errors import InputError
+from keyss.core.filling import filled
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.hiding.opening import open_model
@@ -44,8 +44,8 @@ class Reopener:
             secret = open_secret(stego, self.key, self.sidecar)
         if isinstance(secret, Carried):
             return Opened(filled(secret.gaussians, secret.count))
-        try:  # where the sidecar knows all opacities, force repairs rounded ones and changes no others
-            revealed = reveal_gaussians(stego, secret, force=secret.faint is not None)
+        try:
+            revealed = reveal_gaussians(stego, secret)
         except InputError:  # positions changed, so that it seems to be another model
             revealed = reveal_gaussians(stego, secret, force=True)
         return Opened(revealed, secret.frame)
