@@ -192,7 +192,7 @@ def hide(
             METRICS: json_writer(metrics),
         }
         for name, source in zip(plain_names(len(secrets)), sources, strict=True):
-            if source.fitted:
+            if source.scene is not None:  # else it is the .ply that was given
                 writers[name] = ply_writer(source.gaussians)
         plain.folder.fill(writers)
     return result.stego, metrics
