@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -15,12 +16,14 @@ from keyss.audit import parts
 from keyss.audit.progress import Found, Steps
 from keyss.audit.run import audit
 from keyss.audit.subject import Subject
+from keyss.cli import main
+from keyss.cli.measuring import PartName
 from keyss.core import InputError, OutputError, UsageError, WrongKeyError
 from keyss.fitting.loop import Interrupted
 from test_verbs import CONFIG, write_nerfstudio
 from tiny_scenes import tiny_scene
 
-KEY = "the key"
+KEY = "open sesame 4711"
 
 
 @pytest.fixture(scope="module")
@@ -119,3 +122,33 @@ def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
 
 def test_every_part_has_a_sentence() -> None:
     assert all((part.__doc__ or "").strip() for part in parts.PARTS.values())
+
+
+def test_the_command_runs_the_real_parts_and_writes_the_report(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All parts but robustness, whose changes have tests of their own and take longer."""
+    (tmp_path / "key").write_text(KEY)
+    chosen = [name for name in parts.PARTS if name != "robustness"]
+    flags = [word for name in chosen for word in ("--only", name)]
+    arguments = ["audit", str(run), "--key-file", str(tmp_path / "key"), "--null", "2", *flags]
+    assert main(arguments) == 0
+    assert "classifier between models" in capsys.readouterr().out
+    found = json.loads((run / "audit" / "audit.json").read_text())
+    assert set(found["distances"]["attributes"]) >= {"position", "scale", "rotation", "opacity", "joint"}
+    assert len(found["two_sample"]["stego"]) == 2
+    assert len(found["two_sample"]["null"]) == 1
+    assert [row["attack"] for row in found["leaks"][0] if row["control"]] == ["with the key"]
+    pictures = {item["file"] for group in found["pictures"] for item in group["items"]}
+    pictures |= {row["picture"] for row in found["leaks"][0]}
+    assert all((run / "audit" / name).is_file() for name in pictures)
+    page = (run / "report.html").read_text()
+    assert "data:image/png" in page
+    assert KEY not in page
+    (run / "report.html").unlink()
+    assert main(["report", str(run)]) == 0
+    assert (run / "report.html").read_text() == page
+
+
+def test_the_command_names_its_parts_as_the_audit_does() -> None:
+    assert get_args(PartName) == tuple(parts.PARTS)
