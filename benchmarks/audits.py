@@ -64,7 +64,8 @@ def _rows(audits: list[Audit]) -> list[str]:
         "reveal, s": lambda a: f"{a['speed']['reveal_seconds']:.1f}",
         "audit, min": lambda a: f"{a['seconds'] / 60:.1f}",
     }
-    return [_line([name, *(_try(row, audit) for audit in audits)]) for name, row in rows.items()]
+    cells = [[name, *(_try(row, audit) for audit in audits)] for name, row in rows.items()]
+    return [_line(row) for row in cells if any(row[1:])]
 
 
 def _quality(found: Audit, bound: Audit | None) -> str:

@@ -27,9 +27,9 @@ from keyss import read_ply, write_ply
 from keyss.carry import embed, extract
 from keyss.carry.carrying import usable_carriers
 from keyss.carry.dither import cost
-from keyss.core.filling import filled
 from keyss.carry.plan import Size, room
 from keyss.core import Gaussians, KeyssError, Scene
+from keyss.core.filling import filled
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.rendering import render

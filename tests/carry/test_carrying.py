@@ -361,3 +361,19 @@ def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
     for camera in ring_cameras(4):
         error = (render(model, camera) - render(stego, camera)).square().mean()
         assert -10 * torch.log10(error) > 70
+
+
+def test_strangers_in_the_places_of_the_first_salts_do_not_lock_out_the_key(
+    stego: Gaussians, secret: Gaussians
+) -> None:
+    """Three added Gaussians come before all of the model's own in the order of salts."""
+    first = Carriers.of(stego).salts()[0]
+    strangers = trained_like(40_000, seed=9)
+    names = [row.tobytes() for row in Carriers.of(strangers).names]
+    before = sorted((name, index) for index, name in enumerate(names) if name < first)[:3]
+    assert len(before) == 3
+    added = strangers[torch.tensor([index for _, index in before])]
+    crowded = Gaussians.cat([added, stego])
+    assert first not in Carriers.of(crowded).salts()[:3]
+    assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
+    assert len(extract(crowded, KEY).gaussians) == len(secret)

@@ -53,7 +53,7 @@ from keyss.seal.plan import COPIES, SALTS
 
 VERSION = 1
 LEAST_USABLE = 0.5  # share of the cover's Gaussians that must have random low bits
-SALTS_TRIED = 2
+SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
 _PREFIX = struct.Struct("<BBI")
 
 Bytes = npt.NDArray[np.uint8]
@@ -173,8 +173,8 @@ def extract(stego: Gaussians, key: str) -> Carried:
     """The model that `key` opens in `stego`.
 
     Raises WrongKeyError when it opens nothing, and InputError when too much was removed to read the rest.
-    If the first salt opens nothing a second one is tried: a single changed or added Gaussian may have taken
-    the first one's place, and must not lock out the key.
+    If the first salt opens nothing others are tried, SALTS_TRIED in all: changed or added Gaussians may have
+    taken the first ones' places, and should not lock out the key.
     """
     carriers = Carriers.of(stego)
     for identity in carriers.salts()[:SALTS_TRIED]:

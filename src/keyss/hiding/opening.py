@@ -17,10 +17,11 @@ from keyss.seal.keys import DerivedKey
 def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Carried | HiddenSecret:
     """What `key` opens in `stego`.
 
-    One key derivation serves both methods, and both are always tried. If nothing opens, a second salt is
-    tried, so that a single changed or added Gaussian cannot lock out the key; with `decoy` there is none, for
-    it would take a wrong key longer than a right one, and a wrong key gets a `decoy_secret`. Otherwise raises
-    WrongKeyError when nothing opens. Raises InputError when what is there is damaged.
+    One key derivation serves both methods, and both are always tried. If nothing opens, other salts are
+    tried, SALTS_TRIED in all, so that changed or added Gaussians rarely lock out the key; with `decoy` there
+    is one only, for others would take a wrong key longer than a right one, and a wrong key gets a
+    `decoy_secret`. Otherwise raises WrongKeyError when nothing opens. Raises InputError when what is there
+    is damaged.
     """
     carriers = Carriers.of(stego)
     names = [row.tobytes() for row in carriers.names]
