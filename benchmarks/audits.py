@@ -46,7 +46,7 @@ def _rows(audits: list[Audit]) -> list[str]:
         "wrong keys against the cover, mean": _wrong_keys,
         "3D-Sinkhorn as published, sum (null)": _sinkhorn,
         **{
-            f"distance from plain models over null: {name}": lambda a, name=name: _ratio(a, name)  # type: ignore[misc]
+            f"distance over null: {name} (the plain model's)": lambda a, name=name: _ratio(a, name)  # type: ignore[misc]
             for name in ("position", "scale", "rotation", "opacity", "colour", "harmonics", "joint")
         },
         "classifier, AUC (null)": _classifier,
@@ -59,7 +59,9 @@ def _rows(audits: list[Audit]) -> list[str]:
         "the same after the best fit of colours, SSIM": lambda a: _leak(a, "ssim_fitted", 3),
         "largest leak above null, correlation of gradients": lambda a: _leak(a, "gradient", 3),
         "25 % removed at random: cover, secret": _pruned,
-        "secret dies sooner than the cover under": _sooner,
+        "secret dies later than the cover, or neither": lambda a: _fates(a, ("later", "neither")),
+        "together": lambda a: _fates(a, ("together",)),
+        "secret dies sooner": lambda a: _fates(a, ("sooner",)),
         "rendering, over plain: published, revealed": _rendering,
         "reveal, s": lambda a: f"{a['speed']['reveal_seconds']:.1f}",
         "audit, min": lambda a: f"{a['seconds'] / 60:.1f}",
@@ -83,7 +85,9 @@ def _sinkhorn(audit: Audit) -> str:
 
 
 def _ratio(audit: Audit, name: str) -> str:
-    return f"{audit['distances']['attributes'][name]['ratio']:.2f}"
+    found = f"{audit['distances']['attributes'][name]['ratio']:.2f}"
+    original = audit["distances"].get("original")
+    return f"{found} ({original[name]['ratio']:.2f})" if original else found
 
 
 def _classifier(audit: Audit) -> str:
@@ -119,9 +123,8 @@ def _pruned(audit: Audit) -> str:
     return f"{losses[0]:+.2f}, {losses[1]:+.2f}"
 
 
-def _sooner(audit: Audit) -> str:
-    sooner = [each["attack"] for each in verdicts(audit["robustness"]) if each["verdict"] == "sooner"]
-    return ", ".join(sooner) or "none"
+def _fates(audit: Audit, chosen: tuple[str, ...]) -> str:
+    return ", ".join(row["attack"] for row in verdicts(audit["robustness"]) if row["verdict"] in chosen)
 
 
 def _rendering(audit: Audit) -> str:

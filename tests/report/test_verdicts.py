@@ -181,3 +181,14 @@ def test_a_detector_is_judged_beside_what_it_finds_between_plain_models() -> Non
     data["sealwatch_null"] = {"spam": {"roc": {"auc": 0.70, "low": 0.65, "high": 0.75}}}
     line = judged(data)["sealwatch on renders"]
     assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")
+
+
+def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model() -> None:
+    data = audit()
+    data["distances"] = {"attributes": {"scale": {"ratio": 1.9}, "opacity": {"ratio": 1.4}}}
+    assert judged(data)["attributes of the Gaussians"].word == "visible"
+    data["distances"]["original"] = {"scale": {"ratio": 1.9}, "opacity": {"ratio": 1.0}}
+    assert judged(data)["attributes of the Gaussians"].word == "fine"
+    data["distances"]["attributes"]["opacity"]["ratio"] = 1.6
+    line = judged(data)["attributes of the Gaussians"]
+    assert (line.word, line.value) == ("visible", "opacity 1.6×")

@@ -81,6 +81,8 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
     }
     steps(1, 4)
     distances = against_null(subject.stego, nulls, seed=seed)
+    # One plain model may lie further from others than these from each other: where does the cover's own lie?
+    distances["original"] = against_null(subject.original, nulls, seed=seed)["attributes"]
     steps(2, 4)
     two_sample = two_sample_against_null(subject.stego, nulls, seed=seed)
     steps(3, 4)
