@@ -191,4 +191,4 @@ def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model() -> 
     assert judged(data)["attributes of the Gaussians"].word == "fine"
     data["distances"]["attributes"]["opacity"]["ratio"] = 1.6
     line = judged(data)["attributes of the Gaussians"]
-    assert (line.word, line.value) == ("visible", "opacity 1.6×")
+    assert (line.word, line.value) == ("visible", "opacity 1.60×")
