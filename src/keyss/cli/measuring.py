@@ -72,7 +72,11 @@ def audit(
     ] = 3,
     only: Annotated[
         UseAppendAction[tuple[PartName, ...]],
-        optional("PART", "A part of the audit, once for each.", "all of them"),
+        optional(
+            "PART",
+            "A part: images, parameters, stegexpose, leaks, robustness or speed; once for each.",
+            "all of them",
+        ),
     ] = (),
     resume: Resume = False,
     overwrite: Overwrite = False,
