@@ -124,7 +124,14 @@ def _pruned(audit: Audit) -> str:
 
 
 def _fates(audit: Audit, chosen: tuple[str, ...]) -> str:
-    return ", ".join(row["attack"] for row in verdicts(audit["robustness"]) if row["verdict"] in chosen)
+    """Attacks with one of these verdicts; what begins alike is named together."""
+    names = [row["attack"] for row in verdicts(audit["robustness"]) if row["verdict"] in chosen]
+    parts = []
+    for start in ("noise on ", "conversion to "):
+        own = [name.removeprefix(start) for name in names if name.startswith(start)]
+        names = [name for name in names if not name.startswith(start)]
+        parts += [start + ", ".join(own)] if own else []
+    return "; ".join(names + parts)
 
 
 def _rendering(audit: Audit) -> str:
