@@ -11,7 +11,6 @@ follow code by Binghamton University's DDE Lab that is for education, research a
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
@@ -67,11 +66,9 @@ def sealwatch_roc(
 
 def _sealwatch() -> Any:
     try:
+        import_module("torchvision")  # first: half a sealwatch in memory would spoil another try
         return import_module("sealwatch")
     except (ImportError, OSError, RuntimeError) as error:  # RuntimeError: a torchvision for another torch
-        # Its modules that did load hold on to those that did not, and would spoil another try.
-        for name in [name for name in sys.modules if name.partition(".")[0] == "sealwatch"]:
-            del sys.modules[name]
         raise BackendError(
             "these detectors need the package sealwatch and the torchvision that belongs to this torch "
             f"(pip install 'keyss[steganalysis]'): {error}"
