@@ -9,7 +9,10 @@ import pytest
 
 import keyss
 from keyss import FitConfig, HideConfig, Secret
+from keyss.audit import audit
 from keyss.cli import main
+from keyss.report.reading import read_audit
+from keyss.report.verdicts import verdicts
 
 pytestmark = pytest.mark.slow
 CONFIG = HideConfig(fit=FitConfig(max_gaussians=20_000))
@@ -32,6 +35,32 @@ def test_bonsai_hides_fox_within_the_promised_losses(run: Path) -> None:
     assert metrics["secrets"][0]["psnr"] > bound["secrets"][0]["psnr"] - 0.8
     assert wrong["vs_cover"]["mean"] > metrics["cover"]["psnr"] - 0.1
     assert wrong["vs_secrets"][0]["max"] < wrong["floor"][0] + 0.3
+
+
+def test_an_audit_finds_nothing_of_the_fox(run: Path) -> None:
+    audit(run, ["a key for a fox"], null=2, only=["leaks", "robustness"])
+    words = {line.measure: line.word for line in verdicts(read_audit(run))}
+    assert words["the secret's shapes in them"] == "fine"
+    assert words["loss of a random 25% of the Gaussians"] == "fine"
+
+
+def test_a_carried_fox_is_not_to_be_told_from_none(run: Path, real_data: Path, tmp_path: Path) -> None:
+    plain = [run / "private" / name for name in ("cover.ply", "secret-1.ply")]
+    secret = Secret(real_data / "fox", "a key for a fox", plain[1])
+    out = tmp_path / "carried"
+    keyss.hide(
+        real_data / "bonsai",
+        [secret],
+        method="carry",
+        config=CONFIG,
+        width=200,
+        cover_model=plain[0],
+        out=out,
+    )
+    audit(out, ["a key for a fox"], null=2, only=["parameters", "leaks"])
+    words = {line.measure: line.word for line in verdicts(read_audit(out))}
+    for measure in ("attributes of the Gaussians", "classifier between models", "leaks without the key"):
+        assert words[measure] == "fine"
 
 
 @pytest.mark.xfail(
