@@ -45,6 +45,7 @@ def _rows(audits: list[Audit]) -> list[str]:
         "secret, dB (loss)": lambda a: _quality(a["images"]["secrets"][0], a["images"]["secret_bounds"][0]),
         "wrong keys against the cover, mean": _wrong_keys,
         "3D-Sinkhorn as published, sum (null)": _sinkhorn,
+        "composite score (eq. 10)": lambda a: f"{a['sinkhorn']['score']:.1f}",
         **{
             f"distance over null: {name} (the plain model's)": lambda a, name=name: _ratio(a, name)  # type: ignore[misc]
             for name in ("position", "scale", "rotation", "opacity", "colour", "harmonics", "joint")

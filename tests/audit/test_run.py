@@ -137,6 +137,9 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     found = json.loads((run / "audit" / "audit.json").read_text())
     assert set(found["distances"]["attributes"]) >= {"position", "scale", "rotation", "opacity", "joint"}
     assert len(found["two_sample"]["stego"]) == 2
+    metrics, sinkhorn = json.loads((run / "metrics.json").read_text()), found["sinkhorn"]
+    psnrs = metrics["cover"]["psnr"] + metrics["secrets"][0]["psnr"]
+    assert sinkhorn["score"] == pytest.approx(psnrs * (1 - sinkhorn["stego"]["sum"]))
     assert len(found["two_sample"]["null"]) == 1
     assert [row["attack"] for row in found["leaks"][0] if row["control"]] == ["with the key"]
     pictures = {item["file"] for group in found["pictures"] for item in group["items"]}

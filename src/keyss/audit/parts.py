@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -24,7 +25,7 @@ from keyss.measure.robustness import robustness as survival
 from keyss.measure.robustness import verdicts
 from keyss.measure.roc import stegexpose_roc
 from keyss.measure.sealwatch_detectors import sealwatch_roc
-from keyss.measure.sinkhorn import sinkhorn_3d
+from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.two_sample import two_sample_against_null
 from keyss.rendering import render
@@ -75,10 +76,12 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
     """Distances of the parameters from a plain model's: as published, and such as see something."""
     nulls = subject.nulls
     steps(0, 4)
-    published = {
+    published: dict[str, Any] = {
         "stego": sinkhorn_3d(subject.original, subject.stego),
         "null": [sinkhorn_3d(subject.original, plain) for plain in nulls],
     }
+    if (score := _score(subject, published["stego"]["sum"])) is not None:
+        published["score"] = score
     steps(1, 4)
     distances = against_null(subject.stego, nulls, seed=seed)
     # One plain model may lie further from others than these from each other: where does the cover's own lie?
@@ -193,6 +196,15 @@ def speed(subject: Subject, seed: int, steps: Steps) -> Found:
 PARTS: dict[str, Part] = {
     part.__name__: part for part in (images, parameters, stegexpose, leaks, robustness, speed)
 }
+
+
+def _score(subject: Subject, distance: float) -> float | None:
+    """The paper's composite score (eq. 10) of the cover and the mean secret, where there are photos."""
+    cover, secrets = subject.run.metrics.get("cover"), subject.run.metrics.get("secrets") or []
+    found = [each["psnr"] for each in secrets if "psnr" in each]
+    if not cover or not found:
+        return None
+    return composite_score(cover["psnr"], fmean(found), distance)
 
 
 def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> Images:

@@ -162,6 +162,8 @@ def sinkhorn_table(sinkhorn: Part) -> Html | None:
         (name, number(stego.number(name), 4), _mean_and_range([each.number(name) for each in null], 4))
         for name in names
     ]
+    if (score := sinkhorn.number("score")) is not None:
+        rows.append(("composite score (eq. 10)", number(score, 2), NOTHING))
     return (
         table("Distances; of the null, mean and range", ("", "published model", "plain models (null)"), rows)
         if rows
