@@ -158,7 +158,7 @@ def sinkhorn_table(sinkhorn: Part) -> Html | None:
     names = [
         n for n in ("opacity", "rotation", "scale", "position", "colour", "mean", "sum") if n in stego.entries
     ]
-    rows = [
+    rows: list[tuple[str, str, str]] = [
         (name, number(stego.number(name), 4), _mean_and_range([each.number(name) for each in null], 4))
         for name in names
     ]
