@@ -41,6 +41,7 @@ _LEAK_SCORES = {
     "ssim": ("SSIM", 3),
     "ssim_fitted": ("SSIM, colours fitted", 3),
     "gradient": ("gradients", 3),
+    "gradient_coarse": ("coarse gradients", 3),
 }
 
 
