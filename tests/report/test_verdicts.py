@@ -192,3 +192,21 @@ def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model() -> 
     data["distances"]["attributes"]["opacity"]["ratio"] = 1.6
     line = judged(data)["attributes of the Gaussians"]
     assert (line.word, line.value) == ("visible", "opacity 1.60×")
+
+
+def test_a_classifier_may_tell_as_much_as_of_the_covers_plain_model() -> None:
+    data = audit()
+    data["two_sample"] = {"stego": [{"auc": 0.9}], "null": [{"auc": 0.6}]}
+    assert judged(data)["classifier between models"].word == "visible"
+    data["two_sample"]["original"] = [{"auc": 0.9}]
+    assert judged(data)["classifier between models"].word == "fine"
+    data["two_sample"]["original"] = [{"auc": 0.88}]
+    assert judged(data)["classifier between models"].word == "visible"
+
+
+def test_what_nobody_sees_is_fine_however_perfect_the_bound() -> None:
+    data = audit()
+    data["images"]["cover_bound"]["mean"]["psnr"] = 120.0
+    for psnr, word in ((45.1, "fine"), (44.9, "visible")):
+        data["images"]["cover"]["mean"]["psnr"] = psnr
+        assert judged(data)["cover on test photos"].word == word

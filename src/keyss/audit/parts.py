@@ -87,13 +87,19 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
     # One plain model may lie further from others than these from each other: where does the cover's own lie?
     distances["original"] = against_null(subject.original, nulls, seed=seed)["attributes"]
     steps(2, 4)
-    two_sample = two_sample_against_null(subject.stego, nulls, seed=seed)
+    two_sample, own = (
+        two_sample_against_null(model, nulls, seed=seed) for model in (subject.stego, subject.original)
+    )
     steps(3, 4)
     return Found(
         {
             "sinkhorn": published,
             "distances": distances,
-            "two_sample": {"stego": two_sample["against_plain"], "null": two_sample["between_plain"]},
+            "two_sample": {
+                "stego": two_sample["against_plain"],
+                "null": two_sample["between_plain"],
+                "original": own["against_plain"],
+            },
             "histograms": histograms(subject.stego, nulls),
         }
     )

@@ -15,8 +15,10 @@ from keyss.report.reading import Part
 from keyss.report.survival import survivals
 
 QUALITY_LOSS = 1.0  # dB that cover or secret may be below plain 3DGS of the same photos
+INVISIBLE = 45.0  # dB from which on nobody sees a difference: models that are their own bound have 120
 DISTANCE_RATIO = 1.5  # of a distance from a plain model, to the one between two plain models
 TWO_SAMPLE_AUC = 0.6  # of a classifier that tells the Gaussians of two models apart
+AS_THE_PLAIN_MODEL = 0.01  # more than that of the cover's own plain model an AUC may be
 IMAGE_AUC = 0.1  # distance from 0.5 of a detector's AUC on renders
 LEAK_PSNR = 1.0  # dB nearer to the secret's photos than an innocent model comes
 LEAK_SSIM = 0.05
@@ -116,7 +118,7 @@ def _quality(measure: str, found: Part, bound: Part, otherwise: Word) -> Verdict
         decibel(got),
         f"{decibel(limit)}, plain 3DGS",
         f"at most {decibel(QUALITY_LOSS, 1)} less",
-        "fine" if got >= limit - QUALITY_LOSS else otherwise,
+        "fine" if got >= min(limit - QUALITY_LOSS, INVISIBLE) else otherwise,
         "images",
     )
 
@@ -205,12 +207,16 @@ def _two_sample(audit: Part) -> Verdict | None:
     null = _largest(part.parts("null", 1000), lambda each: each.number("auc"))
     if stego is None:
         return None
+    own = _largest(part.parts("original", 1000), lambda each: each.number("auc"))
+    beside = [] if null is None else [f"{number(null, 2)}, between plain models"]
+    beside += [] if own is None else [f"the cover's plain model {number(own, 2)}"]
+    within = stego <= max(TWO_SAMPLE_AUC, 0.0 if own is None else own + AS_THE_PLAIN_MODEL)
     return Verdict(
         "classifier between models",
         f"AUC {number(stego, 2)}",
-        "" if null is None else f"{number(null, 2)}, between plain models",
-        f"at most {TWO_SAMPLE_AUC}",
-        "fine" if stego <= TWO_SAMPLE_AUC else "visible",
+        "; ".join(beside),
+        f"at most {TWO_SAMPLE_AUC}" + ("" if own is None else ", or as the plain model's"),
+        "fine" if within else "visible",
         "statistics",
     )
 
