@@ -16,7 +16,6 @@ from typing import Any
 
 from keyss.files.atomic import write_bytes
 from keyss.measure import composite_score
-from keyss.measure.robustness import verdicts
 
 BEGIN, END = "<!-- audits: begin -->", "<!-- audits: end -->"
 Audit = dict[str, Any]
@@ -133,7 +132,7 @@ def _pruned(audit: Audit) -> str:
 
 def _fates(audit: Audit, chosen: tuple[str, ...]) -> str:
     """Attacks with one of these verdicts; what begins alike is named together."""
-    names = [row["attack"] for row in verdicts(audit["robustness"]) if row["verdict"] in chosen]
+    names = [row["attack"] for row in audit["survival"] if row["verdict"] in chosen]
     parts = []
     for start in ("noise on ", "conversion to "):
         own = [name.removeprefix(start) for name in names if name.startswith(start)]

@@ -22,8 +22,8 @@ def histograms(stego: Gaussians, plains: Sequence[Gaussians]) -> dict[str, Any]:
     quantities = [_quantities(model) for model in (stego, *plains)]
     for name in quantities[0]:
         values = [each[name].detach().cpu().double().nan_to_num() for each in quantities]
-        together = torch.cat(values)
-        low, high = (float(torch.as_tensor(together.sort().values[i])) for i in _ranks(len(together)))
+        together = torch.cat(values).sort().values
+        low, high = (float(together[rank]) for rank in _ranks(len(together)))
         edges = torch.linspace(low, max(high, low + 1e-9), BINS + 1, dtype=torch.float64)
         shares = [_shares(each, edges) for each in values]
         found[name] = {"edges": edges.tolist(), "stego": shares[0], "plain": shares[1:]}

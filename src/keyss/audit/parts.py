@@ -18,7 +18,7 @@ from keyss.core.scene import Scene, View
 from keyss.files.results import STEGO, picture_name
 from keyss.fitting.image_metrics import thin
 from keyss.hiding.payload import HiddenSecret
-from keyss.measure.distances import against_null
+from keyss.measure.distances import against_null, attribute_distances
 from keyss.measure.images import compare_images
 from keyss.measure.leaks import look_for_secret
 from keyss.measure.robustness import robustness as survival
@@ -27,7 +27,7 @@ from keyss.measure.roc import stegexpose_roc
 from keyss.measure.sealwatch_detectors import sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import speed as measure_speed
-from keyss.measure.two_sample import two_sample_against_null
+from keyss.measure.two_sample import two_sample_against_null, two_sample_auc
 from keyss.rendering import render
 
 PICTURED_VIEWS = 3
@@ -85,11 +85,14 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
     steps(1, 4)
     distances = against_null(subject.stego, nulls, seed=seed)
     # One plain model may lie further from others than these from each other: where does the cover's own lie?
-    distances["original"] = against_null(subject.original, nulls, seed=seed)["attributes"]
+    own = [attribute_distances(plain, subject.original, seed=seed) for plain in nulls]
+    distances["original"] = {
+        name: {"ratio": fmean(each[name] for each in own) / found["null"]}
+        for name, found in distances["attributes"].items()
+        if found["null"]
+    }
     steps(2, 4)
-    two_sample, own = (
-        two_sample_against_null(model, nulls, seed=seed) for model in (subject.stego, subject.original)
-    )
+    two_sample = two_sample_against_null(subject.stego, nulls, seed=seed)
     steps(3, 4)
     return Found(
         {
@@ -98,7 +101,7 @@ def parameters(subject: Subject, seed: int, steps: Steps) -> Found:
             "two_sample": {
                 "stego": two_sample["against_plain"],
                 "null": two_sample["between_plain"],
-                "original": own["against_plain"],
+                "original": [two_sample_auc(plain, subject.original, seed=seed) for plain in nulls],
             },
             "histograms": histograms(subject.stego, nulls),
         }

@@ -128,7 +128,7 @@ class JointRun:
         if self.warm:
             with torch.no_grad():
                 self.parameters["opacities"].clamp_(*self.logit_limits)
-        if not self.warm:  # what a warm start chose from whole models, growth would only make worse
+        else:  # what a warm start chose from whole models, growth would only make worse
             asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
             combined = combine_densification(asking, len(self))
             self.strategy.step_post_backward(
