@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from keyss._version import __version__
@@ -31,7 +30,6 @@ from keyss.files.results import (
     bytes_writer,
     json_bytes,
     json_writer,
-    picture_name,
     plain_names,
     ply_writer,
     png_writer,
@@ -46,8 +44,8 @@ from keyss.hiding.payload import HiddenSecret
 from keyss.hiding.pipeline import hide_scenes
 from keyss.hiding.revealing import Frame
 from keyss.measure.hiding import measure_hiding
+from keyss.measure.images import renders_of
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering import render as render_image
 from keyss.runs import (
     Background,
     PathLike,
@@ -300,12 +298,7 @@ def render(
     gaussians = as_model(model).to(target)
     scene = as_scene(cameras, width, background)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
-    pictures = []
-    with torch.no_grad():
-        for view in views[split]:
-            image = render_image(gaussians, view.camera, scene.background.to(target))
-            pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
-            pictures.append((picture_name(view.camera), pixels))
+    pictures = renders_of(gaussians, scene, views[split])
     if folder is not None:
         folder.fill({name: png_writer(image) for name, image in pictures})
     return pictures

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from statistics import fmean
 from typing import Any
-
-import torch
-from torch import Tensor
 
 from keyss.audit.histograms import histograms
 from keyss.audit.progress import PICTURES, Found, Steps
 from keyss.audit.subject import Subject
 from keyss.core.errors import BackendError
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
 from keyss.files.results import STEGO, picture_name
 from keyss.fitting.image_metrics import thin
 from keyss.hiding.payload import HiddenSecret
 from keyss.measure.distances import against_null, attribute_distances
-from keyss.measure.images import compare_images
+from keyss.measure.images import compare_images, renders_of
 from keyss.measure.leaks import look_for_secret
 from keyss.measure.robustness import robustness as survival
 from keyss.measure.robustness import verdicts
@@ -28,13 +23,11 @@ from keyss.measure.sealwatch_detectors import sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.two_sample import two_sample_against_null, two_sample_auc
-from keyss.rendering import render
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64
 
 Part = Callable[[Subject, int, Steps], Found]
-Images = list[tuple[str, Tensor]]
 
 
 def images(subject: Subject, seed: int, steps: Steps) -> Found:
@@ -214,13 +207,3 @@ def _score(subject: Subject, distance: float) -> float | None:
     if not cover or not found:
         return None
     return composite_score(cover["psnr"], fmean(found), distance)
-
-
-def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> Images:
-    """Names and uint8 pictures [H, W, 3] from the cameras of the views."""
-    found = []
-    with torch.no_grad():
-        for view in views:
-            image = render(model, view.camera, scene.background.to(model.device))
-            found.append((picture_name(view.camera), (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()))
-    return found

@@ -15,9 +15,13 @@ from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from keyss.core.errors import BackendError, InputError, KeyssError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene, View
 from keyss.files.images import read_image
+from keyss.files.results import picture_name
 from keyss.fitting.image_metrics import psnr
 from keyss.measure.lpips import lpips_alex
+from keyss.rendering import render
 
 Pixels = npt.NDArray[np.uint8]
 Doubles = npt.NDArray[np.float64]
@@ -133,3 +137,13 @@ def _flip(a: Tensor, b: Tensor) -> float:
         raise BackendError("FLIP needs the package flip-evaluator: pip install 'keyss[metrics]'") from error
     pair = a.float().numpy(), b.float().numpy()
     return float(flip.evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
+
+
+@torch.no_grad()
+def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> list[tuple[str, Tensor]]:
+    """Names and uint8 pictures [H, W, 3], on the CPU, of a model from the cameras of views of a scene."""
+    background, found = scene.background.to(model.device), []
+    for view in views:
+        image = render(model, view.camera, background).clamp(0, 1)
+        found.append((picture_name(view.camera), (image * 255).round().to(torch.uint8).cpu()))
+    return found
