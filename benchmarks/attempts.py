@@ -23,15 +23,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import torch
 
 import keyss
+from channels.low_bits.trained_like import trained_like
+from keyss.channels.low_bits.container import embed
+from keyss.channels.sidecar import seal_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.ply import write_ply
-from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.payload import HiddenSecret, choose_anchors, pack_secret
-from keyss.hiding.revealing import open_secret
-from keyss.seal import embed, generate_key, random_embeddings, seal_sidecar
-from seal.trained_like import trained_like
+from keyss.keys import generate_key, random_embeddings
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
+from keyss.methods.learned.revealing import open_secret
 
 
 def main() -> None:

@@ -23,17 +23,17 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from channels.low_bits.trained_like import trained_like
 from keyss import read_ply, write_ply
-from keyss.carry import embed, extract
-from keyss.carry.carrying import usable_carriers
-from keyss.carry.dither import cost
-from keyss.carry.plan import Size, room
 from keyss.core import Gaussians, KeyssError, Scene
-from keyss.core.filling import filled
+from keyss.core.pruning_compensation import filled
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
+from keyss.methods.carry import embed, extract
+from keyss.methods.carry.carrying import usable_carriers
+from keyss.methods.carry.dither import cost
+from keyss.methods.carry.plan import Size, room
 from keyss.rendering import render
-from seal.trained_like import trained_like
 
 KEY = "the key of the benchmark"
 REMOVED = 0.25

@@ -31,14 +31,14 @@ from keyss.files.scenes import load_scene
 from keyss.fitting.loop import Interrupted
 from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.plain import PlainRun
-from keyss.hiding.config import PRESETS, HideConfig
-from keyss.hiding.joint import JointRun
-from keyss.hiding.pipeline import training_salt
-from keyss.hiding.revealing import open_secret
-from keyss.hiding.targets import PlacedScene
+from keyss.keys import DerivedKey, KeyDerivation, random_embeddings
 from keyss.measure.hiding import what_wrong_keys_show
+from keyss.methods.learned.config import PRESETS, HideConfig
+from keyss.methods.learned.joint import JointRun
+from keyss.methods.learned.pipeline import training_salt
+from keyss.methods.learned.revealing import open_secret
+from keyss.methods.learned.targets import PlacedScene
 from keyss.progress import reporter
-from keyss.seal import DerivedKey, KeyDerivation, random_embeddings
 
 START, END = "<!-- measured by `make benchmark-fidelity` -->", "<!-- end of what was measured -->"
 KEY = "Xq7Rf2LmZ9aT{:03d}"  # 16 characters

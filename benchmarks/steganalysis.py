@@ -20,12 +20,12 @@ from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from keyss.carry import carrying
+from channels.low_bits.steganalysis import features, held_out_scores, parts, standard_error
+from keyss.channels.low_bits.byte_plan import SALTS
+from keyss.channels.low_bits.container import embed_derived
 from keyss.files.ply import read_ply
-from keyss.seal import DerivedKey
-from keyss.seal.container import embed_derived
-from keyss.seal.plan import SALTS
-from seal.steganalysis import features, held_out_scores, parts, standard_error
+from keyss.keys import DerivedKey
+from keyss.methods.carry import carrying
 
 Labels = npt.NDArray[np.int64]
 

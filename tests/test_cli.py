@@ -18,11 +18,11 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 from files.scene_files import photo, save, write_blender, write_colmap, write_nerfstudio
-from keyss import verbs
+from keyss import api as verbs
 from keyss.cli import commands, main
 from keyss.files.ply import read_ply
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.hiding.config import PRESETS as HIDE_PRESETS
+from keyss.methods.learned.config import PRESETS as HIDE_PRESETS
 
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
 COMMANDS = [command.__name__ for command in commands.ALL]
@@ -496,7 +496,7 @@ class TestUnexpectedErrors:
             def info(path: Path) -> None:
                 raise error
 
-            monkeypatch.setattr("keyss.describe.info", info)
+            monkeypatch.setattr("keyss.runs.describe.info", info)
 
         return fail_with
 

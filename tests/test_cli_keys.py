@@ -10,7 +10,7 @@ import pytest
 
 from keyss.cli.keys import key_of_file, keys, warn_of_weak_keys
 from keyss.core import InputError, UsageError
-from keyss.seal import generate_key
+from keyss.keys import generate_key
 
 
 @pytest.fixture(autouse=True)

@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 
 from files.scene_files import write_blender, write_nerfstudio
+from keyss.channels.sidecar import seal_sidecar, unseal_sidecar
 from keyss.cli import commands, main
 from keyss.core.errors import KeyssError
 from keyss.fitting.loop import Silent
-from keyss.seal import DerivedKey, KeyDerivation, seal_sidecar, unseal_sidecar
+from keyss.keys import DerivedKey, KeyDerivation
 
 KEY = "q7Rv2LxT9bWm4KzD"
 SPELLINGS = [

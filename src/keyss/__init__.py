@@ -15,13 +15,13 @@ from keyss import _threads  # noqa: F401  before anything imports torch
 from keyss._version import __version__
 
 if TYPE_CHECKING:
+    from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal
     from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
-    from keyss.describe import info
     from keyss.files import load_scene, read_ply, write_ply
     from keyss.fitting import FitConfig
-    from keyss.hiding import HideConfig
-    from keyss.seal import generate_key
-    from keyss.verbs import HideResult, Secret, evaluate, fit, hide, render, reveal
+    from keyss.keys import generate_key
+    from keyss.methods.learned import HideConfig
+    from keyss.runs.describe import info
 
 __all__ = [
     "Camera",
@@ -49,12 +49,12 @@ __all__ = [
 
 _HOMES = {
     "keyss.core": ("Camera", "Gaussians", "KeyssError", "Scene", "View", "WrongKeyError"),
-    "keyss.describe": ("info",),
+    "keyss.runs.describe": ("info",),
     "keyss.files": ("load_scene", "read_ply", "write_ply"),
     "keyss.fitting": ("FitConfig",),
-    "keyss.hiding": ("HideConfig",),
-    "keyss.seal": ("generate_key",),
-    "keyss.verbs": ("HideResult", "Secret", "evaluate", "fit", "hide", "render", "reveal"),
+    "keyss.methods.learned": ("HideConfig",),
+    "keyss.keys": ("generate_key",),
+    "keyss.api": ("HideResult", "Secret", "evaluate", "fit", "hide", "render", "reveal"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -20,7 +20,7 @@ from keyss.cli import main
 from keyss.cli.measuring import PartName
 from keyss.core import InputError, OutputError, UsageError, WrongKeyError
 from keyss.fitting.loop import Interrupted
-from test_verbs import CONFIG, write_nerfstudio
+from test_api import CONFIG, write_nerfstudio
 from tiny_scenes import tiny_scene
 
 KEY = "open sesame 4711"

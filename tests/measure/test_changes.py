@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
 from keyss.core import BackendError, Gaussians, Scene, UsageError
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.hiding.payload import choose_anchors
 from keyss.measure.robustness import (
     Change,
     Opened,
@@ -32,7 +32,7 @@ from keyss.measure.robustness.changes import (
 )
 from keyss.measure.robustness.conversions import Converter
 from keyss.measure.robustness.retraining import fine_tuning, purification, refined, unused
-from seal.trained_like import trained_like
+from keyss.methods.learned.payload import choose_anchors
 from tiny_scenes import random_gaussians, tiny_scene
 
 __all__ = ["splat_transform"]  # a fixture

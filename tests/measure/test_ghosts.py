@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import keyss
-from hiding.test_joint import CONFIG, _psnr, _scenes
 from keyss.core import Gaussians, Scene
-from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.pipeline import hide_scenes
-from keyss.hiding.start import opacity_curve
-from keyss.seal import random_embeddings
+from keyss.keys import random_embeddings
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.pipeline import hide_scenes
+from keyss.methods.learned.start import opacity_curve
+from methods.learned.test_joint import CONFIG, _psnr, _scenes
 from tiny_scenes import random_gaussians
 
 

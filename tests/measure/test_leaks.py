@@ -14,12 +14,12 @@ from torch import Tensor
 import keyss
 from keyss.core import Gaussians, UsageError
 from keyss.core.similarity import Similarity
-from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.payload import HiddenSecret
-from keyss.hiding.start import hidden_logits, opacity_curve
+from keyss.keys import random_embeddings
 from keyss.measure.leaks import SCORES, Attack, attack, decoder_attacks, file_attacks, look_for_secret
 from keyss.measure.leaks.attacks import THRESHOLDS
-from keyss.seal import random_embeddings
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.start import hidden_logits, opacity_curve
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
 Rows = dict[str, dict[str, Any]]

@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 
 from keyss.core import Gaussians
-from keyss.hiding.start import hidden_logits, opacity_curve
-from keyss.hiding.visibility import contributions
 from keyss.measure.leaks import file_attacks
 from keyss.measure.leaks.attributes import Attribute, clusters, measured, outliers
 from keyss.measure.leaks.opacities import (
@@ -25,6 +23,8 @@ from keyss.measure.leaks.opacities import (
     outside_the_bands,
     rescaled,
 )
+from keyss.methods.learned.start import hidden_logits, opacity_curve
+from keyss.rendering.visibility import contributions
 from tiny_scenes import random_gaussians, ring_cameras
 
 ATTRIBUTES: tuple[Attribute, ...] = ("quaternion length", "scale", "SH energy")

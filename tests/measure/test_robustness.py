@@ -11,13 +11,11 @@ import pytest
 import torch
 
 import keyss
-from hiding.test_joint import CONFIG, _moved, _scenes
-from keyss.carry import embed
-from keyss.carry.plan import Size, plan
+from channels.low_bits.trained_like import trained_like
+from keyss.channels.low_bits.bits import is_random
 from keyss.core import Gaussians, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import mean_psnr, quality
-from keyss.hiding.pipeline import hide_scenes
 from keyss.measure.robustness import (
     Opened,
     Reopener,
@@ -32,8 +30,10 @@ from keyss.measure.robustness.changes import (
     random_pruning,
 )
 from keyss.measure.robustness.retraining import purification
-from keyss.seal.low_bits import is_random
-from seal.trained_like import trained_like
+from keyss.methods.carry import embed
+from keyss.methods.carry.plan import Size, plan
+from keyss.methods.learned.pipeline import hide_scenes
+from methods.learned.test_joint import CONFIG, _moved, _scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "the right key"

@@ -12,14 +12,14 @@ import plyfile
 import pytest
 import torch
 
+from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
-from keyss.carry import embed
 from keyss.core import Gaussians, Scene
 from keyss.files.ply import write_ply
 from keyss.measure import speed as module
 from keyss.measure.robustness import Opened, Reopener
 from keyss.measure.speed import readers, render_ratio, reveal_seconds, speed
-from seal.trained_like import trained_like
+from keyss.methods.carry import embed
 from tiny_scenes import random_gaussians, tiny_scene
 
 __all__ = ["splat_transform"]  # a fixture

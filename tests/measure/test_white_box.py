@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from torch import Tensor
 
-from hiding.test_joint import KEYS, PAPER, _psnr, _scenes
 from keyss.core import Gaussians
-from keyss.hiding.pipeline import Hidden, hide_scenes
-from keyss.hiding.revealing import decode
 from keyss.measure.white_box import search_embeddings
+from keyss.methods.learned.pipeline import Hidden, hide_scenes
+from keyss.methods.learned.revealing import decode
+from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
 
 RESTARTS = 4
 

@@ -10,9 +10,7 @@ from keyss.audit.histograms import histograms
 from keyss.audit.progress import PICTURES, Found, Steps
 from keyss.audit.subject import Subject
 from keyss.core.errors import BackendError
-from keyss.files.results import STEGO, picture_name
 from keyss.fitting.image_metrics import thin
-from keyss.hiding.payload import HiddenSecret
 from keyss.measure.distances import against_null, attribute_distances
 from keyss.measure.images import compare_images, renders_of
 from keyss.measure.leaks import look_for_secret
@@ -23,6 +21,8 @@ from keyss.measure.sealwatch_detectors import sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.two_sample import two_sample_against_null, two_sample_auc
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.runs.files import STEGO, picture_name
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64

@@ -14,11 +14,11 @@ from keyss.audit.progress import PICTURES, Kept, Steps
 from keyss.audit.subject import Subject, null_seeds, subject_of
 from keyss.core.errors import UsageError
 from keyss.files.output import OutputFolder
-from keyss.files.results import bytes_writer, json_writer
 from keyss.fitting.loop import Interrupted, Reporter, Silent
 from keyss.rendering import Backend, resolve_device
 from keyss.report import write_report
-from keyss.runs import HidingRun, PathLike, fingerprint, open_run
+from keyss.runs.files import bytes_writer, json_writer
+from keyss.runs.opening import HidingRun, PathLike, fingerprint, open_run
 
 AUDIT, FOLDER = "audit.json", "audit"
 FORMAT = 1

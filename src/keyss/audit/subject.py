@@ -20,10 +20,10 @@ from keyss.files.ply import read_ply, write_ply
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
-from keyss.hiding.payload import HiddenSecret
-from keyss.hiding.revealing import read_sidecar
 from keyss.measure.robustness import Reopener
-from keyss.runs import HidingRun, Opened, revealed
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.revealing import read_sidecar
+from keyss.runs.opening import HidingRun, Opened, revealed
 
 NULLS = "private/null"  # plain models of the cover from other seeds, in a run's folder
 

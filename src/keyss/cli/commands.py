@@ -49,7 +49,7 @@ def keygen(
     example: keyss keygen > key.txt
     """
     from keyss.core.errors import UsageError
-    from keyss.seal import generate_key, length_for
+    from keyss.keys import generate_key, length_for
 
     if length is not None and bits is not None:
         raise UsageError("give --length or --bits, not both")
@@ -82,7 +82,7 @@ def fit(
 
     example: keyss fit SCENE -o runs/cover
     """
-    from keyss import verbs
+    from keyss import api as verbs
     from keyss.cli.tables import print_files, print_fit
     from keyss.fitting.config import PRESETS
     from keyss.progress import reporter
@@ -167,15 +167,15 @@ def hide(
     """
     from dataclasses import replace
 
-    from keyss import verbs
+    from keyss import api as verbs
     from keyss.cli.keys import keys, warn_of_weak_keys
     from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.core.errors import UsageError
     from keyss.files.ply import read_ply
-    from keyss.hiding.config import PRESETS
-    from keyss.hiding.from_models import is_model, room_for_models
-    from keyss.hiding.mask import parse_mask
+    from keyss.methods.learned.config import PRESETS
+    from keyss.methods.learned.mask import parse_mask
     from keyss.progress import reporter
+    from keyss.rendering.orbit import is_model, room_for_models
 
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
@@ -194,7 +194,7 @@ def hide(
         raise UsageError("--clip-model is for --key-encoder clip")
     encoder = None
     if key_encoder == "clip":
-        from keyss.hiding.clip_keys import MODEL, ClipKeys
+        from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 
         encoder = ClipKeys(clip_model or MODEL)
     models = secret_model or (None,) * len(secret)
@@ -257,7 +257,7 @@ def reveal(
 
     example: keyss reveal runs/hidden/stego.ply --key-file key.txt -o secret.ply
     """
-    from keyss import verbs
+    from keyss import api as verbs
     from keyss.cli.keys import keys
 
     (key,) = keys((key_file,) if key_file else (), 1)
@@ -291,7 +291,7 @@ def render(
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
     """
-    from keyss import verbs
+    from keyss import api as verbs
 
     images = verbs.render(
         model,
@@ -318,7 +318,7 @@ def evaluate(
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
-    from keyss import verbs
+    from keyss import api as verbs
     from keyss.cli.keys import keys
     from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.progress import reporter
@@ -349,7 +349,7 @@ def info(
     example: keyss info runs/hidden/stego.ply
     """
     from keyss.cli.tables import print_facts
-    from keyss.describe import info as describe
+    from keyss.runs.describe import info as describe
 
     facts = describe(path)
     if json_:
@@ -370,7 +370,7 @@ def demo(
     example: keyss demo -o out/demo
     """
     from keyss.cli.tables import print_files, print_metrics
-    from keyss.demo import WRONG_KEYS, run_demo
+    from keyss.demo.run import WRONG_KEYS, run_demo
     from keyss.progress import reporter
 
     result = run_demo(out, seed=checked_seed(seed), device=device, overwrite=overwrite, reporter=reporter())

@@ -38,7 +38,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
 
 def warn_of_weak_keys(chosen: Sequence[str]) -> None:
     """Say on the standard error stream which of the keys can be guessed, without saying what they are."""
-    from keyss.seal import weakness
+    from keyss.keys import weakness
 
     for number, key in enumerate(chosen, start=1):
         problem = weakness(key)

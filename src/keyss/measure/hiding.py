@@ -13,9 +13,9 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import Quality, mean_psnr, quality
-from keyss.hiding.payload import HiddenSecret
-from keyss.hiding.revealing import decode, reveal_gaussians
-from keyss.seal import random_embeddings
+from keyss.keys import random_embeddings
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.revealing import decode, reveal_gaussians
 
 
 def measure_hiding(

@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.hiding.decoder import Decoder
-from keyss.seal import random_embeddings
+from keyss.keys import random_embeddings
+from keyss.methods.learned.decoder import Decoder
 
 
 @torch.enable_grad()

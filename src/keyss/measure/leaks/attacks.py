@@ -11,9 +11,7 @@ import torch
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
-from keyss.hiding.payload import HiddenSecret
-from keyss.hiding.revealing import decode
-from keyss.hiding.visibility import contributions
+from keyss.keys import random_embeddings
 from keyss.measure.leaks.attributes import Attribute, Side, clusters, outliers
 from keyss.measure.leaks.opacities import (
     by_the_source,
@@ -26,7 +24,9 @@ from keyss.measure.leaks.opacities import (
     rescaled,
 )
 from keyss.measure.white_box import search_embeddings
-from keyss.seal import random_embeddings
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.revealing import decode
+from keyss.rendering.visibility import contributions
 
 THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing

@@ -14,9 +14,9 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import thin
-from keyss.hiding.payload import HiddenSecret
 from keyss.measure.leaks.attacks import Attack, decoder_attacks, file_attacks
 from keyss.measure.leaks.scores import SCORES, scores
+from keyss.methods.learned.payload import HiddenSecret
 from keyss.rendering import render
 
 _GAP = 4  # pixels between the parts of a picture

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.hiding.decoder import Decoder, DecoderShape
-from keyss.hiding.start import DRAWN_LOGIT, opacity_curve
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.start import DRAWN_LOGIT, opacity_curve
 
 OPAQUE = 0.99  # as much as one Gaussian covers in 3DGS
 _BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, so that no outlier sets the scale

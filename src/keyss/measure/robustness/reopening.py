@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from keyss.carry.carrying import Carried
 from keyss.core.errors import InputError
-from keyss.core.filling import filled
 from keyss.core.gaussians import Gaussians
+from keyss.core.pruning_compensation import filled
 from keyss.core.similarity import Similarity
-from keyss.hiding.opening import open_model
-from keyss.hiding.payload import HiddenSecret
-from keyss.hiding.revealing import open_secret, reveal_gaussians
+from keyss.methods.carry.carrying import Carried
+from keyss.methods.learned.opening import open_model
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.revealing import open_secret, reveal_gaussians
 
 
 @dataclass(frozen=True)

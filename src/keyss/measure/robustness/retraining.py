@@ -12,9 +12,9 @@ from keyss.fitting.image_metrics import thin
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
-from keyss.hiding.visibility import contributions
 from keyss.measure.robustness.changes import Change
 from keyss.rendering import render
+from keyss.rendering.visibility import contributions
 
 VIEWS = 64  # in which purification looks for what is used
 

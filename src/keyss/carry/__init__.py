@@ -1,5 +1,0 @@
-"""Carrying: a model inside the low bits of another, without training and nearly without loss."""
-
-from keyss.carry.carrying import Carried, embed, extract
-
-__all__ = ["Carried", "embed", "extract"]

@@ -1,0 +1,1 @@
+"""The low mantissa bits of a float model."""

@@ -1,0 +1,186 @@
+"""The demo: one made-up scene hidden in another, opened with the key and tried with wrong ones."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from keyss import api as verbs
+from keyss.core.errors import WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.demo.photographs import write_demo_scene
+from keyss.files.atomic import write_bytes
+from keyss.files.output import OutputFolder
+from keyss.files.scenes import load_scene
+from keyss.fitting.config import FitConfig
+from keyss.fitting.loop import Interrupted, Reporter, Silent
+from keyss.methods.learned.config import HideConfig
+from keyss.rendering import Backend
+from keyss.runs import files as results
+from keyss.runs.files import METRICS, PRIVATE, SIDECAR, STEGO
+
+COVER, SECRET = "tea-table", "golden-knot"
+VIEWS, WIDTH, HEIGHT = 48, 160, 120
+CONFIG = HideConfig(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
+WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
+SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
+_RESULTS = (
+    *(STEGO, SIDECAR, results.CONFIG, METRICS, PRIVATE),
+    *(SECRET_PLY, COMPARISON, KEY, SCENES),
+)
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo found."""
+
+    metrics: dict[str, Any]  # as in metrics.json
+    refused: int  # wrong keys that were tried and opened nothing
+
+
+def run_demo(
+    out: Path | str,
+    *,
+    seed: int = 0,
+    device: Backend = "auto",
+    overwrite: bool = False,
+    config: HideConfig = CONFIG,
+    sidecar: bool = False,
+    views: int = VIEWS,
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    reporter: Reporter | None = None,
+) -> DemoResult:
+    """Everything from photos to a comparison picture, in the folder `out`.
+
+    The key is `demo-key-SEED`, known to everybody. On the CPU, one seed gives the same `stego.ply` and
+    `secret.ply` every time. Raises KeyssError and its children; whatever is raised, Ctrl-C included,
+    nothing of the demo stays in the folder.
+    """
+    out = Path(out)
+    OutputFolder(out, overwrite=overwrite)
+    was_there = out.exists()
+    _clear(out)
+    try:
+        cover, secret = (
+            _scene(out / SCENES / which, views, width, height, seed, reporter or Silent())
+            for which in (COVER, SECRET)
+        )
+        key = f"demo-key-{seed}"
+        verbs.hide(
+            out / SCENES / COVER,
+            [verbs.Secret(out / SCENES / SECRET, key)],
+            config=config.with_fit(seed=seed),
+            sidecar=sidecar,
+            device=device,
+            out=out,
+            overwrite=True,
+            reporter=reporter,
+        )
+        verbs.reveal(out / STEGO, key, device=device, out=out / SECRET_PLY)
+        refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
+        metrics = verbs.evaluate(out, [key], seed=seed, device=device)
+        picture = io.BytesIO()
+        _comparison(out, cover, secret, metrics, device).save(picture, "PNG", optimize=True)
+        write_bytes(out / COMPARISON, picture.getvalue())
+        write_bytes(out / KEY, f"{key}\n".encode())
+        return DemoResult(metrics, refused)
+    except BaseException as error:
+        _clear(out)
+        shutil.rmtree(out / "checkpoint", ignore_errors=True)
+        if not was_there and out.is_dir() and not any(out.iterdir()):
+            out.rmdir()
+        if isinstance(error, Interrupted):  # there is nothing left to continue from
+            raise KeyboardInterrupt from error
+        raise
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier demo left in the folder, and nothing else."""
+    for name in _RESULTS:
+        path = out / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _scene(folder: Path, views: int, width: int, height: int, seed: int, reporter: Reporter) -> Scene:
+    reporter.start(f"photos of the {folder.name}", views, 0)
+    write_demo_scene(
+        folder,
+        folder.name,
+        views=views,
+        width=width,
+        height=height,
+        seed=seed,
+        progress=lambda done, _: reporter.update(done, 0, {}),
+    )
+    reporter.finish()
+    return load_scene(folder)
+
+
+def _is_refused(stego: Path, key: str, device: Backend) -> bool:
+    try:
+        verbs.reveal(stego, key, device=device)
+    except WrongKeyError:
+        return True
+    return False
+
+
+def _comparison(
+    out: Path, cover: Scene, secret: Scene, metrics: dict[str, Any], device: Backend
+) -> Image.Image:
+    """Photos and renders of three test views side by side."""
+    stego = out / STEGO
+    decoy = verbs.reveal(stego, WRONG_KEYS[0], decoy=True, device=device)
+    hidden, wrong = metrics["secrets"][0], metrics["wrong_key"]["vs_cover"]
+    columns = [
+        ("cover: photo", "", [view.image for view in cover.test]),
+        ("cover: published model", f"{metrics['cover']['psnr']:.1f} dB", _pictures(stego, cover, device)),
+        ("secret: photo", "", [view.image for view in secret.test]),
+        ("opened with the key", f"{hidden['psnr']:.1f} dB", _pictures(out / SECRET_PLY, secret, device)),
+        ("with a wrong key", f"{wrong['mean']:.1f} dB against the cover", _pictures(decoy, cover, device)),
+    ]
+    count = len(cover.test)
+    rows = sorted({count // 6, count // 2, count - 1 - count // 6})
+    return contact_sheet(
+        [(title, note, [images[row].numpy() for row in rows]) for title, note, images in columns]
+    )
+
+
+def _pictures(model: Path | Gaussians, scene: Scene, device: Backend) -> list[torch.Tensor]:
+    return [image for _, image in verbs.render(model, scene, device=device)]
+
+
+def contact_sheet(
+    columns: Sequence[tuple[str, str, Sequence[NDArray[np.uint8]]]], cell: int = 240
+) -> Image.Image:
+    """Columns of images [H, W, 3] of one size, scaled to `cell` pixels' width, under two lines of text."""
+    first = columns[0][2][0]
+    height = round(first.shape[0] * cell / first.shape[1])
+    gap, head = cell // 40, cell // 6
+    rows = len(columns[0][2])
+    sheet = Image.new(
+        "RGB", (gap + len(columns) * (cell + gap), head + rows * (height + gap) + gap), (255, 255, 255)
+    )
+    draw = ImageDraw.Draw(sheet)
+    large, small = ImageFont.load_default(cell // 15), ImageFont.load_default(cell // 19)
+    for index, (title, note, images) in enumerate(columns):
+        x = gap + index * (cell + gap)
+        draw.text((x, gap // 2), title, fill=(20, 20, 20), font=large)
+        draw.text((x, gap // 2 + cell // 12), note, fill=(90, 90, 90), font=small)
+        for row, image in enumerate(images):
+            picture = Image.fromarray(image).resize((cell, height), Image.Resampling.LANCZOS)
+            sheet.paste(picture, (x, head + row * (height + gap)))
+    return sheet

@@ -1,0 +1,22 @@
+"""Keys: from what a person types to derived keys, and authenticated encryption under them."""
+
+from keyss.keys.derivation import (
+    EMBEDDING_SIZE,
+    DerivedKey,
+    KeyDerivation,
+    generate_key,
+    length_for,
+    random_embeddings,
+)
+from keyss.keys.strength import key_strength_bits, weakness
+
+__all__ = [
+    "EMBEDDING_SIZE",
+    "DerivedKey",
+    "KeyDerivation",
+    "generate_key",
+    "key_strength_bits",
+    "length_for",
+    "random_embeddings",
+    "weakness",
+]

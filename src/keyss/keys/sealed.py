@@ -1,0 +1,85 @@
+"""Sealing bytes: compressed, padded, encrypted and authenticated under a data key of their own.
+
+ChaCha20-Poly1305 (RFC 8439) under a key that seals one message only, so the nonce may be zero: the writer
+draws the data key at random or derives it from everything that it seals (see `container`), and two messages
+never share one. Lengths are padded to a coarse bucket first: the size tells little of what is inside.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+from keyss.core.errors import InputError, UsageError
+from keyss.keys.derivation import expand
+
+DATA_KEY_BYTES = 32
+MAX_PAYLOAD_BYTES = 64 << 20  # before compression
+SMALLEST_BUCKET = 4096
+OVERHEAD = 4 + 16  # length of what is compressed, and the tag
+_NONCE = bytes(12)
+
+
+def bucket(size: int) -> int:
+    """`size` rounded up to a multiple of an eighth of the power of two above it, and to at least 4096."""
+    step = max(SMALLEST_BUCKET, 1 << max(0, (size - 1).bit_length() - 3))
+    return -(-size // step) * step
+
+
+def sealed_size(compressed: int) -> int:
+    """Bytes of a sealed payload whose compressed form takes `compressed` bytes."""
+    return bucket(compressed + OVERHEAD)
+
+
+def compressed_size(payload: bytes) -> int:
+    """Bytes of `payload` when compressed as `seal` does it."""
+    return len(_compressed(payload))
+
+
+def seal(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int | None = None) -> bytes:
+    """`payload` sealed under a fresh `data_key` (32 bytes), in `size` bytes or in its bucket's.
+
+    `associated` is authenticated along with it and has to be given again to open. Raises UsageError for a
+    payload of more than 64 MiB.
+    """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to seal, got {len(payload):,}")
+    packed = _compressed(payload)
+    size = sealed_size(len(packed)) if size is None else size
+    plain = struct.pack("<I", len(packed)) + packed
+    if size < len(packed) + OVERHEAD:
+        raise ValueError(f"{len(packed)} bytes do not fit into {size}")
+    plain += bytes(size - 16 - len(plain))
+    return _cipher(data_key).encrypt(_NONCE, plain, associated)
+
+
+def unseal(data_key: bytes, sealed: bytes, associated: bytes = b"") -> bytes:
+    """The payload that was sealed. Raises InputError when anything at all is not as `seal` left it."""
+    try:
+        plain = _cipher(data_key).decrypt(_NONCE, sealed, associated)
+    except (InvalidTag, ValueError) as error:
+        raise InputError("the sealed data are damaged: their authentication fails") from error
+    (length,) = struct.unpack_from("<I", plain.ljust(4, b"\0"))
+    packed = plain[4 : 4 + length]
+    # What follows is bounded although only a holder of the key can have written it.
+    unpacker = zlib.decompressobj()
+    try:
+        payload = unpacker.decompress(packed, MAX_PAYLOAD_BYTES)
+    except zlib.error as error:
+        raise InputError(f"the sealed data cannot be decompressed: {error}") from error
+    if len(packed) != length or not unpacker.eof or unpacker.unused_data:
+        raise InputError("the sealed data are not whole, or larger than 64 MiB")
+    return payload
+
+
+def _cipher(data_key: bytes) -> ChaCha20Poly1305:
+    if len(data_key) != DATA_KEY_BYTES:
+        raise ValueError(f"expected a data key of {DATA_KEY_BYTES} bytes, got {len(data_key)}")
+    return ChaCha20Poly1305(expand(data_key, "payload", 32))
+
+
+def _compressed(payload: bytes) -> bytes:
+    return zlib.compress(payload, 9)

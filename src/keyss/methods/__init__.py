@@ -1,0 +1,1 @@
+"""How a secret becomes bits and Gaussians: one folder for each method."""

@@ -1,0 +1,97 @@
+"""New low bits for models that came through a coarser format.
+
+Where a property takes few different values, as after 8 or 16 bits, or has low bits that are not uniform, as
+after an added offset, each value is moved by a random amount below half of the distance to the next value
+that occurs: less than the format's own precision, so that it would be rounded back. The values then lie in
+steps rather than on them. That is not how trained values lie, and who looks for it can see it; what cannot be
+seen is whether anything is in the low bits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from keyss.channels.low_bits.bits import is_uniform
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.keys.derivation import stream
+from keyss.rendering import render
+
+_FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
+_SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
+_TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
+_VIEWS, _SIZE = 4, 256
+
+Floats = npt.NDArray[np.float32]
+
+
+def dither(model: Gaussians, entropy: bytes) -> Gaussians:
+    """`model` with new low bits where they are not random; positions and constant colours stay.
+
+    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay as they are.
+    """
+    changed = {}
+    for name in ("log_scales", "quats", "opacity_logits", "sh"):
+        values = getattr(model, name).detach().cpu().clone()
+        columns = values.view(len(values), -1).numpy()
+        for column in range(3 if name == "sh" else 0, columns.shape[1]):
+            if not _is_natural(columns[:, column]):
+                noise = _uniform(entropy, f"carry/dither/{name}/{column}", len(columns))
+                columns[:, column] = _dithered(columns[:, column], noise)
+        changed[name] = values
+    return Gaussians(means=model.means, **changed)
+
+
+def cost(before: Gaussians, after: Gaussians) -> float:
+    """PSNR in dB of views around a model, before and after; at most 120."""
+    error = torch.stack(
+        [(render(before, view) - render(after, view)).square().mean() for view in _around(before)]
+    )
+    return float(-10 * torch.log10(error.mean().clamp_min(1e-12)))
+
+
+def _is_natural(values: Floats) -> bool:
+    return len(np.unique(values)) > _FEW * len(values) and is_uniform(values)
+
+
+def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:
+    """`values` moved by `noise` in [-1, 1] times half of the distance to the nearest other value."""
+    unique, inverse = np.unique(values.astype(np.float64), return_inverse=True)
+    if len(unique) < 2:
+        return values
+    gaps = np.diff(unique)
+    reach = np.minimum(np.append(gaps, np.inf), np.insert(gaps, 0, np.inf))
+    reach = np.minimum(reach, np.quantile(gaps, _TYPICAL)) / 2
+    half = unique.astype(np.float16)
+    if len(unique) > _SPARSE * len(values) and (half == unique).all():
+        # Of half precision, but not every value occurs: the next one that does may be several steps away.
+        reach = np.minimum(reach, np.spacing(np.abs(half)).astype(np.float64) / 2)
+    moved: Floats = (values + noise * reach[inverse]).astype(np.float32)
+    return moved
+
+
+def _uniform(entropy: bytes, label: str, count: int) -> npt.NDArray[np.float64]:
+    words = np.frombuffer(stream(entropy, label, 8 * count), "<u8")
+    return words.astype(np.float64) / 2.0**63 - 1
+
+
+def _around(model: Gaussians) -> list[Camera]:
+    """Cameras that look at the middle of a model from all sides."""
+    middle = model.means.median(0).values
+    distance = 2.5 * float((model.means - middle).norm(dim=1).median())
+    cameras = []
+    for index in range(_VIEWS):
+        angle = 2 * math.pi * index / _VIEWS
+        forward = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+        right = torch.tensor([-math.sin(angle), math.cos(angle), 0.0])
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ (middle - distance * forward)
+        K = torch.tensor([[_SIZE, 0, _SIZE / 2], [0, _SIZE, _SIZE / 2], [0, 0, 1.0]])
+        cameras.append(Camera(viewmat, K, _SIZE, _SIZE, f"around-{index}"))
+    return cameras

@@ -1,0 +1,117 @@
+"""What hiding can be told, with the paper's names where it has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from keyss.core.errors import UsageError
+from keyss.fitting.config import PRESETS as FIT_PRESETS
+from keyss.fitting.config import FitConfig
+from keyss.methods.learned.mask import Mask
+
+Start = Literal["warm", "points"]
+Scenes = Literal["both", "cover", "secret"]  # "both": all, however many secrets there are
+
+
+@dataclass(frozen=True, kw_only=True)
+class HideConfig:
+    """The joint training of the published model and the decoder (KeySS, section 3.4)."""
+
+    fit: FitConfig = field(default_factory=FitConfig)  # schedule, cap and rates, also of the plain models
+
+    start: Start = "warm"  # from the plain models' Gaussians, or sparse points (paper)
+    points: Scenes = "both"  # start from points: whose sparse points (combined SfM initialisation)
+    poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
+    densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
+    # Steps at which all scenes are drawn from one pose, photo or plain model's render; at the others each is
+    # drawn from a pose of its own and compared with its photo. The paper has the first kind only.
+    common_poses: float = 0.1
+
+    mask: Mask = ("op",)  # theta: the attributes that the decoder updates
+    decoder: Literal["curve", "network"] = "curve"  # the paper has a network
+    conditioning: Literal["gate", "bias"] = "gate"  # how the key enters the decoder; bias: the paper's
+    hidden: tuple[int, int] = (64, 64)  # widths of a network's common branch
+    branch: int = 32  # width of its branch per attribute
+    frequencies: int = 6  # octaves of its positional encoding
+    design: Literal["standardised", "published"] = "standardised"  # of a network; published: the paper's
+    residuals: Literal["signed", "one-sided"] = "signed"  # one-sided: ReLU on all but the opacity's
+    decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
+    weight_decay: float = 1e-4
+
+    cover_weight: float = 0.5  # beta_cover
+    secret_weight: float = 0.5  # beta_secret, of each secret
+    incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
+    incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
+
+    secret_share: float = 1.0  # warm start: Gaussians of each secret for one of the cover
+    warm_rate: float = 1.0  # warm start: factor on the rates of the Gaussians, which are nearly right
+    # At the cap, what asks to grow waits until something is pruned; freeze: nothing is (the authors' code).
+    at_cap: Literal["wait", "freeze"] = "wait"
+    prune_by: Literal["all", "cover"] = "all"  # whose opacities spare a Gaussian; cover: the authors' code
+
+    def __post_init__(self) -> None:
+        if self.poses != "both" and self.common_poses < 1:
+            raise UsageError(
+                "poses of some scenes only: needs common_poses = 1, for all scenes are drawn from them"
+            )
+        if self.start == "warm" and "op" not in self.mask:
+            raise UsageError(
+                f"mask {','.join(self.mask)}: a warm start hides the secret's Gaussians by their opacity and "
+                "needs op in the mask; start from points instead (--start points)"
+            )
+        if self.start == "warm" and self.conditioning == "bias":
+            raise UsageError(
+                "conditioning bias: a warm start's opacity curve is the same for every key and needs a gate"
+            )
+        if self.decoder == "curve" and (self.start != "warm" or self.mask != ("op",)):
+            raise UsageError(
+                "decoder curve: knows nothing but opacities from a warm start; "
+                f"mask {','.join(self.mask)} with start {self.start} needs a network"
+            )
+
+    def adapted(self, mask: Mask | None = None, start: Start | None = None) -> HideConfig:
+        """The same with another mask or start, and with a network where a curve cannot do it."""
+        mask, start = mask or self.mask, start or self.start
+        curve = self.decoder == "curve" and mask == ("op",) and start == "warm"
+        return replace(self, mask=mask, start=start, decoder="curve" if curve else "network")
+
+    def with_fit(self, **changes: object) -> HideConfig:
+        """The same with changed fields of `fit`."""
+        return replace(self, fit=replace(self.fit, **changes))  # type: ignore[arg-type]
+
+
+def chosen_scenes(which: Scenes, count: int) -> list[int]:
+    """Indices of the scenes that `which` stands for, of the cover (0) and the secrets."""
+    return {"both": list(range(count)), "cover": [0], "secret": list(range(1, count))}[which]
+
+
+_PAPER = HideConfig(
+    fit=replace(FIT_PRESETS["paper"], ssim_weight=0.5),
+    start="points",
+    common_poses=1.0,
+    mask=("op", "ro", "sc", "xyz"),
+    decoder="network",
+    conditioning="bias",
+    hidden=(64, 128),
+    branch=64,
+    frequencies=0,
+    design="published",
+    decoder_rate=5e-5,
+    incorrect_weight=0.01,
+    incorrect_every=1,
+)
+
+PRESETS: dict[str, HideConfig] = {
+    "best": HideConfig(),
+    "quick": HideConfig(fit=FIT_PRESETS["quick"]),
+    # The paper as written, and what its authors' code does otherwise: for comparison only.
+    "paper": _PAPER,
+    "released": replace(
+        _PAPER,
+        fit=FIT_PRESETS["paper"],
+        residuals="one-sided",
+        at_cap="freeze",
+        prune_by="cover",
+    ),
+}

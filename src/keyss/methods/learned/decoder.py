@@ -1,0 +1,254 @@
+"""The decoder: turns the cover's Gaussians into a secret's, one Gaussian at a time, for one key.
+
+KeySS, section 3.2 and appendix: attribute* = attribute + residual, on raw attributes. There are two sources
+of residuals. The *curve* looks at a Gaussian's opacity alone: it knows the band of opacities, too small to be
+drawn, in which a secret's Gaussians lie (`keyss.methods.learned.start`). The *network* is the paper's: a
+common branch over all attributes of a Gaussian, then a branch of two layers per updated attribute.
+
+Corrections to the published code: residuals are plain sums of either sign; every input comes from the one
+Gaussian alone, standardised with constants that are fixed at the start and kept with the weights, so that
+pruning or re-ordering the model changes nothing for the Gaussians that stay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from keyss.core.gaussians import Gaussians
+from keyss.keys.derivation import EMBEDDING_SIZE
+from keyss.methods.learned.mask import Mask
+
+CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
+# Units of a residual, so that all branches learn at like speed: logits, quaternion components, natural
+# logarithms of scale, scene extents, SH coefficients.
+RESIDUAL_UNITS = {"op": 5.0, "ro": 1.0, "sc": 1.0, "xyz": 0.1, "sh": 0.5}
+KEY_GAIN = 3.0  # lets a unit vector move the first layer as much as the attributes do
+# Cosines between an embedding and the decoder's own: the gate is shut below the first, open above the second.
+# Two random unit vectors of 64 numbers come that near once in 10^10 times.
+GATE_SHUT, GATE_OPEN = 0.7, 0.9
+KNOTS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecoderShape:
+    """Kind and sizes of a decoder."""
+
+    mask: Mask = ("op",)
+    kind: Literal["curve", "network"] = "curve"  # a network adds to the curve
+    conditioning: Literal["gate", "bias"] = "gate"  # how the key enters; bias: the paper's
+    # What follows is for networks.
+    hidden: tuple[int, int] = (64, 64)  # widths of the two layers of the common branch
+    branch: int = 32  # width of each attribute's branch
+    frequencies: int = 6  # octaves of sines and cosines of the position
+    sh_degree: int = 3
+    design: Literal["standardised", "published"] = "standardised"  # published: see `Network`
+    residuals: Literal["signed", "one-sided"] = "signed"  # one-sided: ReLU on all but the opacity's
+
+    @property
+    def inputs_size(self) -> int:
+        """Numbers that describe one Gaussian: 11 + 3 K attributes and 6 per octave."""
+        return 11 + 3 * (self.sh_degree + 1) ** 2 + 6 * self.frequencies
+
+    def channels(self, attribute: str) -> int:
+        return CHANNELS.get(attribute, 3 * (self.sh_degree + 1) ** 2)
+
+
+class Decoder(nn.Module):
+    """`decoder(gaussians, embedding)` gives the Gaussians that the key's embedding [64] stands for.
+
+    A new decoder changes nothing, whatever the key.
+    """
+
+    key: Tensor  # [64] the embedding that it belongs to
+    knots: Tensor  # [KNOTS] opacity logits, ascending: where the curve's pieces meet
+    values: Tensor  # [KNOTS] its residuals there
+
+    def __init__(self, shape: DecoderShape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.register_buffer("key", torch.zeros(EMBEDDING_SIZE))
+        self.register_buffer("knots", torch.linspace(-40, 40, KNOTS))
+        self.register_buffer("values", torch.zeros(KNOTS))
+        self.network = Network(shape) if shape.kind == "network" else None
+
+    @torch.no_grad()
+    def prepare(self, gaussians: Gaussians, embedding: Tensor) -> None:
+        """Fix the key and the constants of the inputs, from the model that training starts with."""
+        self.key.copy_(embedding)
+        if self.network is not None:
+            self.network.prepare(gaussians)
+
+    def set_curve(self, knots: Sequence[float], values: Sequence[float]) -> None:
+        """Let the curve go through these points, KNOTS of them; outside it goes on as it ends."""
+        self.knots.copy_(torch.tensor(knots))
+        self.values.copy_(torch.tensor(values))
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """The opacity logits between which the secret's Gaussians lie after a warm start."""
+        return float(self.knots[1]), float(self.knots[4])
+
+    @property
+    def faint_logit(self) -> float:
+        """A logit at which the curve shows a Gaussian nearly opaque: high between its middle knots."""
+        return float(torch.lerp(self.knots[2], self.knots[3], 0.7))
+
+    def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
+        """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
+        gate = self._gate(embedding)
+        if gate == 0:
+            return gaussians
+        residuals: dict[str, Tensor] = {}
+        extent = gaussians.means.new_ones(())
+        if self.network is not None:
+            extent = self.network.extent
+            residuals = self.network(gaussians, embedding, whole or gaussians)
+        if "op" in self.shape.mask:
+            curve = self._curve(gaussians.opacity_logits)[:, None]
+            residuals["op"] = curve + residuals["op"] if "op" in residuals else curve
+        if gate < 1:
+            residuals = {name: gate * residual for name, residual in residuals.items()}
+        return add_residuals(gaussians, residuals, extent)
+
+    def _curve(self, logits: Tensor) -> Tensor:
+        right = torch.searchsorted(self.knots, logits.detach()).clamp(1, KNOTS - 1)
+        start, end = self.knots[right - 1], self.knots[right]
+        return torch.lerp(self.values[right - 1], self.values[right], (logits - start) / (end - start))
+
+    def _gate(self, embedding: Tensor) -> float:
+        """1 for the decoder's own key, 0 for every other, whatever the weights are.
+
+        This keeps honest mistakes from showing anything, at no cost. It protects nothing by itself: who holds
+        the decoder holds `key`. What protects is that the decoder is sealed. A decoder conditioned by a bias
+        has learned the difference instead, which the white-box attack (`keyss.measure`) undoes.
+        """
+        if self.shape.conditioning == "bias":
+            return 1.0
+        cosine = float(F.cosine_similarity(embedding, self.key, dim=0))
+        return min(1.0, max(0.0, (cosine - GATE_SHUT) / (GATE_OPEN - GATE_SHUT)))
+
+
+class Network(nn.Module):
+    """Residuals of the attributes in the mask, from all attributes of a Gaussian (KeySS, eq. 8 and 9).
+
+    The "published" design is the authors': inputs scaled to length 1, residuals without units that are not
+    zero at first. Ours changes nothing at first and sees standardised inputs and where a Gaussian is.
+    """
+
+    center: Tensor  # [3] world position that the encoding is centred on
+    extent: Tensor  # [] world units of one step of position
+    offset: Tensor  # [11 + 3 K] mean of the attributes at the start
+    spread: Tensor  # [11 + 3 K] their standard deviation
+
+    def __init__(self, shape: DecoderShape) -> None:
+        super().__init__()
+        self.shape = shape
+        attributes = shape.inputs_size - 6 * shape.frequencies
+        self.register_buffer("center", torch.zeros(3))
+        self.register_buffer("extent", torch.ones(()))
+        self.register_buffer("offset", torch.zeros(attributes))
+        self.register_buffer("spread", torch.ones(attributes))
+        self.first = nn.Linear(shape.inputs_size, shape.hidden[0])
+        self.second = nn.Linear(*shape.hidden)
+        if shape.conditioning == "bias":
+            self.first_key = nn.Linear(EMBEDDING_SIZE, shape.hidden[0], bias=False)
+        self.branches = nn.ModuleDict()
+        for attribute in shape.mask:
+            last = nn.Linear(shape.branch, shape.channels(attribute))
+            if shape.design == "standardised":
+                nn.init.zeros_(last.weight)
+                nn.init.zeros_(last.bias)
+            self.branches[attribute] = nn.Sequential(
+                nn.Linear(shape.hidden[1], shape.branch), nn.ReLU(), last
+            )
+
+    @torch.no_grad()
+    def prepare(self, gaussians: Gaussians) -> None:
+        """Fix the constants of the inputs."""
+        if self.shape.design == "published":
+            return
+        self.center.copy_(gaussians.means.median(0).values)
+        distance = (gaussians.means - self.center).norm(dim=1).median()
+        self.extent.copy_(distance.clamp_min(1e-6))
+        attributes = self._attributes(gaussians)
+        self.offset.copy_(attributes.mean(0))
+        # SH of a fresh model are zeros: a floor keeps them from being blown up later.
+        self.spread.copy_(attributes.std(0, correction=0).clamp_min(0.1))
+
+    def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians) -> dict[str, Tensor]:
+        published = self.shape.design == "published"
+        hidden = self.first(self.describe(gaussians, whole))
+        if self.shape.conditioning == "bias":
+            hidden = hidden + (1 if published else KEY_GAIN) * self.first_key(embedding)
+        hidden = F.relu(self.second(F.relu(hidden)))
+        residuals = {}
+        for name, branch in self.branches.items():
+            residual = branch(hidden) * (1 if published else RESIDUAL_UNITS[name])
+            one_sided = self.shape.residuals == "one-sided" and name != "op"
+            residuals[name] = F.relu(residual) if one_sided else residual
+        return residuals
+
+    def describe(self, gaussians: Gaussians, whole: Gaussians) -> Tensor:
+        """[N, inputs] what the network sees of each Gaussian."""
+        if self.shape.design == "published":
+            return _normalised(gaussians, whole)
+        attributes = self._attributes(gaussians)
+        position = attributes[:, :3]
+        octaves = 2.0 ** torch.arange(self.shape.frequencies, device=position.device) * (math.pi / 2)
+        angles = (position[:, :, None] * octaves).flatten(1)
+        standardised = (attributes - self.offset) / self.spread
+        return torch.cat([standardised, angles.sin(), angles.cos()], dim=1)
+
+    def _attributes(self, gaussians: Gaussians) -> Tensor:
+        position = self._contracted(gaussians.means)
+        opacity = gaussians.opacity_logits[:, None]
+        return torch.cat(
+            [position, opacity, gaussians.quats, gaussians.log_scales, gaussians.sh.flatten(1)], dim=1
+        )
+
+    def _contracted(self, means: Tensor) -> Tensor:
+        """[N, 3] in a ball of radius 2: far positions are drawn in (Mip-NeRF 360, eq. 10)."""
+        position = (means - self.center) / (2 * self.extent)
+        distance = position.norm(dim=1, keepdim=True).clamp_min(1e-9)
+        return torch.where(distance <= 1, position, (2 - 1 / distance) * position / distance)
+
+
+def _normalised(gaussians: Gaussians, whole: Gaussians) -> Tensor:
+    """[N, 11 + 3 K] attributes scaled to length 1, as the authors' code has them (KeySS, appendix).
+
+    The opacities are one vector over the whole model; of every other attribute each Gaussian's is one.
+    """
+    return torch.cat(
+        [
+            F.normalize(gaussians.means, dim=1),
+            (gaussians.opacity_logits / whole.opacity_logits.norm())[:, None],
+            F.normalize(gaussians.quats, dim=1),
+            F.normalize(gaussians.log_scales, dim=1),
+            F.normalize(gaussians.sh.flatten(1), dim=1),
+        ],
+        dim=1,
+    )
+
+
+def add_residuals(gaussians: Gaussians, residuals: Mapping[str, Tensor], extent: Tensor) -> Gaussians:
+    """attribute* = attribute + residual (KeySS, eq. 9), on raw attributes; positions in units of `extent`."""
+    means, quats, log_scales = gaussians.means, gaussians.quats, gaussians.log_scales
+    opacity_logits, sh = gaussians.opacity_logits, gaussians.sh
+    if "op" in residuals:
+        opacity_logits = opacity_logits + residuals["op"][:, 0]
+    if "ro" in residuals:
+        quats = quats + residuals["ro"]
+    if "sc" in residuals:
+        log_scales = log_scales + residuals["sc"]
+    if "xyz" in residuals:
+        means = means + residuals["xyz"] * extent
+    if "sh" in residuals:
+        sh = sh + residuals["sh"].view_as(sh)
+    return Gaussians(means, quats, log_scales, opacity_logits, sh)

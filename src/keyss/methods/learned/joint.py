@@ -1,0 +1,271 @@
+"""The joint training of the published model and the decoder (KeySS, section 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
+from keyss.fitting.density import CappedStrategy
+from keyss.fitting.image_metrics import mean_psnr, thin
+from keyss.fitting.losses import photometric_loss
+from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
+from keyss.fitting.sampling import Shuffle
+from keyss.keys.derivation import random_embeddings
+from keyss.methods.learned.config import HideConfig, chosen_scenes
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.scramble import LEAST_OPACITY
+from keyss.methods.learned.start import HIDDEN_SLOPE, logit_limits, make_start
+from keyss.methods.learned.targets import CombinedPoses, PlacedScene
+from keyss.rendering import render_with_meta
+from keyss.rendering.visibility import possibly_seen
+
+LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
+
+# A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
+Drawn = tuple[dict[str, Any], Tensor | None, float]
+
+
+class JointRun:
+    """The state of a hiding, and its step: the losses of all scenes, each at one pose."""
+
+    def __init__(
+        self,
+        scenes: Sequence[PlacedScene],  # the cover, then the secrets
+        embeddings: Sequence[Tensor],  # [64] of each secret's key
+        config: HideConfig,
+        device: torch.device,
+    ) -> None:
+        self.config = config
+        self.device = device
+        self.scenes = scenes
+        self.embeddings = [embedding.to(device) for embedding in embeddings]
+        self.iterations = config.fit.iterations
+        self.iteration = 0
+        self.generator = torch.Generator().manual_seed(config.fit.seed)
+        self.poses = CombinedPoses(scenes, device)
+        self.watched = [thin(placed.scene.test, 8) for placed in scenes]
+        self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
+        self.owners = chosen_scenes(config.poses, len(scenes))
+        self.owner_order = Shuffle(len(self.owners), self.generator)
+        self.shuffles = [Shuffle(len(placed.scene.train), self.generator) for placed in scenes]
+        self.extent = scenes[0].scene.extent
+
+        start = make_start(scenes, config, self.generator)
+        self.warm = start.curves is not None
+        self.parameters = to_parameters(start.gaussians, device)
+        self.optimizers = make_optimizers(self.parameters, config.fit, self.extent)
+        self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
+        if self.warm:
+            self.rates = {name: config.warm_rate * rate for name, rate in self.rates.items()}
+            # The hidden opacities are drawn together: what moves them moves the secret's 1 / slope as far.
+            self.rates["opacities"] *= HIDDEN_SLOPE
+            self.logit_limits = logit_limits(self.parameters["opacities"].detach(), len(embeddings))
+        self.strategy = CappedStrategy(
+            config.fit,
+            self._largest_opacity if config.prune_by == "all" else None,
+            freeze=config.at_cap == "freeze",
+        )
+        self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
+
+        with torch.random.fork_rng():
+            torch.manual_seed(config.fit.seed)
+            # One for each secret: who opens one of them holds no network that knows another.
+            self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
+        for decoder, embedding in self._keyed_decoders():
+            decoder.prepare(self.gaussians(), embedding)
+        for decoder, curve in zip(self.decoders, start.curves or (), strict=False):
+            decoder.set_curve(*curve)
+        self._all_decoders = torch.nn.ModuleList(self.decoders)
+        weights = list(self._all_decoders.parameters())  # none for curves
+        self.decoder_optimizer = (
+            torch.optim.AdamW(weights, lr=config.decoder_rate, weight_decay=config.weight_decay)
+            if weights
+            else None
+        )
+
+    def __len__(self) -> int:
+        return len(self.parameters["means"])
+
+    def step(self) -> None:
+        config = self.config
+        self.iteration += 1
+        degree = config.fit.sh_degree if self.warm else config.fit.sh_degree_at(self.iteration)
+        poses = self._draw_poses()
+
+        def loss_of(drawn: Gaussians, scene: int) -> tuple[Tensor, dict[str, Any]]:
+            background, target = self.backgrounds[scene], self.poses.target(scene, *poses[scene])
+            image, meta = render_with_meta(
+                drawn, self.poses.camera(*poses[scene]), background, sh_degree=degree
+            )
+            return photometric_loss(image, target, config.fit.ssim_weight), meta
+
+        cover = to_gaussians(self.parameters)
+        cover_loss, meta = loss_of(cover, 0)
+        total = config.cover_weight * cover_loss
+        drawn: list[Drawn] = [(meta, None, config.cover_weight)]
+        for scene, (decoder, embedding) in enumerate(self._keyed_decoders(), start=1):
+            seen = possibly_seen(cover, self.poses.camera(*poses[scene]), 0.02 * self.extent)
+            loss, meta = loss_of(decoder(cover[seen], embedding, cover), scene)
+            total = total + config.secret_weight * loss
+            drawn.append((meta, seen, config.secret_weight))
+        if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
+            total = total + self._incorrect_loss(cover.detach(), poses[0], loss_of)
+
+        if not self.warm:
+            for meta, _, _ in drawn:
+                meta["means2d"].retain_grad()
+        total.backward()
+        self._set_rates()
+        for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
+            if optimizer is not None:
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+        if self.warm:
+            with torch.no_grad():
+                self.parameters["opacities"].clamp_(*self.logit_limits)
+        else:  # what a warm start chose from whole models, growth would only make worse
+            asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
+            combined = combine_densification(asking, len(self))
+            self.strategy.step_post_backward(
+                self.parameters, self.optimizers, self.density, self.iteration, combined
+            )
+
+    def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], loss_of: Any) -> Tensor:
+        """The cover is right already: only the decoders are to learn from wrong keys, in turns."""
+        config = self.config
+        decoder = self.decoders[self.iteration // config.incorrect_every % len(self.decoders)]
+        wrong = random_embeddings(1, self.generator)[0].to(self.device)
+        part = cover[possibly_seen(cover, self.poses.camera(*pose), 0.02 * self.extent)]
+        loss: Tensor = loss_of(decoder(part, wrong, cover), 0)[0]
+        return config.incorrect_weight * config.incorrect_every * len(self.decoders) * loss
+
+    def _draw_poses(self) -> list[tuple[int, int]]:
+        """For each scene whose training pose it is drawn from, and which one."""
+        count = len(self.scenes)
+        if float(torch.rand((), generator=self.generator)) < self.config.common_poses:
+            owner = self.owners[self.owner_order.draw()]
+            return [(owner, self.shuffles[owner].draw())] * count
+        return [(scene, self.shuffles[scene].draw()) for scene in range(count)]
+
+    def _keyed_decoders(self) -> list[tuple[Decoder, Tensor]]:
+        """Each secret's decoder and what its key becomes."""
+        return list(zip(self.decoders, self.embeddings, strict=True))
+
+    def _set_rates(self) -> None:
+        progress = self.iteration / self.iterations
+        # Constant rates leave everything trembling, which a warm start has no growth to make up for.
+        late = LAST_RATE ** max(0.0, 2 * progress - 1) if self.warm else 1.0
+        for name, optimizer in self.optimizers.items():
+            decay = 0.01**progress if name == "means" else late
+            optimizer.param_groups[0]["lr"] = self.rates[name] * decay
+        if self.decoder_optimizer is not None:
+            warm_up = min(1.0, self.iteration / 100)
+            self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress
+
+    @torch.no_grad()
+    def _largest_opacity(self) -> Tensor:
+        """[N] the largest opacity over the cover and all secrets."""
+        gaussians = self.gaussians()
+        opacities = [gaussians.opacities]
+        opacities += [self._decoded(secret, gaussians).opacities for secret in range(len(self.decoders))]
+        return torch.stack(opacities).amax(0)
+
+    def drawn(self) -> Tensor:
+        """[N] whether a Gaussian is drawn in any scene: what is not would only give away where it lies."""
+        return self._largest_opacity() >= LEAST_OPACITY
+
+    def _decoded(self, secret: int, gaussians: Gaussians) -> Gaussians:
+        decoded: Gaussians = self.decoders[secret](gaussians, self.embeddings[secret])
+        return decoded
+
+    def gaussians(self) -> Gaussians:
+        """The model as it would be published."""
+        return to_gaussians(self.parameters).detach()
+
+    @torch.no_grad()
+    def evaluate(self) -> dict[str, float]:
+        gaussians = self.gaussians()
+        numbers = {"cover": mean_psnr(gaussians, self.watched[0], self.backgrounds[0])}
+        for secret in range(1, len(self.scenes)):
+            name = "secret" if len(self.embeddings) == 1 else f"secret {secret}"
+            decoded = self._decoded(secret - 1, gaussians)
+            numbers[name] = mean_psnr(decoded, self.watched[secret], self.backgrounds[secret])
+        return numbers
+
+    def state(self) -> tuple[State, dict[str, Any]]:
+        tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
+        tensors |= {f"decoders.{name}": value for name, value in self._all_decoders.state_dict().items()}
+        adam = self.decoder_optimizer.state_dict()["state"] if self.decoder_optimizer is not None else {}
+        for index, moments in adam.items():
+            tensors |= {f"decoder_adam.{index}.{name}": value for name, value in moments.items()}
+        tensors |= {"owners": self.owner_order.state(), "generator": self.generator.get_state()}
+        tensors |= {f"order.{i}": shuffle.state() for i, shuffle in enumerate(self.shuffles)}
+        return tensors, {"iteration": self.iteration}
+
+    def load(self, tensors: State, meta: dict[str, Any]) -> None:
+        unpack_optimizers(tensors, self.parameters, self.optimizers)
+        unpack_density(tensors, self.density, self.device)
+        prefix = "decoders."
+        self._all_decoders.load_state_dict(
+            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+        )
+        if self.decoder_optimizer is not None:
+            adam = self.decoder_optimizer.state_dict()
+            for name, value in tensors.items():
+                if name.startswith("decoder_adam."):
+                    _, index, key = name.split(".")
+                    adam["state"].setdefault(int(index), {})[key] = value
+            self.decoder_optimizer.load_state_dict(adam)
+        self.owner_order.load(tensors["owners"])
+        for i, shuffle in enumerate(self.shuffles):
+            shuffle.load(tensors[f"order.{i}"])
+        self.generator.set_state(tensors["generator"])
+        self.iteration = int(meta["iteration"])
+
+
+def decoder_shape(config: HideConfig) -> DecoderShape:
+    """The sizes of the decoder that `config` asks for."""
+    return DecoderShape(
+        mask=config.mask,
+        kind=config.decoder,
+        hidden=config.hidden,
+        branch=config.branch,
+        frequencies=config.frequencies,
+        sh_degree=config.fit.sh_degree,
+        design=config.design,
+        residuals=config.residuals,
+        conditioning=config.conditioning,
+    )
+
+
+def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
+    """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
+
+    `drawn` holds for each render its meta, the indices of the Gaussians it was made of (None: all
+    `count`), and the weight of its loss, by which its gradients are divided to be as large as those that
+    the thresholds of plain 3DGS are meant for.
+    """
+    device = drawn[0][0]["means2d"].device
+    gradients = torch.zeros(len(drawn), count, 2, device=device)
+    radii = torch.zeros(len(drawn), count, 2, device=device)
+    width, height = drawn[0][0]["width"], drawn[0][0]["height"]
+    for row, (meta, indices, weight) in enumerate(drawn):
+        where = slice(None) if indices is None else indices
+        size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
+        gradients[row, where] = meta["means2d"].grad[0] * (size / weight)
+        radii[row, where] = meta["radii"][0].float()
+    means2d = torch.zeros_like(gradients)
+    means2d.grad = gradients
+    return {
+        "means2d": means2d,
+        "radii": radii,
+        "width": width,
+        "height": height,
+        "n_cameras": 1,
+        "gaussian_ids": None,
+    }

@@ -1,0 +1,126 @@
+"""What the joint training starts from: the plain models' Gaussians (warm), or sparse points (the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.fitting.image_metrics import thin
+from keyss.fitting.parameters import initial_gaussians, initial_points
+from keyss.methods.learned.config import HideConfig, chosen_scenes
+from keyss.methods.learned.targets import PlacedScene
+from keyss.rendering.visibility import contributions
+
+# Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
+# higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
+# band of logits of its own, from low - 0.5 to high + 0.5 of `opacity_curve`; bands must not touch.
+DRAWN_LOGIT, UNDRAWN_LOGIT = -5.54, -5.6
+HIDDEN_LOGIT, HIDDEN_STEP = -8.2, -3.7
+HIDDEN_SLOPE = 0.25
+SHOWN_LOGITS = (-4.0, 6.0)
+TRANSPARENT_LOGIT = -8.0
+SELECTION_VIEWS = 64
+
+
+@dataclass(frozen=True)
+class Start:
+    """Initial Gaussians of the published model."""
+
+    gaussians: Gaussians
+    # For each secret the knots and values that its decoder's opacity curve starts with, or nothing known yet.
+    curves: tuple[tuple[list[float], list[float]], ...] | None
+
+
+def make_start(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
+    """The start for the cover (first of `scenes`) and its secrets."""
+    if config.start == "points":
+        return _from_points(scenes, config, generator)
+    return _from_models(scenes, config)
+
+
+def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
+    """Combined SfM points: an equal share of the cap for every scene, what one leaves goes to the others."""
+    fit = config.fit
+    chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
+    clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in chosen]
+    shares = _shares([len(points) for points, _ in clouds], [1.0] * len(clouds), fit.max_gaussians)
+    parts = [
+        initial_gaussians(points, colors, fit.sh_degree, share, generator)
+        for (points, colors), share in zip(clouds, shares, strict=True)
+    ]
+    return Start(Gaussians.cat(parts), None)
+
+
+def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
+    """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
+    plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
+    # What is never drawn would lie among the hidden.
+    plains = [plain[plain.opacity_logits > DRAWN_LOGIT] for plain in plains]
+    weights = [1.0] + [config.secret_share] * (len(scenes) - 1)
+    shares = _shares([len(plain) for plain in plains], weights, config.fit.max_gaussians)
+    chosen = [
+        _most_contributing(plain, placed.scene, share)
+        for plain, placed, share in zip(plains, scenes, shares, strict=True)
+    ]
+    parts = chosen[:1] + [
+        replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
+        for secret, part in enumerate(chosen[1:])
+    ]
+    return Start(Gaussians.cat(parts), tuple(opacity_curve(secret) for secret in range(len(chosen) - 1)))
+
+
+def hidden_logits(logits: Tensor, secret: int) -> Tensor:
+    """[N] what the opacity logits [N] of a secret (0, 1, ...) are in the cover."""
+    return HIDDEN_LOGIT + HIDDEN_STEP * secret + HIDDEN_SLOPE * logits.clamp(*SHOWN_LOGITS)
+
+
+def opacity_curve(secret: int) -> tuple[list[float], list[float]]:
+    """Knots and values of the opacity curve that undoes `hidden_logits` and makes all others transparent."""
+    middle = HIDDEN_LOGIT + HIDDEN_STEP * secret
+    low, high = (middle + HIDDEN_SLOPE * logit for logit in SHOWN_LOGITS)
+    knots = [-40.0, low - 0.5, low - 0.1, high + 0.4, high + 0.5, 40.0]
+    shown = (
+        [TRANSPARENT_LOGIT] * 2 + [(x - middle) / HIDDEN_SLOPE for x in knots[2:4]] + [TRANSPARENT_LOGIT] * 2
+    )
+    return knots, [y - x for x, y in zip(knots, shown, strict=True)]
+
+
+def logit_limits(logits: Tensor, secrets: int) -> tuple[Tensor, Tensor]:
+    """[N] least and [N] largest opacity logits that leave each Gaussian to the scene that it starts with.
+
+    A secret's stays where its opacity curve shows it: one that left the band would be transparent in every
+    scene, where nothing scrambles it. One of the cover's stays above all bands.
+    """
+    low, high = torch.full_like(logits, UNDRAWN_LOGIT), torch.full_like(logits, torch.inf)
+    for secret in range(secrets):
+        knots, _ = opacity_curve(secret)
+        own = (logits > knots[1]) & (logits < knots[4])
+        low[own], high[own] = knots[2], knots[3]
+    return low, high
+
+
+def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
+    """`total` items divided by `weights`, nowhere more than `available`; what is left over is given on."""
+    shares = [0] * len(available)
+    while (left := total - sum(shares)) > 0:
+        open_ends = [i for i in range(len(available)) if shares[i] < available[i]]
+        if not open_ends:
+            break
+        weight = sum(weights[i] for i in open_ends)
+        for i in open_ends:
+            fair = max(1, int(left * weights[i] / weight))
+            shares[i] += min(fair, available[i] - shares[i], total - sum(shares))
+    return shares
+
+
+def _most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
+    """The `count` Gaussians that add most to what the training views show, in their order."""
+    if count >= len(plain):
+        return plain
+    cameras = [view.camera for view in thin(scene.train, SELECTION_VIEWS)]
+    return plain[contributions(plain, cameras).topk(count).indices.sort().values]

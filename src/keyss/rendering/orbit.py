@@ -1,0 +1,123 @@
+"""Scenes made of models: what a 3DGS model shows from all around takes the place of photos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.scene import Camera, Scene, View
+from keyss.methods.learned.config import HideConfig
+from keyss.rendering import render
+
+VIEWS = 96
+IMAGE_SIZE = 400  # pixels of a square picture
+FIELD_OF_VIEW = 50.0  # degrees
+HIGHEST = 60.0  # degrees of elevation, and of depression
+# Distances in turn, in units of that from which the whole model is seen: people look at all of it, then near.
+DISTANCES = (1.0, 0.75, 1.0, 0.5)
+TEST_EVERY = 8
+
+
+def is_model(source: str | Path | Gaussians) -> bool:
+    """Whether a source is a model, or the name of one, and not a folder of photos."""
+    return isinstance(source, Gaussians) or Path(source).suffix.lower() == ".ply"
+
+
+@torch.no_grad()
+def scene_of_model(
+    model: Gaussians, name: str, *, size: int | None = None, background: Tensor | None = None
+) -> Scene:
+    """Pictures of `model`, size x size, from cameras around it; every eighth is kept for testing.
+
+    The cameras stand on a spiral over a sphere and look at the middle of what can be seen; up is -y, as
+    captures made with COLMAP have it and as viewers assume.
+    """
+    background = torch.zeros(3) if background is None else background
+    views = []
+    for camera in orbit(model, size or IMAGE_SIZE):
+        image = render(model, camera, background.to(model.device))
+        views.append(View(camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()))
+    colors = ((model.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1) * 255).round().to(torch.uint8)
+    return Scene(
+        name,
+        train=tuple(view for index, view in enumerate(views) if index % TEST_EVERY),
+        test=tuple(views[::TEST_EVERY]),
+        points=model.means.cpu(),
+        colors=colors.cpu(),
+        background=background.cpu(),
+    )
+
+
+def orbit(model: Gaussians, size: int) -> list[Camera]:
+    """VIEWS square cameras around a model."""
+    middle, radius = middle_and_radius(model)
+    focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    reach = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+    limit = math.sin(math.radians(HIGHEST))
+    cameras = []
+    for index in range(VIEWS):
+        # Equal steps of the sine of the elevation, golden steps of the azimuth: evenly over the sphere.
+        height = limit * (1 - 2 * (index + 0.5) / VIEWS)
+        azimuth = index * math.pi * (3 - math.sqrt(5))
+        flat = math.sqrt(1 - height * height)
+        outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
+        position = middle + outward * reach * DISTANCES[index % len(DISTANCES)]
+        cameras.append(_looking(position, -outward, K, size, f"orbit_{index:03d}.png"))
+    return cameras
+
+
+def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
+    """[3] where what can be seen of a model lies, and how far it reaches (world units).
+
+    Gaussians count by opacity and size. The radius holds nine tenths of them, but is at most three times
+    that of the nearer half: around an object, that is all of it; in an unbounded scene, its middle.
+    """
+    scales = model.scales.sort(dim=1).values
+    weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu()
+    means = model.means.cpu()
+    middle = torch.stack([_quantile(means[:, axis], weight, 0.5) for axis in range(3)])
+    distance = (means - middle).norm(dim=1)
+    half, most = (float(_quantile(distance, weight, share)) for share in (0.5, 0.9))
+    return middle, max(min(most, 3 * half), 1e-6)
+
+
+def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
+    values, order = values.sort()
+    total = weight[order].double().cumsum(0)
+    return values[int(torch.searchsorted(total, share * total[-1]).clamp_max(len(values) - 1))]
+
+
+def _looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str) -> Camera:
+    """A camera at `position` that looks along the unit vector `forward`, with -y up."""
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    right = right / right.norm()
+    down = torch.linalg.cross(forward, right)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, down, forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return Camera(viewmat, K, size, size, name)
+
+
+def room_for_models(config: HideConfig, models: Sequence[Gaussians]) -> HideConfig:
+    """`config` with a cap that holds all `models`, the SH degree they need, and a short, gentle schedule.
+
+    Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are. Where
+    nothing has to be left out the start is right already, and large steps would only do harm.
+    """
+    return replace(
+        config,
+        warm_rate=0.1,
+        fit=replace(
+            config.fit,
+            iterations=min(config.fit.iterations, 400),
+            max_gaussians=max(16, sum(len(model) for model in models)),
+            sh_degree=max(1, *(model.sh_degree for model in models)),
+        ),
+    )

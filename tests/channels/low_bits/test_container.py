@@ -1,0 +1,337 @@
+"""Payloads in a model's low bits: what they survive, who can read them, and what can be seen of them."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gsply
+import numpy as np
+import plyfile
+import pytest
+import torch
+from argon2.low_level import Type, hash_secret_raw
+
+from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
+from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
+from keyss.channels.low_bits.bits import identities, is_random, read_low_bits
+from keyss.channels.low_bits.byte_plan import capacity, cells_for, check_room, plan
+from keyss.channels.low_bits.container import embed, embed_derived, extract, extract_derived, smallest
+from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
+from keyss.files.ply import read_ply, write_ply
+from keyss.keys import DerivedKey, generate_key
+from keyss.keys.derivation import ALPHABET
+from keyss.rendering import render
+from tiny_scenes import ring_cameras
+
+__all__ = ["splat_transform"]  # a fixture
+
+PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
+KEY = "the right key"
+GENERATED = "q7Rv2LxT9bWm4KzD"
+SMALLEST = 540  # Gaussians that carry a byte
+
+
+@pytest.fixture(scope="module")
+def plain() -> Gaussians:
+    return trained_like(1500)
+
+
+@pytest.fixture(scope="module")
+def stego(plain: Gaussians) -> Gaussians:
+    return embed(plain, [(KEY, PAYLOAD)])
+
+
+def test_round_trip(stego: Gaussians) -> None:
+    assert extract(stego, KEY) == PAYLOAD
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_round_trip_of_lower_degrees(degree: int) -> None:
+    model = trained_like(4000, sh_degree=degree)
+    own = keys()
+    stego = embed_derived(model, [(own, PAYLOAD[:1500])])
+    assert extract_derived(stego, own[0]) == PAYLOAD[:1500]
+
+
+def test_the_same_again_gives_the_same_bits_and_other_payloads_others(plain: Gaussians) -> None:
+    own = keys()
+    stego = embed_derived(plain, [(own, PAYLOAD)])
+    assert_same_bits(embed_derived(plain, [(own, PAYLOAD)]), stego)
+    other = embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")])
+    same = (read_low_bits(other) == read_low_bits(stego))[is_random(plain)].mean()
+    assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
+
+
+def test_only_low_bits_of_some_fields_change(plain: Gaussians, stego: Gaussians) -> None:
+    assert torch.equal(plain.means, stego.means)
+    assert torch.equal(plain.sh[:, 0], stego.sh[:, 0])
+    for name, bits in (("log_scales", 9), ("quats", 9), ("opacity_logits", 9), ("sh", 13)):
+        before, after = (getattr(model, name).contiguous().view(torch.int32) for model in (plain, stego))
+        assert not torch.equal(before, after)
+        assert torch.equal(before >> bits, after >> bits), name
+        assert torch.equal(before & 1, after & 1), name
+    assert identities(plain) == identities(stego)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: int) -> None:
+    order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
+    own = keys()
+    kept = embed_derived(stego, [(own, PAYLOAD)])[order[: len(stego) * 3 // 4]]
+    salt = smallest(identities(stego)).index(smallest(identities(kept))[0])
+    assert extract_derived(kept, own[salt]) == PAYLOAD
+    if seed == 0:
+        assert extract(stego[order[: len(stego) * 3 // 4]], KEY) == PAYLOAD
+
+
+def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
+    model = trained_like(4000)
+    own, other = keys(), keys(1)
+    room = capacity(4000)
+    stego = embed_derived(model, [(own, os.urandom(room * 9 // 10))])
+    order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
+    names = identities(stego)
+    first = smallest(names)[0]
+    rest = stego[torch.cat([torch.tensor([names.index(first)]), order[:1500]])]
+    with pytest.raises(InputError, match="too much of the model"):
+        extract_derived(rest, own[0])
+    with pytest.raises(WrongKeyError):
+        extract_derived(rest, other[0])
+
+
+Columns = dict[str, np.ndarray]
+OTHER_FILES: dict[str, Callable[[Columns], bytes]] = {
+    "without normals": lambda columns: ply_bytes(_without_normals(columns)),
+    "with unknown properties": lambda columns: ply_bytes({**columns, "label": np.ones(len(columns["x"]))}),
+    "in another order": lambda columns: ply_bytes(dict(reversed(columns.items()))),
+    "big-endian": lambda columns: ply_bytes(columns, form="binary_big_endian"),
+    "in double precision": lambda columns: ply_bytes(columns, kinds=dict.fromkeys(columns, "double")),
+    "as text": lambda columns: ply_bytes(_without_normals(columns), form="ascii"),
+}
+
+
+def _without_normals(columns: Columns) -> Columns:
+    return {name: values for name, values in columns.items() if name not in ("nx", "ny", "nz")}
+
+
+@pytest.mark.parametrize("name", OTHER_FILES)
+def test_survives_other_files(stego: Gaussians, tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.ply").write_bytes(OTHER_FILES[name](columns_of(stego)))
+    again = read_ply(tmp_path / "a.ply")
+    assert_same_bits(again, stego)
+    assert extract(again, KEY) == PAYLOAD
+
+
+def _resave_by_plyfile(source: Path, target: Path) -> None:
+    data = plyfile.PlyData.read(source)
+    plyfile.PlyData([plyfile.PlyElement.describe(data["vertex"].data.copy(), "vertex")]).write(target)
+
+
+RESAVERS: dict[str, Callable[[Path, Path], object]] = {
+    "keyss": lambda source, target: write_ply(target, read_ply(source)),
+    "gsply": lambda source, target: gsply.plywrite(target, gsply.plyread(source)),
+    "plyfile": _resave_by_plyfile,
+}
+
+
+@pytest.mark.parametrize("name", RESAVERS)
+def test_survives_being_saved_again(stego: Gaussians, tmp_path: Path, name: str) -> None:
+    write_ply(tmp_path / "in.ply", stego)
+    RESAVERS[name](tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_ply(tmp_path / "out.ply"), KEY) == PAYLOAD
+
+
+def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "in.ply", stego)
+    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_ply(copy), KEY) == PAYLOAD
+
+
+def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:
+    model, first, second = trained_like(3000, seed=5), keys(1), keys(2)
+    stego = embed_derived(model, [(first, b"first"), (second, PAYLOAD)])
+    assert extract_derived(stego, first[0]) == b"first"
+    assert extract_derived(stego, second[0]) == PAYLOAD
+    with pytest.raises(WrongKeyError):
+        extract_derived(stego, keys(3)[0])
+    with pytest.raises(UsageError, match="same key"):
+        embed_derived(model, [(first, b"a"), (first, b"b")])
+
+
+def test_the_holder_of_a_key_sees_the_same_whether_there_is_another_secret_or_not() -> None:
+    """As many own cells, as much of the rest changed, and that rest as random."""
+    model, own, other = trained_like(4000, seed=6), keys(1), keys(2)
+    before = read_low_bits(model)
+    stegos = [
+        embed_derived(model, [(own, PAYLOAD)]),
+        embed_derived(model, [(own, PAYLOAD), (other, os.urandom(20_000))]),
+    ]
+    seen = [_opened(stego, own[0]) for stego in stegos]
+    assert len(seen[0]) == len(seen[1])  # header cells; the data cells follow from the same plan
+    changed = [(read_low_bits(stego) != before).any(axis=1).mean() for stego in stegos]
+    assert changed[0] == changed[1] == is_random(model).mean()
+    for stego in stegos:
+        counts = np.bincount(read_low_bits(stego).ravel(), minlength=256)
+        expected = counts.sum() / 256
+        assert ((counts - expected) ** 2).sum() / expected < 255 + 6 * (2 * 255) ** 0.5
+
+
+def _opened(stego: Gaussians, key: DerivedKey) -> list[tuple[int, bytes]]:
+    from keyss.channels.low_bits.container import _header_cipher
+
+    return list(_header_cipher(key).open_all(identities(stego), [r.tobytes() for r in read_low_bits(stego)]))
+
+
+def _neighbours(key: str) -> list[str]:
+    """`key` with one character changed to any other of the alphabet, or its cases exchanged."""
+    changed = {key[:i] + c + key[i + 1 :] for i in range(len(key)) for c in ALPHABET}
+    return sorted((changed | {key.swapcase(), key.upper(), key.lower()}) - {key})
+
+
+def test_a_thousand_random_keys_open_nothing() -> None:
+    """Below Argon2id, whose output is replaced: it is what keys differ in."""
+    model, own = trained_like(SMALLEST, seed=3), keys()
+    stego = embed_derived(model, [(own, b"x")])
+    names = identities(stego)
+    assert extract_derived(stego, own[0], names) == b"x"
+    for number in range(1000):
+        with pytest.raises(WrongKeyError):
+            extract_derived(stego, DerivedKey.of_master(number.to_bytes(32, "big")), names)
+
+
+def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All the way from the text, with an Argon2id that takes 64 KiB and one pass, which no file may ask for.
+
+    At full cost the same is done by `test_wrong_keys_at_full_cost`.
+    """
+
+    def cheap(secret: bytes, salt: bytes, **costs: object) -> bytes:
+        return hash_secret_raw(secret, salt, 1, 64, 1, 32, Type.ID)
+
+    monkeypatch.setattr("keyss.keys.derivation.hash_secret_raw", cheap)
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    neighbours = _neighbours(GENERATED)
+    assert len(neighbours) == 16 * 61 + 3
+    for neighbour in neighbours:
+        with pytest.raises(WrongKeyError):
+            extract(stego, neighbour)
+
+
+@pytest.mark.slow
+def test_wrong_keys_at_full_cost() -> None:
+    """1,000 random keys and all one-character neighbours, as a person would try them; 3 to 10 minutes."""
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    for wrong in [*_neighbours(GENERATED), *(generate_key() for _ in range(1000))]:
+        with pytest.raises(WrongKeyError):
+            extract(stego, wrong)
+
+
+def test_a_wrong_key_makes_the_same_work_as_a_right_one(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the decryption, counting what takes long; in seconds: benchmarks/attempts.py."""
+    work: Counter[str] = Counter()
+
+    def count(where: str) -> None:
+        module, name = where.rsplit(".", 1)
+        real = getattr(importlib.import_module(module), name)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            work[name] += 1
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(where, counted)
+
+    for where in ("keys.hash_secret_raw", "container.identities", "container.read_low_bits", "cells.blake2b"):
+        count(f"keyss.channels.low_bits.{where}")
+    assert extract(stego, KEY) == PAYLOAD
+    right = work.copy()
+    work.clear()
+    with pytest.raises(WrongKeyError):
+        extract(stego, "The right key")
+    assert right["hash_secret_raw"] == work["hash_secret_raw"] == 1
+    assert right == work
+
+
+def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain, KEY)
+    with pytest.raises(WrongKeyError):
+        extract(trained_like(50, sh_degree=0), KEY)
+
+
+def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
+    with pytest.raises(UsageError, match=r"too small.*Gaussians \(--max-gaussians\) would do.*--sidecar"):
+        embed_derived(trained_like(300), [(keys(), PAYLOAD)])
+    with pytest.raises(UsageError, match="spherical harmonics"):
+        check_room(100, 10_000, 1, sh_degree=0)
+    with pytest.raises(UsageError, match="for each of 2 secrets"):
+        check_room(126_000, 5_000, 2, sh_degree=3)
+    check_room(126_000, 10_000, 1, sh_degree=3)  # the demo
+
+
+def test_capacity_grows_with_the_model_and_its_plan_is_kept_to() -> None:
+    sizes = [capacity(cells) for cells in (100, 500, 1000, 5000, 20_000, 200_000)]
+    assert sizes == sorted(sizes)
+    assert sizes[0] == 0
+    assert sizes[-1] / 200_000 > 18
+    assert capacity(20_000, 2) == capacity(20_000, 1) > 1.9 * capacity(20_000, 3)
+    for size in (4096, 131_072):
+        need = cells_for(size, 1, 3)
+        assert capacity(need) >= size > capacity(need - 1)
+        assert plan(need, 1, 3, size) is not None
+        assert plan(need - 1, 1, 3, size) is None
+
+
+@pytest.mark.parametrize("change", UNNATURAL)
+def test_models_without_random_low_bits_are_refused(
+    change: Callable[[Gaussians], Gaussians], plain: Gaussians
+) -> None:
+    with pytest.raises(InputError, match=r"low bits.*--sidecar"):
+        embed_derived(change(plain), [(keys(), b"x")])
+
+
+def test_values_that_are_not_random_stay_as_they_are() -> None:
+    model = trained_like(1500, seed=8)
+    model.quats[:100] = torch.tensor([1.0, 0, 0, 0])
+    model.sh[100:200, 4:] = 0
+    model.opacity_logits[200:230] = 0.1234567
+    twice = Gaussians.cat([model, model[300:310]])
+    usable = is_random(twice)
+    assert not usable[:230].any()
+    assert not usable[300:310].any()
+    assert not usable[-10:].any()
+    assert usable[310:1500].mean() > 0.95
+    stego = embed_derived(twice, [(keys(), b"x")])
+    assert_same_bits(stego[torch.from_numpy(~usable)], twice[torch.from_numpy(~usable)])
+
+
+def test_values_that_are_nearly_equal_stay_as_they_are() -> None:
+    """Grey colours and round Gaussians, whichever low bits their values have."""
+    model = trained_like(3000, seed=8)
+    grey, round_ = slice(0, 300), slice(300, 600)
+    model.sh[grey, 7, 2] = model.sh[grey, 7, 0] * (1 + 1e-5)
+    model.log_scales[round_, 1] = model.log_scales[round_, 2] * (1 - 1e-6)
+    usable = is_random(model)
+    assert not usable[:600].any()
+    assert usable[600:].mean() > 0.95
+    stego = embed_derived(model, [(keys(), b"x")])
+    assert np.array_equal(is_random(stego)[:600], usable[:600])
+    assert_same_bits(model[:600], stego[:600])
+
+
+def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
+    model = trained_like(1500, seed=9)
+    model = replace(model, means=model.means / 4, log_scales=model.log_scales + 1, sh=model.sh * 2)
+    stego = embed_derived(model, [(keys(), PAYLOAD)])
+    for camera in ring_cameras(4):
+        error = (render(model, camera) - render(stego, camera)).square().mean()
+        assert -10 * torch.log10(error) > 70

@@ -1,0 +1,51 @@
+"""A classifier on low-bit statistics does not tell embedded models from others, and would if it could.
+
+The models are synthetic here, which shows that embedding leaves no trace of its own. That trained models have
+random low bits to begin with is measured on real ones: docs/threat-model.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from channels.low_bits.steganalysis import features, held_out_auc
+from channels.low_bits.trained_like import keys, trained_like
+from keyss.channels.low_bits.container import embed_derived
+from keyss.core import Gaussians
+
+MODELS = 24
+
+
+@pytest.fixture(scope="module")
+def models() -> list[Gaussians]:
+    return [trained_like(1200, seed=100 + seed) for seed in range(MODELS)]
+
+
+def _auc(plain: list[Gaussians], changed: list[Gaussians]) -> dict[str, float]:
+    x = np.array([features(model) for model in (*plain, *changed)])
+    y = np.repeat([0, 1], MODELS)
+    scenes = np.tile(np.arange(MODELS) // 4, 2)
+    return held_out_auc(x, y, scenes)
+
+
+def test_embedded_models_look_like_others(models: list[Gaussians]) -> None:
+    embedded = [embed_derived(model, [(keys(seed), bytes(2000))]) for seed, model in enumerate(models)]
+    for name, auc in _auc(models, embedded).items():
+        # 0.55 and two standard errors of an AUC of 24 against 24 under the null hypothesis
+        assert auc <= 0.55 + 2 * ((2 * MODELS + 1) / (12 * MODELS**2)) ** 0.5, name
+
+
+def test_the_classifier_notices_what_it_is_made_for(models: list[Gaussians]) -> None:
+    """The control: bits with a bias of one in fifty, as a careless cipher or rounding to even would leave."""
+
+    def biased(model: Gaussians, seed: int) -> Gaussians:
+        words = model.sh[:, 1:].contiguous().numpy().view(np.uint32).copy()
+        chosen = np.random.default_rng(seed).random(words.shape) < 0.02
+        words[chosen] &= ~np.uint32(2)
+        sh = model.sh.clone()
+        sh[:, 1:] = sh.new_tensor(words.view(np.float32))
+        return Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits, sh)
+
+    auc = _auc(models, [biased(model, seed) for seed, model in enumerate(models)])
+    assert auc["logistic"] > 0.8

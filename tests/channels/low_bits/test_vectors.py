@@ -1,0 +1,66 @@
+"""Known answers: files written today open tomorrow, and what must fail fails for the reason named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from keyss.channels.low_bits.byte_cells import CellCipher
+from keyss.core import errors
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys.sealed import unseal
+
+FOLDER = Path(__file__).parents[3] / "tests" / "vectors"
+DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
+SEALING = json.loads((FOLDER / "sealing.json").read_text())
+COSTS = ("time_cost", "memory_kib", "parallelism")
+
+
+def _derived(vector: dict[str, Any]) -> DerivedKey:
+    costs = {name: vector[name] for name in COSTS if name in vector}
+    return DerivedKey(vector["key"], KeyDerivation(salt=bytes.fromhex(vector["salt"]), **costs))
+
+
+@pytest.mark.parametrize("vector", DERIVATION["valid"], ids=lambda vector: ascii(vector["key"]))
+def test_derivation(vector: dict[str, Any]) -> None:
+    key = _derived(vector)
+    assert key.verifier().hex() == vector["verifier"]
+    for label in ("seal", "cells/header"):
+        assert key.expand(label, 32).hex() == vector[label]
+    assert key.embedding()[:4].tolist() == pytest.approx(vector["embedding_first_4"], abs=2e-6)
+
+
+@pytest.mark.parametrize("vector", DERIVATION["invalid"], ids=lambda vector: vector["why"])
+def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
+    with pytest.raises(getattr(errors, vector["error"])):
+        _derived(vector)
+
+
+def test_sealing() -> None:
+    vector = SEALING["sealed"]
+    parts = (bytes.fromhex(vector[name]) for name in ("data_key", "sealed", "associated"))
+    assert unseal(*parts).hex() == vector["payload"]
+
+
+@pytest.mark.parametrize("vector", SEALING["invalid"], ids=lambda vector: vector["why"])
+def test_sealing_that_must_fail(vector: dict[str, Any]) -> None:
+    good = SEALING["sealed"]
+    with pytest.raises(getattr(errors, vector["error"]), match=vector["words"]):
+        unseal(
+            bytes.fromhex(good["data_key"]),
+            bytes.fromhex(vector["sealed"]),
+            bytes.fromhex(good["associated"]),
+        )
+
+
+def test_cell() -> None:
+    vector = SEALING["cell"]
+    secret, identity, data, cell = (
+        bytes.fromhex(vector[name]) for name in ("secret", "identity", "data", "cell")
+    )
+    cipher = CellCipher(secret, vector["label"])
+    assert cipher.close(identity, vector["number"], data) == cell
+    assert cipher.open(identity, cell) == (vector["number"], data)

@@ -1,0 +1,50 @@
+"""Models whose values look as after training, made in milliseconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from keyss.channels.low_bits.byte_plan import SALTS
+from keyss.core import Gaussians
+from keyss.keys import DerivedKey
+
+
+def trained_like(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
+    """Normal numbers of the magnitudes that training gives, every bit of their mantissas random."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int, mean: float = 0.0, spread: float = 1.0) -> torch.Tensor:
+        return (mean + spread * torch.randn(*shape, generator=generator, dtype=torch.float64)).float()
+
+    return Gaussians(
+        means=normal(count, 3, spread=2.0),
+        quats=normal(count, 4),
+        log_scales=normal(count, 3, mean=-4.0),
+        opacity_logits=normal(count, spread=2.0),
+        sh=normal(count, (sh_degree + 1) ** 2, 3, spread=0.1),
+    )
+
+
+def keys(seed: int = 0) -> list[DerivedKey]:
+    """A key under every salt, without Argon2id: its output is replaced by random bytes."""
+    generator = torch.Generator().manual_seed(10_000 + seed)
+    numbers = torch.randint(256, (SALTS, 32), generator=generator, dtype=torch.uint8)
+    return [DerivedKey.of_master(row.numpy().tobytes()) for row in numbers]
+
+
+def _half_precision(model: Gaussians) -> Gaussians:
+    return model.map(lambda values: values.half().float())
+
+
+def _eight_bits(model: Gaussians) -> Gaussians:
+    return model.map(lambda values: (values * 16).round() / 16 * 1.1)
+
+
+def _moved(model: Gaussians) -> Gaussians:
+    return replace(model, log_scales=model.log_scales * 2**-14 + 3.0)
+
+
+# What leaves no natural low bits.
+UNNATURAL = (_half_precision, _eight_bits, _moved)

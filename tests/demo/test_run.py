@@ -1,0 +1,98 @@
+"""The demo, at a size that takes seconds."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from keyss import api as verbs
+from keyss.core import OutputError
+from keyss.demo import run as demo
+from keyss.fitting.config import FitConfig
+from keyss.fitting.loop import Interrupted
+from keyss.methods.learned.config import HideConfig
+
+SMALL: dict[str, Any] = {
+    "config": HideConfig(fit=FitConfig(iterations=30, max_gaussians=300)),
+    "views": 16,
+    "width": 32,
+    "height": 24,
+    "device": "cpu",
+    "sidecar": True,  # so small a model has no room
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, demo.DemoResult]:
+    out = tmp_path_factory.mktemp("demo") / "out" / "demo"
+    return out, demo.run_demo(out, seed=3, **SMALL)
+
+
+def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResult]) -> None:
+    out, result = run
+    assert {path.name for path in out.iterdir()} == {
+        *("stego.ply", "secret.ply", "decoder.sealed", "metrics.json", "config.json", "private"),
+        *("comparison.png", "key.txt", "scenes"),
+    }
+    assert result.refused == len(demo.WRONG_KEYS)
+    assert result.metrics == json.loads((out / "metrics.json").read_text())
+    assert (out / "key.txt").read_text() == "demo-key-3\n"
+    with Image.open(out / "comparison.png") as picture:
+        assert picture.size[0] > 5 * 240
+
+
+def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
+    out, _ = run
+    verbs.reveal(out / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
+
+
+def test_one_seed_gives_the_same_bytes_in_another_place(
+    run: tuple[Path, demo.DemoResult], tmp_path: Path
+) -> None:
+    demo.run_demo(tmp_path, seed=3, **SMALL)
+    for name in ("stego.ply", "secret.ply", "decoder.sealed"):
+        assert (tmp_path / name).read_bytes() == (run[0] / name).read_bytes()
+
+
+def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
+    run: tuple[Path, demo.DemoResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "stego.ply").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="--overwrite"):
+        demo.run_demo(tmp_path, **SMALL)
+    assert (tmp_path / "stego.ply").read_text() == "old"
+
+    def interrupted(*args: object, **kwargs: object) -> None:
+        raise Interrupted(tmp_path / "checkpoint", 5)
+
+    def photos(folder: Path, which: str, **options: object) -> None:
+        shutil.copytree(run[0] / "scenes" / which, folder)
+
+    monkeypatch.setattr(verbs, "hide", interrupted)
+    monkeypatch.setattr(demo, "write_demo_scene", photos)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        demo.run_demo(tmp_path, overwrite=True, **SMALL)
+    assert not isinstance(caught.value, Interrupted)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    with pytest.raises(KeyboardInterrupt):
+        demo.run_demo(tmp_path / "new", **SMALL)
+    assert not (tmp_path / "new").exists()
+
+
+def test_contact_sheet() -> None:
+    red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
+    sheet = np.asarray(
+        demo.contact_sheet([("left", "", [red, red]), ("right", "1 dB", [blue, blue])], cell=80)
+    )
+    assert sheet.shape == (13 + 2 * 62 + 2, 2 + 2 * 82, 3)
+    assert (sheet[13:73, 2:82] == (255, 0, 0)).all()
+    assert (sheet[75:135, 84:164] == (0, 0, 255)).all()
+    assert (sheet[:13] != 255).any()

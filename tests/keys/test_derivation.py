@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import hashlib
+import hmac
+
+import pytest
+import torch
+from argon2.low_level import Type, hash_secret_raw
+
+from keyss.core import InputError, UsageError
+from keyss.keys import DerivedKey, KeyDerivation, generate_key, random_embeddings
+
+CHEAP = KeyDerivation(salt=b"0123456789abcdef", time_cost=1, memory_kib=8192, parallelism=1)
+
+
+def _expand(key: str, label: bytes, length: int) -> bytes:
+    """RFC 5869's second step over Argon2id, written out with hashlib only."""
+    prk = hash_secret_raw(key.encode(), CHEAP.salt, 1, 8192, 1, 32, Type.ID)
+    block, result, counter = b"", b"", 1
+    while len(result) < length:
+        block = hmac.new(prk, block + label + bytes([counter]), hashlib.sha256).digest()
+        result, counter = result + block, counter + 1
+    return result[:length]
+
+
+def test_derivation_is_argon2id_then_hkdf_with_labels() -> None:
+    key = DerivedKey("correct horse", CHEAP)
+    assert key.verifier() == _expand("correct horse", b"keyss/v1/verifier", 32)
+    words = _expand("correct horse", b"keyss/v1/embedding", 512)
+    numbers = [int.from_bytes(words[i : i + 8], "little") / 2**64 for i in range(0, 512, 8)]
+    normal = torch.distributions.Normal(0.0, 1.0).icdf(torch.tensor(numbers, dtype=torch.float64))
+    torch.testing.assert_close(key.embedding(), (normal / normal.norm()).float(), rtol=0, atol=1e-6)
+
+
+def test_embeddings_are_unit_vectors_and_unrelated_even_for_near_keys() -> None:
+    vectors = torch.stack([DerivedKey(k, CHEAP).embedding() for k in ("key", "kez", "Key", "key ")])
+    products = vectors @ vectors.T
+    torch.testing.assert_close(products.diagonal(), torch.ones(4))
+    assert (products - torch.eye(4)).abs().max() < 0.6  # 64 dimensions: a standard deviation of 0.125
+
+
+def test_keys_are_compared_after_unicode_normalisation() -> None:
+    composed, decomposed = DerivedKey("caf\u00e9 \ufb01", CHEAP), DerivedKey("cafe\u0301 fi", CHEAP)
+    assert composed.matches(decomposed.verifier())
+    assert not composed.matches(DerivedKey("cafe fi", CHEAP).verifier())
+
+
+def test_salt_changes_everything() -> None:
+    other = KeyDerivation(salt=b"fedcba9876543210", time_cost=1, memory_kib=8192, parallelism=1)
+    assert not DerivedKey("key", CHEAP).matches(DerivedKey("key", other).verifier())
+
+
+@pytest.mark.parametrize("key", ["", "x" * 5000])
+def test_empty_and_overlong_keys_are_refused(key: str) -> None:
+    with pytest.raises(UsageError):
+        DerivedKey(key, CHEAP)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"salt": b"short"}, {"memory_kib": 1 << 30}, {"memory_kib": 8}, {"time_cost": 0}, {"parallelism": 1000}],
+)
+def test_costs_out_of_range_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="key derivation"):
+        KeyDerivation(**({"salt": bytes(16)} | changes))  # type: ignore[arg-type]
+
+
+def test_generated_keys_are_alphanumeric_and_fresh() -> None:
+    keys = {generate_key() for _ in range(50)}
+    assert len(keys) == 50
+    assert all(len(key) == 16 and key.isalnum() and key.isascii() for key in keys)
+    assert len(generate_key(40)) == 40
+    with pytest.raises(UsageError):
+        generate_key(0)
+
+
+def test_random_embeddings_are_unit_vectors_from_the_generator() -> None:
+    first = random_embeddings(5, torch.Generator().manual_seed(3))
+    assert first.shape == (5, 64)
+    torch.testing.assert_close(first.norm(dim=1), torch.ones(5))
+    assert torch.equal(first, random_embeddings(5, torch.Generator().manual_seed(3)))

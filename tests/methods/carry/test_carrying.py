@@ -1,0 +1,379 @@
+"""Models in a model's low bits: what comes back, what they survive, who can read them, what can be seen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+
+from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
+from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
+from keyss.channels.low_bits.bits import identities, is_random, read_low_bits
+from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
+from keyss.files.ply import read_ply, write_ply
+from keyss.keys import DerivedKey
+from keyss.methods.carry import embed, extract
+from keyss.methods.carry.carrying import Carriers, _key_cipher, embed_derived, extract_derived
+from keyss.methods.carry.plan import Layout, Size, header_carriers, plan, room, thinned
+from keyss.methods.carry.table import Table
+from keyss.rendering import render
+from tiny_scenes import ring_cameras
+
+__all__ = ["splat_transform"]  # a fixture
+
+KEY = "the right key"
+ENTROPY = bytes(32)
+
+
+@pytest.fixture(scope="module")
+def cover() -> Gaussians:
+    return trained_like(3000)
+
+
+@pytest.fixture(scope="module")
+def secret() -> Gaussians:
+    return trained_like(1200, seed=1)
+
+
+@pytest.fixture(scope="module")
+def stego(cover: Gaussians, secret: Gaussians) -> Gaussians:
+    return embed(cover, [(KEY, secret)])
+
+
+def rows_of(model: Gaussians) -> set[bytes]:
+    """Its Gaussians as a set: what is revealed has another order."""
+    flat = [value.reshape(len(model), -1) for value in vars(model).values()]
+    return {row.tobytes() for row in torch.cat(flat, 1).numpy()}
+
+
+def salt_of(model: Gaussians, own: list[DerivedKey], before: Gaussians) -> DerivedKey:
+    """The key under the salt that a reader of `model` tries first."""
+    names = Carriers.of(before).salts()
+    return own[names.index(Carriers.of(model).salts()[0])]
+
+
+def test_round_trip(stego: Gaussians, secret: Gaussians) -> None:
+    carried = extract(stego, KEY)
+    assert carried.count == len(carried.gaussians) == len(secret)
+    found = carried.gaussians
+    order, other = found.means[:, 0].argsort(), secret.means[:, 0].argsort()
+    assert torch.allclose(found.means[order], secret.means[other], atol=1e-4)
+    assert torch.allclose(found.sh[order], secret.sh[other], atol=0.02)
+
+
+@pytest.mark.parametrize("cover_degree", [1, 2, 3])
+@pytest.mark.parametrize("secret_degree", range(4))
+def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secret_degree: int) -> None:
+    model, hidden = trained_like(3000, sh_degree=cover_degree), trained_like(900, 1, secret_degree)
+    own = keys()
+    if (cover_degree, secret_degree) in ((1, 1), (1, 2), (1, 3)):
+        with pytest.raises(
+            UsageError, match=f"SH degree 1 cannot carry a secret of SH degree {secret_degree}"
+        ):
+            embed_derived(model, [(own, hidden)])
+        return
+    carried = extract_derived(Carriers.of(embed_derived(model, [(own, hidden)])), own[0])
+    assert carried.gaussians.sh_degree == secret_degree
+    assert len(carried.gaussians) == 900
+
+
+def test_a_cover_without_spherical_harmonics_is_refused() -> None:
+    with pytest.raises(UsageError, match="SH degree 0 cannot carry"):
+        embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
+    with pytest.raises(WrongKeyError):
+        extract_derived(Carriers.of(trained_like(50, sh_degree=0)), keys()[0])
+
+
+def test_only_low_bits_of_some_fields_change(cover: Gaussians, stego: Gaussians) -> None:
+    assert torch.equal(cover.means, stego.means)
+    assert torch.equal(cover.sh[:, 0], stego.sh[:, 0])
+    for name, bits in (("log_scales", 9), ("quats", 9), ("opacity_logits", 9), ("sh", 13)):
+        before, after = (getattr(model, name).contiguous().view(torch.int32) for model in (cover, stego))
+        assert torch.equal(before >> bits, after >> bits), name
+        assert torch.equal(before & 1, after & 1), name
+    assert identities(cover) == identities(stego)
+
+
+def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gaussians) -> None:
+    """So what the holder of one key sees does not depend on what else is hidden."""
+    own, other = keys(1), keys(2)
+    hidden = [trained_like(800, 5), trained_like(900, 6)]
+    before = read_low_bits(cover)
+    seen = []
+    for secrets in ([(own, hidden[0])], [(own, hidden[0]), (other, hidden[1])]):
+        stego = embed_derived(cover, secrets)
+        changed = (read_low_bits(stego) != before).any(axis=1)
+        assert (changed == is_random(cover)).all()
+        counts = np.bincount(read_low_bits(stego).ravel(), minlength=256)
+        assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
+        carriers = Carriers.of(stego)
+        carried = extract_derived(carriers, own[0])
+        cells, _ = _key_cipher(own[0]).open(carriers.names, carriers.low)
+        seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
+        with pytest.raises(WrongKeyError):
+            extract_derived(carriers, keys(3)[0])  # a third key hides nothing
+    assert seen[0] == seen[1]
+
+
+def test_two_secrets_open_with_their_own_keys_only(cover: Gaussians) -> None:
+    """Two fifths of the cover each, as 40,000 and 40,000 in 100,000."""
+    hidden, own = [trained_like(1200, 5), trained_like(1200, 6)], [keys(1), keys(2)]
+    stego = embed_derived(cover, list(zip(own, hidden, strict=True)))
+    found = [extract_derived(Carriers.of(stego), each[0]).gaussians for each in own]
+    for got, want in zip(found, hidden, strict=True):
+        assert torch.allclose(got.means.sort(0).values, want.means.sort(0).values, atol=1e-3)
+    with pytest.raises(UsageError, match="another key for each"):
+        embed_derived(cover, [(own[0], hidden[0]), (own[0], hidden[1])])
+
+
+def test_a_secret_as_large_as_the_cover_and_three_that_share(cover: Gaussians) -> None:
+    large, own = trained_like(3000, 7), keys()
+    carried = extract_derived(Carriers.of(embed_derived(cover, [(own, large)])), own[0])
+    assert len(carried.gaussians) == 3000
+    secrets = [(keys(seed), trained_like(1500, seed)) for seed in (1, 2, 3)]
+    stego = Carriers.of(embed_derived(cover, secrets))
+    for each, model in secrets:
+        assert len(extract_derived(stego, each[0]).gaussians) == len(model)
+
+
+def test_every_random_draw_depends_on_the_entropy_only(cover: Gaussians, secret: Gaussians) -> None:
+    own = keys()
+    same = [embed_derived(cover, [(own, secret)], entropy=ENTROPY) for _ in range(2)]
+    assert_same_bits(*same)
+    other = embed_derived(cover, [(own, secret)])
+    written = is_random(cover)
+    equal = read_low_bits(other)[written] == read_low_bits(same[0])[written]
+    assert equal.mean() == pytest.approx(1 / 256, abs=2e-3)
+
+
+def test_a_carrier_says_nothing_of_its_gaussian(cover: Gaussians, secret: Gaussians) -> None:
+    own = keys()
+    stego = Carriers.of(embed_derived(cover, [(own, secret)]))
+    found = extract_derived(stego, own[0]).gaussians
+    # The order is that of the carriers in the file; nothing of the secret's own order is left in it.
+    origin = secret.means[:, 0].argsort()[found.means[:, 0].argsort().argsort()].double()
+    together = torch.stack([origin, torch.arange(len(origin), dtype=torch.float64)])
+    assert abs(float(torch.corrcoef(together)[0, 1])) < 4 / len(origin) ** 0.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
+    cover: Gaussians, secret: Gaussians, seed: int
+) -> None:
+    own = keys()
+    stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
+    whole = rows_of(extract_derived(Carriers.of(stego), own[0]).gaussians)
+    order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
+    assert rows_of(extract_derived(Carriers.of(stego[order]), own[0]).gaussians) == whole
+    pruned = stego[order[: len(stego) * 3 // 4]]
+    carried = extract_derived(Carriers.of(pruned), salt_of(pruned, own, stego))
+    assert rows_of(carried.gaussians) <= whole
+    assert carried.count == len(secret)
+    copies = plan([Size(1200, 3)], int(is_random(cover).sum()), 3000, 3)[0].copies
+    assert 0 < copies < 300
+    expected = 0.75 * (len(secret) - copies) + (1 - 0.25**2) * copies
+    assert len(carried.gaussians) == pytest.approx(expected, abs=4 * (0.19 * 1200) ** 0.5)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
+    cover: Gaussians, secret: Gaussians, axis: int
+) -> None:
+    own = keys()
+    stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
+    half = stego[stego.means[:, axis] > stego.means[:, axis].median()]
+    found = extract_derived(Carriers.of(half), salt_of(half, own, stego)).gaussians
+    assert 0.45 * len(secret) < len(found) < 0.6 * len(secret)
+    assert found.means[:, axis].median() == pytest.approx(float(secret.means[:, axis].median()), abs=0.4)
+
+
+def test_a_single_bit_costs_one_gaussian_at_most(cover: Gaussians, secret: Gaussians) -> None:
+    """Any bit of any value: low ones, high ones, positions; through the whole key, both salts included."""
+    stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
+    own = [_derived(stego, index) for index in range(3)]
+    whole = rows_of(extract(stego, KEY).gaussians)
+    random = np.random.default_rng(0)
+    names = Carriers.of(stego).salts()
+    first = [name.tobytes() for name in Carriers.of(stego).names].index(names[0])
+    for trial in range(60):
+        row = first if trial < 5 else int(random.integers(len(stego)))
+        changed = _with_flipped_bit(stego, row, int(random.integers(59)), int(random.integers(31)))
+        if changed is None:
+            continue
+        carriers = Carriers.of(changed)
+        found: set[bytes] = set()
+        for name in carriers.salts()[:2]:
+            if name in names[:3]:
+                found = rows_of(extract_derived(carriers, own[names.index(name)]).gaussians)
+                break
+        assert len(whole - found) <= 1
+        assert found <= whole
+
+
+def _derived(stego: Gaussians, index: int) -> DerivedKey:
+    from keyss.channels.low_bits.container import derivation_of
+
+    return DerivedKey(KEY, derivation_of(Carriers.of(stego).salts()[index]))
+
+
+def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaussians | None:
+    """None where the value would not be finite."""
+    changed = model.map(torch.clone)
+    for values in vars(changed).values():
+        flat = values.view(len(values), -1).numpy().view(np.uint32)
+        if column < flat.shape[1]:
+            flat[row, column] ^= np.uint32(1 << bit)
+            return changed if torch.isfinite(values[row]).all() else None
+        column -= flat.shape[1]
+    raise AssertionError("no such column")
+
+
+def test_1000_wrong_keys_and_ordinary_models_open_nothing(secret: Gaussians) -> None:
+    """At the level below Argon2id, whose output is replaced: it is what keys differ in."""
+    model, own = trained_like(800, seed=3), keys()
+    stego = Carriers.of(embed_derived(model, [(own, secret[:200])]))
+    assert len(extract_derived(stego, own[0]).gaussians) == 200
+    for number in range(1000):
+        with pytest.raises(WrongKeyError):
+            extract_derived(stego, DerivedKey.of_master(number.to_bytes(32, "big")))
+    with pytest.raises(WrongKeyError):
+        extract(model, KEY)
+
+
+def test_neighbours_of_the_key_open_nothing(stego: Gaussians) -> None:
+    for wrong in (KEY[:-1], KEY + "x", KEY.replace("r", "s", 1)):
+        with pytest.raises(WrongKeyError):
+            extract(stego, wrong)
+
+
+def test_survives_files_without_normals_with_more_properties_and_in_other_orders(
+    stego: Gaussians, tmp_path: Path
+) -> None:
+    columns = columns_of(stego)
+    bare = {name: values for name, values in columns.items() if name not in ("nx", "ny", "nz")}
+    more = {"label": np.ones(len(stego), np.float32)} | dict(reversed(columns.items()))
+    for index, data in enumerate((ply_bytes(bare), ply_bytes(more))):
+        path = tmp_path / f"{index}.ply"
+        path.write_bytes(data)
+        assert_same_bits(read_ply(path), stego)
+
+
+def test_survives_our_writer_and_gsply(stego: Gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "ours.ply", stego)
+    gsply.plywrite(tmp_path / "theirs.ply", gsply.plyread(tmp_path / "ours.ply"))
+    assert len(extract(read_ply(tmp_path / "theirs.ply"), KEY).gaussians) == 1200
+
+
+def test_survives_plyfile(stego: Gaussians, tmp_path: Path) -> None:
+    plyfile = pytest.importorskip("plyfile")
+    write_ply(tmp_path / "ours.ply", stego)
+    plyfile.PlyData.read(tmp_path / "ours.ply").write(tmp_path / "theirs.ply")
+    assert_same_bits(read_ply(tmp_path / "theirs.ply"), stego)
+
+
+def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "in.ply", stego)
+    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
+    assert len(extract(read_ply(copy), KEY).gaussians) == 1200
+
+
+def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians, secret: Gaussians) -> None:
+    own = keys()
+    stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
+    carriers = Carriers.of(stego)
+    cells, _ = _key_cipher(own[0]).open(carriers.names, carriers.low)
+    keep = np.zeros(len(stego), bool)
+    keep[np.flatnonzero(cells)[:2]] = True
+    with pytest.raises(WrongKeyError):  # nothing but key cells: as good as nothing
+        extract_derived(Carriers(carriers.names[keep], carriers.low[keep]), own[0])
+    keep[:40] = True
+    try:
+        carried = extract_derived(Carriers(carriers.names[keep], carriers.low[keep]), own[0])
+        assert len(carried.gaussians) < 40
+    except (InputError, WrongKeyError):
+        pass
+    with pytest.raises(WrongKeyError):
+        extract_derived(Carriers(carriers.names[keep], carriers.low[keep]), keys(1)[0])
+
+
+def test_layouts_follow_from_a_secret_s_own_size() -> None:
+    """Whole carriers up to half of them, halves above; others do not change that while there is room."""
+    small, large = Size(40_000, 3), Size(85_000, 3)
+    alone = plan([small], 90_000, 100_000, 3)[0]
+    assert alone.cells == 1
+    assert alone.copies == 45_000 - 40_000 - header_carriers(3, 3)
+    assert plan([Size(10_000, 3)], 90_000, 100_000, 3)[0].copies == 2500
+    assert plan([small, small], 90_000, 100_000, 3) == [alone, alone]
+    assert plan([large], 90_000, 100_000, 3)[0].cells == 2
+    both = plan([small, large], 90_000, 100_000, 3)
+    assert both == [alone, replace(plan([large], 90_000, 100_000, 3)[0], copies=0)]
+    assert [each.cells for each in plan([small] * 3, 90_000, 100_000, 3)] == [2, 2, 2]
+    assert isinstance(alone, Layout)
+    assert alone.table.total > 560
+
+
+def test_too_large_a_secret_is_refused_with_the_number_that_fits() -> None:
+    sizes = [Size(250_000, 3)]
+    fits = room(sizes, 90_000, 3)
+    assert fits == 2 * (90_000 - header_carriers(3, 3))
+    with pytest.raises(UsageError, match=rf"250,000 Gaussians is too large.*{fits:,} would fit; --thin"):
+        plan(sizes, 90_000, 100_000, 3)
+    assert thinned(sizes, 90_000, 3) == [fits]
+    assert plan([Size(fits, 3)], 90_000, 100_000, 3)[0].cells == 2
+    two = [Size(20_000, 3), Size(300_000, 3)]
+    kept = thinned(two, 90_000, 3)
+    assert kept[0] == 20_000
+    assert plan([Size(count, 3) for count in kept], 90_000, 100_000, 3)
+    with pytest.raises(UsageError, match="would fit"):
+        thinned(sizes, 100, 3)
+    assert Table.floor(3).total <= 264
+
+
+@pytest.mark.parametrize("change", UNNATURAL)
+def test_covers_without_random_low_bits_are_refused(
+    change: Callable[[Gaussians], Gaussians], cover: Gaussians
+) -> None:
+    with pytest.raises(InputError, match=r"low bits.*--dither"):
+        embed_derived(change(cover), [(keys(), cover[:10])])
+
+
+def test_values_that_are_not_random_stay_as_they_are(cover: Gaussians) -> None:
+    model = cover.map(torch.clone)
+    model.quats[:100] = torch.tensor([1.0, 0, 0, 0])
+    model.sh[100:200, 4:] = 0
+    model.opacity_logits[200:230] = 0.1234567
+    usable = is_random(model)
+    stego = embed_derived(model, [(keys(), trained_like(500))])
+    assert_same_bits(stego[torch.from_numpy(~usable)], model[torch.from_numpy(~usable)])
+    assert not usable[:230].any()
+
+
+def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
+    model = trained_like(1500, seed=9)
+    model = replace(model, means=model.means / 4, log_scales=model.log_scales + 1, sh=model.sh * 2)
+    stego = embed_derived(model, [(keys(), trained_like(1000))], entropy=os.urandom(32))
+    for camera in ring_cameras(4):
+        error = (render(model, camera) - render(stego, camera)).square().mean()
+        assert -10 * torch.log10(error) > 70
+
+
+def test_strangers_in_the_places_of_the_first_salts_do_not_lock_out_the_key(
+    stego: Gaussians, secret: Gaussians
+) -> None:
+    """Three added Gaussians come before all of the model's own in the order of salts."""
+    first = Carriers.of(stego).salts()[0]
+    strangers = trained_like(40_000, seed=9)
+    names = [row.tobytes() for row in Carriers.of(strangers).names]
+    before = sorted((name, index) for index, name in enumerate(names) if name < first)[:3]
+    assert len(before) == 3
+    added = strangers[torch.tensor([index for _, index in before])]
+    crowded = Gaussians.cat([added, stego])
+    assert first not in Carriers.of(crowded).salts()[:3]
+    assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
+    assert len(extract(crowded, KEY).gaussians) == len(secret)

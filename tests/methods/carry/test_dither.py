@@ -1,0 +1,90 @@
+"""New low bits for models that came through a coarser format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from channels.low_bits.trained_like import keys, trained_like
+from files.test_ply import assert_same_bits
+from keyss.core import Gaussians, InputError
+from keyss.methods.carry.carrying import Carriers, embed_derived, extract_derived, usable_carriers
+from keyss.methods.carry.dither import cost, dither
+
+ENTROPY = bytes(32)
+
+
+def _half(values: torch.Tensor) -> torch.Tensor:
+    return values.half().float()
+
+
+def _steps(values: torch.Tensor) -> torch.Tensor:
+    return (values * 64).round() / 64
+
+
+def _added(values: torch.Tensor) -> torch.Tensor:
+    return values.clamp(-6, -2) + 4
+
+
+@pytest.fixture(scope="module")
+def model() -> Gaussians:
+    return trained_like(4000, seed=3)
+
+
+@pytest.mark.parametrize("change", [_half, _steps])
+def test_quantised_models_can_carry_again_and_would_be_rounded_back(
+    model: Gaussians, change: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    coarse = model.map(change)
+    with pytest.raises(InputError, match="low bits"):
+        usable_carriers(coarse)
+    fine = dither(coarse, ENTROPY)
+    assert usable_carriers(fine).mean() > 0.9
+    assert torch.equal(fine.means, coarse.means)
+    assert torch.equal(fine.sh[:, 0], coarse.sh[:, 0])
+    for name in ("quats", "log_scales", "opacity_logits", "sh"):
+        before, after = getattr(coarse, name), getattr(fine, name)
+        assert (change(after) == before).float().mean() > 0.99, name
+    own = keys()
+    stego = embed_derived(fine, [(own, model[:1000])])
+    assert len(extract_derived(Carriers.of(stego), own[0]).gaussians) == 1000
+
+
+def test_an_added_offset_is_noticed_and_dithered(model: Gaussians) -> None:
+    moved = Gaussians(model.means, model.quats, _added(model.log_scales), model.opacity_logits, model.sh)
+    with pytest.raises(InputError, match=r"scale_0 are not random.*--dither"):
+        usable_carriers(moved)
+    fine = dither(moved, ENTROPY)
+    assert torch.equal(fine.quats, moved.quats)
+    assert usable_carriers(fine).mean() > 0.5
+    assert float((fine.log_scales - moved.log_scales).abs().max()) < 0.01
+
+
+def test_trained_models_and_properties_of_one_value_stay_as_they_are(model: Gaussians) -> None:
+    assert_same_bits(dither(model, ENTROPY), model)
+    flat = model.map(torch.clone)
+    flat.sh[:, 9:] = 0
+    assert_same_bits(dither(flat, ENTROPY), flat)
+
+
+def test_the_cost_is_what_pictures_show(model: Gaussians) -> None:
+    small = Gaussians(
+        model.means[:500] / 4,
+        model.quats[:500],
+        model.log_scales[:500] + 1,
+        model.opacity_logits[:500],
+        model.sh[:500],
+    )
+    assert cost(small, small) == pytest.approx(120)
+    steps = small.map(_steps)
+    assert 30 < cost(steps, dither(steps, ENTROPY)) < 80
+
+
+def test_other_entropy_gives_other_bits(model: Gaussians) -> None:
+    steps = model.map(_steps)
+    one, other = dither(steps, ENTROPY), dither(steps, bytes([1] * 32))
+    assert (one.quats.numpy() != other.quats.numpy()).mean() > 0.99
+    assert np.isfinite(one.sh.numpy()).all()

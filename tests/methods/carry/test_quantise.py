@@ -1,0 +1,129 @@
+"""Records of Gaussians: how far off what comes back may be, whatever goes in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from channels.low_bits.trained_like import trained_like
+from keyss.core import Gaussians, InputError
+from keyss.methods.carry.quantise import Codec, Line
+from keyss.methods.carry.table import Table
+from keyss.rendering import render
+from tiny_scenes import ring_cameras
+
+FINITE = st.floats(-1e6, 1e6, width=32)
+VALUES = arrays.arrays(np.float64, st.integers(1, 30), elements=FINITE)
+
+
+@given(VALUES, st.floats(0, 1e3), st.floats(0.01, 50), st.integers(1, 24))
+def test_a_line_is_off_by_half_a_step_at_most_and_clips_beyond_its_ends(
+    values: np.ndarray, spread: float, reach: float, bits: int
+) -> None:
+    line = Line(1.5, spread if spread > 1e-3 else 0.0, reach)
+
+    def position(x: np.ndarray) -> np.ndarray:
+        return np.arcsinh((x - 1.5) / line.spread) if line.spread else x - 1.5
+
+    decoded = line.decode(line.encode(values, bits), bits)
+    off = np.abs(position(decoded) - position(values).clip(-reach, reach))
+    assert (off <= reach / ((1 << bits) - 1) * (1 + 1e-6) + 1e-9 * reach).all()
+
+
+@given(st.data(), st.integers(0, 3), st.sampled_from([0, 40, 500]))
+@settings(max_examples=25, deadline=None)
+def test_every_attribute_comes_back_within_the_error_of_its_bits(
+    data: st.DataObject, degree: int, more: int
+) -> None:
+    count = data.draw(st.integers(1, 12))
+
+    def some(*shape: int) -> torch.Tensor:
+        return torch.from_numpy(data.draw(arrays.arrays(np.float32, (count, *shape), elements=FINITE)))
+
+    model = Gaussians(some(3), some(4), some(3), some(), some((degree + 1) ** 2, 3))
+    table = Table.of_size(Table.floor(degree).total + more, degree)
+    assert table is not None
+    assert table.total <= Table.floor(degree).total + more
+    codec = Codec.fit(model, table)
+    back = codec.decode(codec.encode(model))
+    assert Codec.unpack(codec.pack()) == codec
+    scales = model.log_scales.double()
+    step = float(scales.max() - scales.min()) / ((1 << table.log_scales) - 1)
+    assert (
+        float((back.log_scales - scales).abs().max()) <= 0.51 * step + 1e-6 * float(scales.abs().max()) + 1e-6
+    )
+    for axis, line in enumerate(codec.lines[:3]):
+        was, now = (((m.means[:, axis].double() - line.centre) / line.spread).asinh() for m in (model, back))
+        assert float((was - now).abs().max()) <= 1.1 * line.reach / ((1 << table.means) - 1) + 1e-5
+    assert torch.isfinite(back.sh).all()
+    length = model.quats.double().norm(dim=1)
+    unit = model.quats.double() / length[:, None].clamp_min(1e-60)
+    same = (unit * back.quats.double()).sum(1).abs()[length > 0]
+    # Each of the three is off by half a step of sqrt(2) / (2^bits - 1), and the fourth by as much as follows.
+    assert (1 - same <= 6 * (0.5**0.5 / ((1 << table.quats) - 1)) ** 2 + 1e-6).all()
+    assert torch.allclose(back.quats.norm(dim=1), torch.ones(count), atol=1e-5)
+
+
+def test_quaternions_of_no_length_and_of_either_sign_mean_the_rotation_that_they_mean() -> None:
+    model = trained_like(8, sh_degree=0)
+    model.quats[0] = 0
+    model.quats[1] = torch.tensor([0.0, -3.0, 0, 0])
+    codec = Codec.fit(model, Table.floor(0))
+    quats = codec.decode(codec.encode(model)).quats
+    assert torch.allclose(quats[:2].abs(), torch.eye(4)[:2], atol=0.01)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_tables_grow_bit_by_bit_and_say_when_nothing_fits(degree: int) -> None:
+    floor = Table.floor(degree)
+    assert Table.of_size(floor.total, degree) == floor
+    assert Table.of_size(floor.total - 1, degree) is None
+    totals = []
+    for bits in range(floor.total, 1200, 50):
+        table = Table.of_size(bits, degree)
+        assert table is not None
+        assert bits - 63 <= table.total <= bits or table.means == 24
+        assert table.sh_degree == degree
+        totals.append(table.total)
+    assert totals == sorted(totals)
+
+
+def test_half_and_whole_records_of_degree_3_are_as_near_as_promised() -> None:
+    """Of a model with colours that go together, as those of trained ones do."""
+    model = trained_like(2000, seed=4)
+    sh = 0.25 * model.sh + 0.75 * model.sh[:, :, :1]
+    model = Gaussians(model.means / 4, model.quats, model.log_scales + 1, model.opacity_logits, sh)
+    for bits, least in ((264, 40), (568, 65)):
+        table = Table.of_size(bits, 3)
+        assert table is not None
+        codec = Codec.fit(model, table)
+        assert codec.record_bytes <= bits // 8
+        back = codec.decode(codec.encode(model))
+        for camera in ring_cameras(3):
+            error = (render(model, camera) - render(back, camera)).square().mean()
+            assert -10 * torch.log10(error) > least
+
+
+@given(st.binary(max_size=150))
+def test_damaged_parameters_are_an_input_error_or_bounded_numbers(data: bytes) -> None:
+    try:
+        codec = Codec.unpack(data)
+    except InputError:
+        return
+    records = np.random.default_rng(0).integers(0, 256, (20, codec.record_bytes), dtype=np.uint8)
+    assert all(torch.isfinite(values).all() for values in vars(codec.decode(records)).values())
+
+
+@pytest.mark.parametrize(
+    ("centre", "spread", "reach"),
+    [(np.nan, 1, 1), (0, -1, 1), (0, 1, 0), (0, 1, np.inf), (0, 1, 61), (0, 1e29, 60), (1e31, 0, 1)],
+)
+def test_lines_that_could_give_numbers_out_of_bounds_are_refused(
+    centre: float, spread: float, reach: float
+) -> None:
+    with pytest.raises(ValueError, match="no such line"):
+        Line(centre, spread, reach)

@@ -1,0 +1,31 @@
+"""A known answer: a model that was carried when version 1 was made opens ever after, and to the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from keyss.core import WrongKeyError
+from keyss.files.ply import read_ply
+from keyss.methods.carry import extract
+
+FOLDER = Path(__file__).parents[2] / "vectors"
+VECTOR = json.loads((FOLDER / "carried.json").read_text())
+STEGO = read_ply(FOLDER / "carried.ply")
+
+
+def test_a_carried_model_opens() -> None:
+    carried = extract(STEGO, VECTOR["key"])
+    assert (carried.count, carried.bits) == (VECTOR["count"], VECTOR["bits"])
+    found = carried.gaussians[carried.gaussians.means[:, 0].argsort()]
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        values = getattr(found, name)
+        torch.testing.assert_close(values, torch.tensor(VECTOR[name]).reshape(values.shape))
+
+
+def test_to_its_key_only() -> None:
+    with pytest.raises(WrongKeyError):
+        extract(STEGO, VECTOR["wrong"])

@@ -1,0 +1,272 @@
+"""Hiding tiny scenes, all the way: the same code as for real ones, in seconds."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
+from keyss.core.similarity import Similarity
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import mean_psnr
+from keyss.fitting.loop import Interrupted, Silent
+from keyss.keys import random_embeddings
+from keyss.methods.learned.config import PRESETS, HideConfig
+from keyss.methods.learned.joint import JointRun, combine_densification
+from keyss.methods.learned.pipeline import Hidden, hide_scenes
+from keyss.methods.learned.revealing import decode, open_secret, reveal_gaussians
+from keyss.methods.learned.targets import CombinedPoses, PlacedScene
+from keyss.rendering import render
+from tiny_scenes import random_gaussians, tiny_scene
+
+CONFIG = HideConfig(
+    fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0),
+)
+# What the paper has, small.
+PAPER = replace(
+    PRESETS["paper"], fit=replace(CONFIG.fit, iterations=60), design="standardised", decoder_rate=3e-3
+)
+KEYS = ("first key", "second key")
+
+
+def _moved(scene: Scene, frame: Similarity) -> Scene:
+    """The same photos of a world that lies elsewhere."""
+    return replace(
+        scene,
+        train=tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in scene.train),
+        test=tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in scene.test),
+        points=frame.apply_points(scene.points),
+    )
+
+
+def _scenes() -> tuple[list[Scene], list[Gaussians]]:
+    """A cover and two secrets, one of them in a frame of its own, and their true models."""
+    quaternion = torch.linalg.qr(
+        torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    )[0]
+    rotation = quaternion * quaternion.det().sign()
+    frame = Similarity(3.0, rotation, torch.tensor([5.0, -2.0, 1.0], dtype=torch.float64))
+    scenes = [tiny_scene(0), _moved(tiny_scene(1), frame), tiny_scene(2, distance=5.0)]
+    models = [
+        random_gaussians(seed=0),
+        frame.apply_gaussians(random_gaussians(seed=1)),
+        random_gaussians(seed=2),
+    ]
+    return scenes, models
+
+
+def _psnr(model: Gaussians, scene: Scene) -> float:
+    return mean_psnr(model, scene.test, scene.background)
+
+
+def _same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Gaussians))
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    scenes, models = _scenes()
+    return hide_scenes(scenes, KEYS, CONFIG, plains=models, sidecar=True)
+
+
+def test_the_published_model_shows_the_cover(hidden: Hidden) -> None:
+    scenes, _ = _scenes()
+    assert len(hidden.stego) <= CONFIG.fit.max_gaussians
+    assert _psnr(hidden.stego, scenes[0]) > 30
+    assert _psnr(hidden.stego, scenes[2]) < 18
+
+
+@pytest.mark.parametrize("secret", [1, 2])
+def test_each_key_opens_its_secret_in_its_own_frame(hidden: Hidden, secret: int) -> None:
+    scenes, _ = _scenes()
+    revealed = reveal_gaussians(hidden.stego, hidden.secrets[secret - 1])
+    assert _psnr(revealed, scenes[secret]) > 26
+    assert _psnr(revealed, scenes[secret]) > _psnr(hidden.stego, scenes[secret]) + 10
+
+
+def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> None:
+    scenes, _ = _scenes()
+    own = reveal_gaussians(hidden.stego, hidden.secrets[0])
+    there = reveal_gaussians(hidden.stego, hidden.secrets[0], frame="cover")
+    frame = hidden.secrets[0].frame
+    assert frame.scale != pytest.approx(1, abs=0.1)
+    camera = scenes[1].test[0].camera
+    difference = render(own, camera) - render(there, frame.apply_camera(camera))
+    assert difference.abs().max() < 2e-3
+
+
+def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:
+    for key, secret in zip(KEYS, hidden.secrets, strict=True):
+        opened = open_secret(hidden.stego, key, hidden.sidecar)
+        assert torch.equal(opened.embedding, secret.embedding)
+    for key in ("First key", "other"):
+        with pytest.raises(WrongKeyError):
+            open_secret(hidden.stego, key, hidden.sidecar)
+
+
+def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
+    scenes, _ = _scenes()
+    for embedding in random_embeddings(2, torch.Generator().manual_seed(5)):
+        decoy = decode(hidden.stego, hidden.secrets[0], embedding)
+        assert _psnr(decoy, scenes[0]) > 26
+        assert _psnr(decoy, scenes[2]) < _psnr(hidden.stego, scenes[2]) + 1
+
+
+def test_a_model_too_small_for_its_low_bits_is_refused_before_any_work() -> None:
+    large = replace(CONFIG, decoder="network", hidden=(128, 128))
+    with pytest.raises(UsageError, match=r"too small.*--max-gaussians.*--sidecar"):
+        hide_scenes(_scenes()[0], KEYS, large)
+
+
+def test_a_model_large_enough_carries_its_secrets() -> None:
+    scenes = _scenes()[0]
+    fit = replace(CONFIG.fit, iterations=30, max_gaussians=2600, grow_every=10, grow_start=0.1)
+    config = replace(CONFIG, fit=fit)
+    many = [random_gaussians(2600, seed=7), *_scenes()[1][1:]]
+    hidden = hide_scenes(scenes, KEYS, config, plains=many)
+    assert hidden.sidecar is None
+    assert len(hidden.stego) > 1500
+    for key, secret in zip(KEYS, hidden.secrets, strict=True):
+        opened = open_secret(hidden.stego, key)
+        assert torch.equal(opened.embedding, secret.embedding)
+        assert _same(reveal_gaussians(hidden.stego, opened), reveal_gaussians(hidden.stego, secret))
+    for secret, scene in zip(hidden.secrets, scenes[1:], strict=True):
+        assert _psnr(reveal_gaussians(hidden.stego, secret), scene) > 26
+
+
+def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: Hidden) -> None:
+    scenes, _ = _scenes()
+    chosen = torch.randperm(len(hidden.stego), generator=torch.Generator().manual_seed(0))
+    shuffled = reveal_gaussians(hidden.stego[chosen], hidden.secrets[1])
+    assert _psnr(shuffled, scenes[2]) > 26
+    reveal_gaussians(hidden.stego[chosen[:200]], hidden.secrets[1])
+    with pytest.raises(InputError, match="another model"):
+        reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1])
+    reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1], force=True)
+
+
+class _InterruptAt(Silent):
+    """Presses Ctrl-C at one iteration of one stage."""
+
+    def __init__(self, stage: str, iteration: int) -> None:
+        self.stage, self.at = stage, iteration
+        self.now = ""
+
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        self.now = title
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        if iteration == self.at and self.now.startswith(self.stage):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("base", [CONFIG, replace(CONFIG, decoder="network"), PAPER])
+def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, base: HideConfig) -> None:
+    scenes = _scenes()[0][:2]
+    config = replace(base, fit=replace(CONFIG.fit, iterations=40, grow_every=5))
+
+    def run(resume: bool, reporter: Silent | None = None) -> Hidden:
+        return hide_scenes(
+            scenes, KEYS[:1], config, sidecar=True, checkpoints=tmp_path, resume=resume, reporter=reporter
+        )
+
+    whole = hide_scenes(scenes, KEYS[:1], config, sidecar=True)
+    with pytest.raises(Interrupted):
+        run(False, _InterruptAt("plain model of the secret", 17))
+    with pytest.raises(Interrupted):
+        run(True, _InterruptAt("hide", 23))
+    resumed = run(True)
+    assert _same(resumed.stego, whole.stego)
+    assert resumed.sidecar == whole.sidecar
+    with pytest.raises(InputError, match="other settings"):
+        hide_scenes(scenes, ["another key"], config, sidecar=True, checkpoints=tmp_path, resume=True)
+
+
+def test_keys_must_be_one_per_secret_and_different() -> None:
+    scenes, models = _scenes()
+    with pytest.raises(UsageError, match="same key"):
+        hide_scenes(scenes, ["key", "key"], CONFIG, plains=models)
+    with pytest.raises(UsageError, match="one key for each"):
+        hide_scenes(scenes, ["key"], CONFIG, plains=models)
+
+
+def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
+    scenes, models = _scenes()
+    frame = Similarity(0.5, torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+    placed = [
+        PlacedScene.of(scenes[0], models[0], Similarity.identity()),
+        PlacedScene.of(scenes[1], models[1], frame),
+    ]
+    poses = CombinedPoses(placed, torch.device("cpu"))
+    own = poses.target(1, owner=1, index=3)
+    assert torch.equal(own.image, scenes[1].train[3].image.float() / 255)
+    # The model moved into the cover's frame shows from a moved camera what its photo shows.
+    rendered = render(placed[1].plain, poses.camera(1, 3)).clamp(0, 1)
+    assert (rendered - own.image).abs().mean() < 4e-3
+    foreign = poses.target(0, owner=1, index=3)
+    expected = render(models[0], poses.camera(1, 3)).clamp(0, 1)
+    assert (foreign.image - expected).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_combined_densification_scatters_and_unweights() -> None:
+    def meta(gradient: list[list[float]], radii: list[list[int]]) -> dict[str, object]:
+        means2d = torch.zeros(1, len(gradient), 2, requires_grad=True)
+        means2d.grad = torch.tensor([gradient], dtype=torch.float32)
+        return {"means2d": means2d, "radii": torch.tensor([radii]), "width": 4, "height": 3}
+
+    cover = meta([[1, 2], [3, 4], [5, 6]], [[1, 1], [0, 0], [2, 2]])
+    secret = meta([[7, 8]], [[3, 3]])
+    combined = combine_densification([(cover, None, 0.5), (secret, torch.tensor([1]), 0.25)], 3)
+    assert combined["means2d"].grad.tolist() == [
+        [[2, 4], [6, 8], [10, 12]],
+        [[0, 0], [28, 32], [0, 0]],
+    ]
+    assert combined["radii"].tolist() == [[[1, 1], [0, 0], [2, 2]], [[0, 0], [3, 3], [0, 0]]]
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(UsageError, match="--start points"):
+        HideConfig(mask=("xyz",), decoder="network")
+    assert HideConfig(mask=("xyz",), start="points", decoder="network").mask == ("xyz",)
+    with pytest.raises(UsageError, match="network"):
+        HideConfig(start="points")
+    with pytest.raises(UsageError, match="network"):
+        HideConfig(mask=("op", "sh"))
+    with pytest.raises(UsageError, match="gate"):
+        HideConfig(conditioning="bias")
+
+
+@pytest.mark.parametrize("preset", ["paper", "released"])
+def test_the_published_presets_train(preset: str) -> None:
+    """Few steps from sparse points: everything they switch on runs, and what comes out is finite."""
+    scenes, models = _scenes()
+    base = PRESETS[preset]
+    config = replace(
+        base, fit=replace(CONFIG.fit, iterations=12, grow_every=4, ssim_weight=base.fit.ssim_weight)
+    )
+    hidden = hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
+    for secret in hidden.secrets:
+        revealed = reveal_gaussians(hidden.stego, secret)
+        assert 0 < len(revealed) <= len(hidden.stego)
+        assert all(getattr(revealed, f.name).isfinite().all() for f in fields(Gaussians))
+
+
+@pytest.mark.parametrize("which", ["cover", "secret"])
+def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -> None:
+    scenes, models = _scenes()
+    fit = replace(CONFIG.fit, iterations=12, grow_every=4)
+    config = replace(PAPER, fit=fit, points=which, poses=which, densification=which)
+    placed = [
+        PlacedScene.of(scene, model, Similarity.identity())
+        for scene, model in zip(scenes, models, strict=True)
+    ]
+    run = JointRun(placed, list(random_embeddings(2, torch.Generator())), config, torch.device("cpu"))
+    owners = {pose[0] for _ in range(30) for pose in run._draw_poses()}
+    assert owners == ({0} if which == "cover" else {1, 2})
+    run.step()

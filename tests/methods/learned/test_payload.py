@@ -1,0 +1,127 @@
+"""A secret's bytes: whole round trips, and damage that ends in InputError."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from keyss.core import InputError
+from keyss.core.similarity import Similarity
+from keyss.keys import random_embeddings
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from tiny_scenes import random_gaussians
+
+FRAME = Similarity(2.0, torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+
+
+def _secret() -> HiddenSecret:
+    torch.manual_seed(0)
+    stego = random_gaussians()
+    decoder = Decoder(DecoderShape(mask=("op", "ro", "sc", "xyz"), kind="network", hidden=(16, 16), branch=8))
+    decoder.prepare(stego, random_embeddings(1, torch.Generator().manual_seed(0))[0])
+    return HiddenSecret(decoder, FRAME, choose_anchors(stego, torch.Generator().manual_seed(0)))
+
+
+PACKED = pack_secret(_secret())
+SHAPE = asdict(_secret().decoder.shape) | {"mask": "op,ro,sc,xyz"}
+
+
+def _with_header(**changes: object) -> bytes:
+    """The same with another JSON header, keeping the tensors."""
+    (size,) = struct.unpack("<Q", PACKED[:8])
+    outer = json.loads(PACKED[8 : 8 + size])
+    inner = json.loads(outer["__metadata__"]["keyss"])
+    inner.update(changes)
+    outer["__metadata__"]["keyss"] = json.dumps(inner)
+    header = json.dumps(outer).encode()
+    header += b" " * (-len(header) % 8)
+    return struct.pack("<Q", len(header)) + header + PACKED[8 + size :]
+
+
+def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
+    secret, opened = _secret(), unpack_secret(PACKED)
+    assert opened.decoder.shape == secret.decoder.shape
+    assert torch.equal(opened.embedding, secret.embedding)
+    assert torch.equal(opened.frame.translation, FRAME.translation)
+    assert torch.equal(opened.anchors, secret.anchors)
+    for name, value in secret.decoder.state_dict().items():
+        exact = opened.decoder.state_dict()[name]
+        halved = name in dict(secret.decoder.named_parameters())
+        assert torch.equal(exact, value.half().float() if halved else value), name
+    assert pack_secret(opened) == PACKED
+
+
+def test_another_version_is_refused_by_number() -> None:
+    with pytest.raises(InputError, match=r"version 1.*version 3"):
+        unpack_secret(_with_header(version=1))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format": "other"},
+        {"shape": None},
+        {"shape": {"mask": "op"}},
+        {"shape": SHAPE | {"hidden": [10**9, 16]}},
+        {"shape": SHAPE | {"hidden": [16]}},
+        {"shape": SHAPE | {"branch": 8.0}},
+        {"shape": SHAPE | {"kind": "eval"}},
+        {"shape": SHAPE | {"mask": "op"}},  # fewer branches than there are weights for
+        {"shape": SHAPE | {"extra": 1}},
+        {"frame": {"scale": -1}},
+        {"frame": 3},
+    ],
+)
+def test_hostile_headers_are_input_errors(changes: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        unpack_secret(_with_header(**changes))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, len(PACKED) - 1), st.integers(0, 7), st.integers(0, len(PACKED)))
+def test_truncated_and_mutated_bytes_are_input_errors_or_secrets(at: int, bit: int, size: int) -> None:
+    broken = bytearray(PACKED)
+    broken[at] ^= 1 << bit
+    for data in (bytes(broken), PACKED[:size], bytes(broken[:size])):
+        with contextlib.suppress(InputError):
+            unpack_secret(data)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=300))
+def test_any_bytes_are_input_errors(data: bytes) -> None:
+    with pytest.raises(InputError):
+        unpack_secret(data)
+
+
+def test_weights_that_are_not_finite_are_refused() -> None:
+    secret = _secret()
+    assert secret.decoder.network is not None
+    secret.decoder.network.first.bias.data[0] = float("nan")
+    with pytest.raises(InputError, match="finite"):
+        unpack_secret(pack_secret(secret))
+
+
+def test_a_curve_that_goes_back_is_refused() -> None:
+    secret = _secret()
+    secret.decoder.knots[2] = secret.decoder.knots[1]
+    with pytest.raises(InputError, match="ascending"):
+        unpack_secret(pack_secret(secret))
+
+
+def test_belonging_survives_order_and_pruning_but_not_another_model() -> None:
+    secret, stego = _secret(), random_gaussians()
+    secret.check_belongs_to(stego)
+    secret.check_belongs_to(stego[torch.randperm(len(stego))[: len(stego) // 2]])
+    with pytest.raises(InputError, match="another model"):
+        secret.check_belongs_to(random_gaussians(seed=1))
+    with pytest.raises(InputError, match="another model"):
+        secret.check_belongs_to(replace(stego, means=stego.means * 1.001))

@@ -1,0 +1,127 @@
+"""Scrambled ghosts: put back by their key, in any order, and saying nothing to others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import kstest
+
+from channels.low_bits.trained_like import trained_like
+from keyss.channels.low_bits.bits import is_random, read_low_bits, write_low_bits
+from keyss.core import Gaussians
+from keyss.methods.learned.scramble import Scramble, with_lengths_of_the_cover
+
+BAND = (-10.0, -6.0)
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def _stego() -> Gaussians:
+    """A thousand visible Gaussians and a thousand hidden ones that lie elsewhere and look otherwise."""
+    cover, secret = trained_like(1000), trained_like(1000, 1)
+    hidden = replace(
+        secret,
+        means=0.2 * secret.means + 7,
+        log_scales=secret.log_scales - 2,
+        opacity_logits=-8 + 0.1 * secret.opacity_logits.clamp(-9, 9),
+    )
+    return Gaussians.cat([replace(cover, opacity_logits=cover.opacity_logits.abs()), hidden])
+
+
+def _hidden(model: Gaussians) -> Gaussians:
+    return model[(model.opacity_logits > BAND[0]) & (model.opacity_logits < BAND[1])]
+
+
+@pytest.fixture(scope="module")
+def closed() -> tuple[Scramble, Gaussians, Gaussians]:
+    stego = _stego()
+    scramble = Scramble.of(stego, b"k" * 32, BAND)
+    return scramble, stego, scramble.close(stego)
+
+
+def test_only_the_hidden_change_and_they_stay_hidden(closed: tuple[Scramble, Gaussians, Gaussians]) -> None:
+    _, stego, published = closed
+    for name in FIELDS:
+        assert torch.equal(getattr(published, name)[:1000], getattr(stego, name)[:1000]), name
+    assert len(_hidden(published)) == 1000
+    for name in ("means", "log_scales", "opacity_logits"):
+        assert (getattr(published, name)[1000:] != getattr(stego, name)[1000:]).all(), name
+
+
+def test_the_key_puts_them_back_whatever_the_order_and_the_low_bits(
+    closed: tuple[Scramble, Gaussians, Gaussians],
+) -> None:
+    scramble, stego, published = closed
+    rows = np.flatnonzero(is_random(published))
+    noise = np.random.default_rng(0).integers(0, 256, read_low_bits(published)[rows].shape, dtype=np.uint8)
+    order = torch.randperm(2000)[:1500]
+    opened = scramble.open(write_low_bits(published, rows, noise)[order])
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        error = (getattr(opened, name) - getattr(stego, name)[order]).abs()
+        assert float(error.quantile(0.99)) < (5e-4 if name == "means" else 2e-3), name
+        assert float(error.max()) < 2e-2, name
+
+
+def test_another_key_puts_nothing_back(closed: tuple[Scramble, Gaussians, Gaussians]) -> None:
+    scramble, stego, published = closed
+    opened = replace(scramble, key=b"j" * 32).open(published)
+    distance = (opened.means - stego.means)[1000:].norm(dim=1)
+    chance = (stego.means[1000:][torch.randperm(1000)] - stego.means[1000:]).norm(dim=1)
+    assert float(distance.median()) > 0.8 * float(chance.median())
+
+
+def test_what_is_published_is_distributed_as_the_cover_and_independent_of_what_is_hidden(
+    closed: tuple[Scramble, Gaussians, Gaussians],
+) -> None:
+    _, stego, published = closed
+    for name in ("means", "log_scales"):
+        for axis in range(3):
+            shown = getattr(published, name)[1000:, axis].numpy()
+            cover, hidden = (
+                getattr(stego, name)[part, axis].numpy() for part in (slice(1000), slice(1000, 2000))
+            )
+            assert kstest(shown, cover).pvalue > 1e-3
+            assert kstest(shown, hidden).pvalue < 1e-9
+            assert abs(np.corrcoef(shown.argsort().argsort(), hidden.argsort().argsort())[0, 1]) < 0.12
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_hidden_gaussians_are_no_special_case(count: int) -> None:
+    stego = _stego()[: 1000 + count]
+    scramble = Scramble.of(stego, b"k" * 32, BAND)
+    opened = scramble.open(scramble.close(stego))
+    torch.testing.assert_close(opened.means, stego.means, atol=1e-3, rtol=1e-3)
+
+
+def test_round_and_grey_covers_get_round_and_grey_ghosts() -> None:
+    """What goes together in the cover does in what is published, and opens all the same."""
+    stego = _stego()
+    noise = torch.randn(2000, 1, generator=torch.Generator().manual_seed(2))
+    round_grey = replace(
+        stego,
+        log_scales=stego.log_scales.mean(1, keepdim=True) + noise + 1e-3 * stego.log_scales,
+        sh=torch.cat([noise[:, :, None] + 1e-3 * stego.sh[:, :1], stego.sh[:, 1:]], dim=1),
+    )
+    cover = Gaussians.cat([round_grey[:1000], stego[1000:]])
+    scramble = Scramble.of(cover, b"k" * 32, BAND)
+    ghosts = scramble.close(cover)[1000:]
+    for values in (ghosts.log_scales, ghosts.sh[:, 0]):
+        assert float(np.corrcoef(values.numpy().T)[0, 1:].min()) > 0.95
+    opened = scramble.open(scramble.close(cover))
+    for name in ("log_scales", "sh"):
+        error = (getattr(opened, name) - getattr(cover, name)).abs()
+        assert float(error.max()) < 2e-2, name
+
+
+def test_quaternions_get_lengths_of_the_cover_and_keep_their_directions() -> None:
+    stego = _stego()
+    stego = replace(stego, quats=torch.cat([stego.quats[:1000], 3 * stego.quats[1000:]]))
+    changed = with_lengths_of_the_cover(stego, BAND)
+    lengths = changed.quats.norm(dim=1)
+    torch.testing.assert_close(lengths[1000:].sort().values, stego.quats[:1000].norm(dim=1).sort().values)
+    turned = torch.nn.functional.cosine_similarity(changed.quats, stego.quats)
+    torch.testing.assert_close(turned, torch.ones(2000))
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        assert torch.equal(getattr(changed, name), getattr(stego, name))

@@ -1,0 +1,79 @@
+"""Scenes made of models: what they show, from where, and hiding one model in another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from keyss.core import Gaussians
+from keyss.core.scene import camera_positions
+from keyss.core.similarity import Similarity
+from keyss.fitting.image_metrics import mean_psnr
+from keyss.methods.learned.config import HideConfig
+from keyss.methods.learned.pipeline import hide_scenes
+from keyss.methods.learned.revealing import open_secret, reveal_gaussians
+from keyss.rendering.orbit import VIEWS, middle_and_radius, orbit, room_for_models, scene_of_model
+from tiny_scenes import random_gaussians
+
+SIZE = 48
+
+
+def test_cameras_stand_around_look_at_the_middle_and_hold_minus_y_up() -> None:
+    model = random_gaussians(500)
+    cameras = orbit(model, SIZE)
+    middle, radius = middle_and_radius(model)
+    outward = torch.nn.functional.normalize(camera_positions(cameras) - middle, dim=1)
+    for camera, direction in zip(cameras, outward, strict=True):
+        torch.testing.assert_close(camera.forward, -direction, atol=1e-5, rtol=0)
+        assert camera.up[1] < 0
+        rotation = camera.viewmat[:3, :3].double()
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), atol=1e-6, rtol=0)
+        assert torch.det(rotation) > 0
+    # No side of the model is left out.
+    sides = torch.cat([torch.eye(3)[[0, 2]], -torch.eye(3)[[0, 2]]])
+    assert ((outward @ sides.T) > 0.7).any(0).all()
+    assert (camera_positions(cameras) - middle).norm(dim=1).min() > radius
+
+
+def test_what_hardly_shows_moves_no_camera() -> None:
+    """Faint giants and a few far floaters are in most models."""
+    model = random_gaussians(500)
+    middle, radius = middle_and_radius(model)
+    far = replace(model[:20], means=model[:20].means * 1000 + 500)
+    faint = replace(model[:100], means=model[:100].means + 50, opacity_logits=torch.full((100,), -12.0))
+    moved, larger = middle_and_radius(Gaussians.cat([model, far, faint]))
+    assert float((moved - middle).norm()) < 0.2 * radius
+    assert larger < 1.3 * radius
+
+
+@pytest.mark.parametrize(
+    "model", [random_gaussians(1), replace(random_gaussians(3), means=torch.zeros(3, 3))]
+)
+def test_a_model_without_extent_still_makes_a_scene(model: Gaussians) -> None:
+    scene = scene_of_model(model, "dot", size=8)
+    assert len(scene.views) == VIEWS
+    assert all(view.camera.viewmat.isfinite().all() for view in scene.views)
+
+
+def test_models_move_with_their_cameras() -> None:
+    """The same model elsewhere and larger is looked at in the same way."""
+    model = random_gaussians(300)
+    frame = Similarity(
+        3.0, torch.eye(3, dtype=torch.float64), torch.tensor([5.0, 1, -2], dtype=torch.float64)
+    )
+    here, there = (scene_of_model(each, "m", size=SIZE) for each in (model, frame.apply_gaussians(model)))
+    difference = here.train[0].image.float() - there.train[0].image.float()
+    assert difference.abs().mean() < 1
+
+
+def test_one_model_hides_in_another_without_photos() -> None:
+    models = [random_gaussians(1200, seed=0), random_gaussians(700, seed=1)]
+    scenes = [scene_of_model(model, "m", size=SIZE) for model in models]
+    config = room_for_models(HideConfig(), models)
+    assert config.fit.max_gaussians == 1900
+    hidden = hide_scenes(scenes, ["key"], config.with_fit(iterations=30, evaluate_every=0), plains=models)
+    revealed = reveal_gaussians(hidden.stego, open_secret(hidden.stego, "key"))
+    assert mean_psnr(hidden.stego, scenes[0].test, scenes[0].background) > 40
+    assert mean_psnr(revealed, scenes[1].test, scenes[1].background) > 40
