@@ -72,7 +72,7 @@ def main() -> None:
     sealing["cell"] = cell()
     (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    stego = embed(trained_like(400), [(key, trained_like(8, 1))], entropy=bytes(32))
+    stego = embed(trained_like(400), [(key, trained_like(8, 1, 1))], entropy=bytes(32))
     write_ply(FOLDER / "carried.ply", stego)
 
 
