@@ -17,7 +17,7 @@ from keyss._version import __version__
 if TYPE_CHECKING:
     from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal
     from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
-    from keyss.files import load_scene, read_ply, write_ply
+    from keyss.files import load_scene, read_model, write_model
     from keyss.fitting import FitConfig
     from keyss.keys import generate_key
     from keyss.methods.learned import HideConfig
@@ -41,16 +41,16 @@ __all__ = [
     "hide",
     "info",
     "load_scene",
-    "read_ply",
+    "read_model",
     "render",
     "reveal",
-    "write_ply",
+    "write_model",
 ]
 
 _HOMES = {
     "keyss.core": ("Camera", "Gaussians", "KeyssError", "Scene", "View", "WrongKeyError"),
     "keyss.runs.describe": ("info",),
-    "keyss.files": ("load_scene", "read_ply", "write_ply"),
+    "keyss.files": ("load_scene", "read_model", "write_model"),
     "keyss.fitting": ("FitConfig",),
     "keyss.methods.learned": ("HideConfig",),
     "keyss.keys": ("generate_key",),

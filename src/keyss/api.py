@@ -17,8 +17,8 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.atomic import write_bytes
-from keyss.files.output import OutputFolder, check_output_file
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.models import check_model_output, read_model, write_model
+from keyss.files.output import OutputFolder
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
@@ -267,14 +267,14 @@ def reveal(
     not what they should be or do not belong together.
     """
     target = resolve_device(device)
-    path = None if out is None else check_output_file(out, overwrite)
+    path = None if out is None else check_model_output(out, overwrite)
     model = as_model(stego)
     if decoder is None and not isinstance(stego, Gaussians):
         decoder = sidecar_beside(Path(stego))
     secret = open_any(model, key, decoder, decoy=decoy)
     found = revealed(model.to(target), secret, frame=frame, force=force)
     if path is not None:
-        write_ply(path, found)
+        write_model(path, found)
     return found
 
 
@@ -333,7 +333,7 @@ def evaluate(
             target,
         )
     else:
-        bounds = [read_ply(opened.folder / name) for name in plain_names(len(learned))]
+        bounds = [read_model(opened.folder / name) for name in plain_names(len(learned))]
         metrics = opened.metrics | measure_hiding(
             opened.stego.to(target),
             learned,

@@ -8,7 +8,7 @@ from typing import Any
 from keyss.channels.sidecar import read_header
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene
-from keyss.files.ply import describe_ply
+from keyss.files.models import describe_model, is_model_path
 from keyss.files.scenes import load_scene
 from keyss.methods.learned.revealing import read_sidecar
 from keyss.runs.files import METRICS, MODEL, STEGO, read_json
@@ -25,8 +25,8 @@ def info(path: str | Path) -> dict[str, Any]:
         return _describe_scene(load_scene(path))
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    if path.suffix.lower() == ".ply":
-        facts = describe_ply(path)
+    if is_model_path(path):
+        facts = describe_model(path)
         return {
             "kind": "3DGS model",
             "path": str(path),

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.scene import Scene
-from keyss.files.ply import read_ply
+from keyss.files.models import read_model
 from keyss.files.scenes import load_scene
 from keyss.methods.carry.carrying import Carried
 from keyss.methods.learned.opening import open_model
@@ -69,7 +69,7 @@ class HidingRun:
         for name, source in zip(plain_names(len(self.opened)), self.sources, strict=True):
             path = self.folder / name
             path = Path(source) if not path.exists() and is_model(source) else path
-            found.append(read_ply(path) if path.exists() else None)
+            found.append(read_model(path) if path.exists() else None)
         return found
 
 
@@ -91,7 +91,7 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
         ) from error
     if not all(isinstance(source, str) for source in sources):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    stego, sidecar = read_ply(folder / STEGO), sidecar_beside(folder / STEGO)
+    stego, sidecar = read_model(folder / STEGO), sidecar_beside(folder / STEGO)
     found = {fingerprint(secret): (secret, key) for key in keys for secret in [open_any(stego, key, sidecar)]}
     if set(found) != set(fingerprints):
         raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(found)} of them")
@@ -114,7 +114,7 @@ def open_any(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, de
 def revealed(stego: Gaussians, secret: Opened, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
     """The secret as a model of its own, on the CPU; a carried one makes up for what was lost."""
     if isinstance(secret, Carried):
-        return filled(secret.gaussians, secret.count)
+        return compensate_pruning(secret.gaussians, secret.count)
     return reveal_gaussians(stego, secret, frame=frame, force=force).to("cpu")
 
 
@@ -131,7 +131,7 @@ def as_scene(source: PathLike | Scene | Gaussians, width: int | None, background
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
     """A model, or the one in a `.ply`, on the CPU."""
-    return source.to("cpu") if isinstance(source, Gaussians) else read_ply(source)
+    return source.to("cpu") if isinstance(source, Gaussians) else read_model(source)
 
 
 def sidecar_beside(stego: Path) -> Path | None:

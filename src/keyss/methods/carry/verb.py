@@ -14,10 +14,10 @@ from torch import Tensor
 
 from keyss._version import __version__
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.scene import Scene
+from keyss.files.models import is_model_path, read_model
 from keyss.files.output import OutputFolder
-from keyss.files.ply import read_ply
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
@@ -73,10 +73,10 @@ class PlainModels:
         if isinstance(given, Gaussians):
             return Source(given.to("cpu"), None)
         if _is_model(given):
-            return Source(read_ply(given), None)
+            return Source(read_model(given), None)
         scene = _photos(given, self.width, self.background)
         if model is not None:
-            return Source(model.to("cpu") if isinstance(model, Gaussians) else read_ply(model), scene)
+            return Source(model.to("cpu") if isinstance(model, Gaussians) else read_model(model), scene)
         result = fit_scene(
             scene,
             self.config,
@@ -208,7 +208,7 @@ def evaluate(
     device: torch.device | str,
 ) -> dict[str, Any]:
     """`metrics` with the stego model and what keys opened in it measured against the photos again."""
-    models = [stego, *(filled(carried.gaussians, carried.count) for carried in opened)]
+    models = [stego, *(compensate_pruning(carried.gaussians, carried.count) for carried in opened)]
     found = []
     for source, model in zip(sources, models, strict=True):
         scene = None if _is_model(source) else _photos(source, width, background)
@@ -219,7 +219,7 @@ def evaluate(
 
 
 def _is_model(given: Path | str | Scene) -> TypeGuard[Path | str]:
-    return not isinstance(given, Scene) and Path(given).suffix.lower() == ".ply"
+    return not isinstance(given, Scene) and is_model_path(given)
 
 
 def _photos(

@@ -13,7 +13,7 @@ from keyss.channels.low_bits.container import extract_derived, key_for
 from keyss.channels.sidecar import open_slots, read_header
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.files.reading import read_file
 from keyss.keys import DerivedKey
@@ -89,7 +89,7 @@ def reveal_gaussians(
     decoded = decode(stego, secret, secret.embedding)
     if (drawn := is_drawn(decoded)).any():
         decoded = decoded[drawn]
-    decoded = filled(decoded, secret.count)
+    decoded = compensate_pruning(decoded, secret.count)
     if frame == "cover":
         return decoded
     return secret.frame.inverse().apply_gaussians(decoded.to("cpu"))
