@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from keyss.channels.low_bits.container import embed
+from keyss.methods.carry.thinning import most_visible
 
 import keyss
 from channels.low_bits.trained_like import keys, trained_like
 from keyss import FitConfig, Gaussians, HideConfig, Secret
-from keyss.channels.low_bits.container import embed
 from keyss.cli import main
 from keyss.core import UsageError, WrongKeyError
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.ply import read_ply, write_ply
 from keyss.methods.carry.carrying import embed_derived
-from keyss.methods.carry.thinning import most_visible
 from keyss.methods.learned.opening import open_model
 from keyss.methods.learned.payload import HiddenSecret, pack_secret
 from keyss.methods.learned.revealing import decoy_secret

@@ -21,8 +21,8 @@ from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.scramble import LEAST_OPACITY
 from keyss.methods.learned.start import HIDDEN_SLOPE, logit_limits, make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
+from keyss.methods.learned.visibility import possibly_seen
 from keyss.rendering import render_with_meta
-from keyss.rendering.visibility import possibly_seen
 
 LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
 
