@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
+import msgspec
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 
 _ROTATION_TOLERANCE = 1e-6
+_Numbers: TypeAlias = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,11 @@ class Similarity:
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
-    def compose(self, first: Similarity) -> Similarity:
-        """The transform that applies `first` and then this one; also written `self @ first`."""
+    def __matmul__(self, first: Similarity) -> Similarity:
+        """The transform that applies `first` and then this one."""
         return Similarity(
             self.scale * first.scale, self.rotation @ first.rotation, self.apply_points(first.translation)
         )
-
-    def __matmul__(self, first: Similarity) -> Similarity:
-        return self.compose(first)
 
     def apply_points(self, points: Tensor) -> Tensor:
         """[..., 3] transformed points, of the dtype and on the device of `points`."""
@@ -105,23 +104,22 @@ class Similarity:
     @staticmethod
     def from_json(data: object) -> Similarity:
         """The similarity that `to_json` described. Raises ValueError for anything else."""
-        if not isinstance(data, dict) or data.keys() != {"scale", "rotation", "translation"}:
-            raise ValueError("similarity: expected an object with scale, rotation and translation")
-        rows = data["rotation"]
-        if not isinstance(rows, list) or len(rows) != 3:
-            raise ValueError("similarity: expected three rows of rotation")
-        rotation = torch.stack([_numbers(row) for row in rows])
-        return Similarity(float(_numbers([data["scale"]], 1)), rotation, _numbers(data["translation"]))
+        try:
+            exact = msgspec.convert(data, _Exact)
+        except msgspec.ValidationError as error:
+            raise ValueError(f"similarity: {error}") from error
+        rotation, translation = (
+            torch.tensor(numbers, dtype=torch.float64) for numbers in (exact.rotation, exact.translation)
+        )
+        return Similarity(exact.scale, rotation, translation)
 
 
-def _numbers(data: object, count: int = 3) -> Tensor:
-    """[count] float64 of a list of JSON numbers."""
-    if not isinstance(data, list) or len(data) != count or not all(type(v) in (int, float) for v in data):
-        raise ValueError(f"similarity: expected {count} number(s), got {str(data)[:80]}")
-    try:
-        return torch.tensor([float(value) for value in data], dtype=torch.float64)
-    except OverflowError as error:
-        raise ValueError("similarity: a number is too large") from error
+class _Exact(msgspec.Struct, forbid_unknown_fields=True):
+    """A similarity in JSON."""
+
+    scale: float
+    rotation: tuple[_Numbers, _Numbers, _Numbers]
+    translation: _Numbers
 
 
 def _quaternion(rotation: Tensor) -> Tensor:

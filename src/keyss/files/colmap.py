@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PureWindowsPath
 
 from keyss.core.errors import InputError
-from keyss.files.colmap_model import find_model, read_model
+from keyss.files.colmap_model import find_model, read_sparse_model
 from keyss.files.layout import Layout, Photo, hold_out, refuse_duplicates
 
 
@@ -23,7 +23,7 @@ def read_colmap(folder: Path) -> Layout:
     model_folder = find_model(folder)
     if model_folder is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
-    model = read_model(model_folder)
+    model = read_sparse_model(model_folder)
     photos = [
         Photo(
             folder / "images" / _inside(model_folder, image.name),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,26 +68,6 @@ def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], t
         )
     ordered = sorted(photos, key=lambda photo: photo.name)
     return tuple(p for i, p in enumerate(ordered) if i % 8), tuple(ordered[::8])
-
-
-def viewmat_from_quaternion(
-    where: str, quaternion: Sequence[float], translation: Sequence[float]
-) -> NDArray[np.float64]:
-    """[4, 4] from a rotation wxyz (normalised here) and a translation. Raises InputError."""
-    norm = math.hypot(*quaternion)
-    if not 1e-8 < norm < math.inf:
-        raise InputError(f"{where}: expected a rotation quaternion, found {list(quaternion)}")
-    w, x, y, z = (q / norm for q in quaternion)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    if not all(abs(t) <= MAX_COORDINATE for t in translation):
-        raise InputError(f"{where}: expected a finite translation, found {list(translation)}")
-    viewmat[:3, 3] = translation
-    return viewmat
 
 
 def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:
