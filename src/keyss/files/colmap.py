@@ -6,7 +6,7 @@ from pathlib import Path, PureWindowsPath
 
 from keyss.core.errors import InputError
 from keyss.files.colmap_model import find_model, read_sparse_model
-from keyss.files.layout import Layout, Photo, hold_out, refuse_duplicates
+from keyss.files.layout import SceneLayout, Photo, hold_out, refuse_duplicates
 
 
 def is_colmap(folder: Path) -> bool:
@@ -14,7 +14,7 @@ def is_colmap(folder: Path) -> bool:
     return find_model(folder) is not None
 
 
-def read_colmap(folder: Path) -> Layout:
+def read_colmap(folder: Path) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
 
     Image names may hold subfolders but never leave `images/`. Raises InputError for a broken model and
@@ -34,7 +34,7 @@ def read_colmap(folder: Path) -> Layout:
         for image in model.images
     ]
     refuse_duplicates(model_folder, photos)
-    return Layout(*hold_out(model_folder, photos), model.points)
+    return SceneLayout(*hold_out(model_folder, photos), model.points)
 
 
 def _inside(model_folder: Path, name: str) -> str:

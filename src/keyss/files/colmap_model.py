@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from keyss.core.errors import InputError
-from keyss.files.layout import MAX_COORDINATE, Points
+from keyss.files.layout import MAX_COORDINATE, PointCloud
 from keyss.files.lens import Lens, make_lens
 from keyss.files.reading import read_file, read_text
 
@@ -62,7 +62,7 @@ class SparseModel:
 
     lenses: dict[int, Lens]  # by camera id
     images: tuple[ModelImage, ...]
-    points: Points  # in the order of their ids
+    points: PointCloud  # in the order of their ids
 
 
 def find_model(folder: Path) -> Path | None:
@@ -199,7 +199,7 @@ def _images_bin(path: Path) -> Iterator[ModelImage]:
     records.end()
 
 
-def _points_bin(path: Path) -> Points:
+def _points_bin(path: Path) -> PointCloud:
     records = _Records(path)
     data, end = records.data, len(records.data)
     count = records.count(51, "points")
@@ -222,7 +222,7 @@ def _points_bin(path: Path) -> Points:
     raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
     points = raw.view(fields)[:, 0]
     points = points[np.argsort(points["id"], kind="stable")]
-    return Points.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
+    return PointCloud.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
 
 
 def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -236,7 +236,7 @@ def _images_txt(path: Path) -> Iterator[ModelImage]:
         yield _image(where, words[9], _number(int, where, words[8]), _floats(where, words[1:8], 7))
 
 
-def _points_txt(path: Path) -> Points:
+def _points_txt(path: Path) -> PointCloud:
     xyz, rgb, ids = [], [], []
     for where, words in _rows(path, "POINT3D_ID X Y Z R G B ERROR TRACK..."):
         ids.append(_number(int, where, words[0]))
@@ -246,7 +246,7 @@ def _points_txt(path: Path) -> Points:
             raise InputError(f"{where}: expected colours of 0 to 255, found {rgb[-1]}")
     order = sorted(range(len(ids)), key=ids.__getitem__)
     positions = np.array(xyz, dtype=np.float64).reshape(-1, 3)[order]
-    return Points.checked(path, positions, np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order])
+    return PointCloud.checked(path, positions, np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order])
 
 
 def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:

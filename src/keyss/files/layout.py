@@ -26,18 +26,18 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Points:
+class PointCloud:
     """A point cloud."""
 
     xyz: NDArray[np.float32]  # [P, 3]
     rgb: NDArray[np.uint8]  # [P, 3]
 
     @staticmethod
-    def none() -> Points:
-        return Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    def none() -> PointCloud:
+        return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
 
     @staticmethod
-    def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> Points:
+    def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> PointCloud:
         """The points as float32. Raises InputError when a coordinate is not finite or beyond 1e15."""
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():
@@ -45,16 +45,16 @@ class Points:
             raise InputError(
                 f"{where}: expected finite points, found {xyz[first].tolist()} as point {first + 1}"
             )
-        return Points(xyz.astype(np.float32), rgb)
+        return PointCloud(xyz.astype(np.float32), rgb)
 
 
 @dataclass(frozen=True)
-class Layout:
+class SceneLayout:
     """The photos of a scene, split into training and test, and its points."""
 
     train: tuple[Photo, ...]
     test: tuple[Photo, ...]
-    points: Points
+    points: PointCloud
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
