@@ -14,7 +14,7 @@ from keyss.audit.progress import PICTURES, Kept, Steps
 from keyss.audit.subject import Subject, null_seeds, subject_of
 from keyss.core.errors import UsageError
 from keyss.files.output import OutputFolder
-from keyss.fitting.loop import Interrupted, Reporter, Silent
+from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.rendering import Backend, resolve_device
 from keyss.report import write_report
 from keyss.runs.files import bytes_writer, json_writer
@@ -51,7 +51,7 @@ def audit(
         raise UsageError(f"expected at least 2 plain models to compare with, got {null}")
     if unknown := sorted(set(only) - set(PARTS)):
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
-    started, reporter = time.monotonic(), reporter or Silent()
+    started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
     output = OutputFolder(opened.folder / FOLDER, overwrite=overwrite, resume=resume)
     seeds = null_seeds(opened, null, seed)

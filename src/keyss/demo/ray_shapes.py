@@ -70,7 +70,7 @@ def ellipsoid(points: Floats, radii: Vector) -> Floats:
     """Not exact, but never more than the distance near the surface of moderately flat ellipsoids."""
     scaled = points / column(radii)
     size = length(scaled)
-    return size * (size - np.float32(1)) / np.maximum(length(scaled / column(radii)), np.float32(1e-6))
+    return np.divide(size * (size - 1), np.maximum(length(scaled / column(radii)), 1e-6))
 
 
 @_shape

@@ -12,7 +12,7 @@ from torch import Tensor
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.image_metrics import Quality, mean_psnr, quality
+from keyss.fitting.image_metrics import ImageQuality, mean_psnr, quality
 from keyss.keys import random_embeddings
 from keyss.methods.learned.payload import HiddenSecret
 from keyss.methods.learned.revealing import decode, reveal_gaussians
@@ -77,7 +77,7 @@ def what_wrong_keys_show(
 
 
 def _quality(scene: Scene, model: Gaussians) -> dict[str, float]:
-    result: Quality = quality(model, scene.test, _background(scene, model))
+    result: ImageQuality = quality(model, scene.test, _background(scene, model))
     return asdict(result)
 
 
