@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,7 +10,6 @@ from torch import Tensor
 
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera, Scene, View
-from keyss.methods.learned.config import HideConfig
 from keyss.rendering import render
 
 VIEWS = 96
@@ -103,21 +100,3 @@ def _looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str)
     viewmat[:3, :3] = torch.stack([right, down, forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return Camera(viewmat, K, size, size, name)
-
-
-def room_for_models(config: HideConfig, models: Sequence[Gaussians]) -> HideConfig:
-    """`config` with a cap that holds all `models`, the SH degree they need, and a short, gentle schedule.
-
-    Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are. Where
-    nothing has to be left out the start is right already, and large steps would only do harm.
-    """
-    return replace(
-        config,
-        warm_rate=0.1,
-        fit=replace(
-            config.fit,
-            iterations=min(config.fit.iterations, 400),
-            max_gaussians=max(16, sum(len(model) for model in models)),
-            sh_degree=max(1, *(model.sh_degree for model in models)),
-        ),
-    )

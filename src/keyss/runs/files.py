@@ -15,6 +15,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.files.atomic import write_bytes
 from keyss.files.ply import write_ply
+from keyss.runs.records import write_record
 
 STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
     "stego.ply",
@@ -54,6 +55,11 @@ def png_writer(image: Tensor) -> Callable[[Path], None]:
 def png_bytes(image: Tensor) -> bytes:
     """A PNG file of an image [H, W, 3] uint8."""
     return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
+
+
+def record_writer(record: Any) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes a record."""
+    return lambda path: write_record(path, record)
 
 
 def json_writer(data: dict[str, Any]) -> Callable[[Path], None]:
