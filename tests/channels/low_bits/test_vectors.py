@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from keyss.channels.low_bits.byte_cells import CellCipher
+from keyss.channels.low_bits.cells import CellCipher
 from keyss.core import errors
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.sealed import unseal
@@ -28,7 +29,7 @@ def _derived(vector: dict[str, Any]) -> DerivedKey:
 def test_derivation(vector: dict[str, Any]) -> None:
     key = _derived(vector)
     assert key.verifier().hex() == vector["verifier"]
-    for label in ("seal", "cells/header"):
+    for label in ("seal", "low-bits/key"):
         assert key.expand(label, 32).hex() == vector[label]
     assert key.embedding()[:4].tolist() == pytest.approx(vector["embedding_first_4"], abs=2e-6)
 
@@ -58,9 +59,12 @@ def test_sealing_that_must_fail(vector: dict[str, Any]) -> None:
 
 def test_cell() -> None:
     vector = SEALING["cell"]
-    secret, identity, data, cell = (
-        bytes.fromhex(vector[name]) for name in ("secret", "identity", "data", "cell")
+    identity, data, cell = (
+        np.frombuffer(bytes.fromhex(vector[name]), np.uint8)[None] for name in ("identity", "data", "cell")
     )
-    cipher = CellCipher(secret, vector["label"])
-    assert cipher.close(identity, vector["number"], data) == cell
-    assert cipher.open(identity, cell) == (vector["number"], data)
+    secret, label = bytes.fromhex(vector["secret"]), vector["label"]
+    cipher = CellCipher(secret, label, data.shape[1], vector["tag_bytes"])
+    assert (cipher.encrypt(identity, data, vector["slot"]) == cell).all()
+    fits, decrypted = cipher.decrypt(identity, cell, vector["slot"])
+    assert fits.all()
+    assert (decrypted == data).all()
