@@ -29,7 +29,7 @@ from keyss.channels.sidecar import seal_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.files.ply import write_ply
+from keyss.files.models import write_model
 from keyss.keys import generate_key, random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
@@ -53,7 +53,7 @@ def main() -> None:
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"
-        write_ply(path, stego)
+        write_model(path, stego)
         beside.write_bytes(sidecar)
         _compare("open, one file", lambda key: _attempt(stego, key, None), right, wrong, asked.rounds)
         _compare("open, sidecar", lambda key: _attempt(stego, key, sidecar), right, wrong, asked.rounds)

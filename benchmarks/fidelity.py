@@ -26,7 +26,7 @@ from keyss.core import Scene, WrongKeyError
 from keyss.core.alignment import align
 from keyss.core.similarity import Similarity
 from keyss.files.atomic import write_bytes
-from keyss.files.ply import read_ply
+from keyss.files.models import read_model
 from keyss.files.scenes import load_scene
 from keyss.fitting.loop import Interrupted
 from keyss.fitting.parameters import make_optimizers, to_parameters
@@ -141,7 +141,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
 
 def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed: int) -> dict[str, Any]:
     """What near and random keys show to somebody who holds the decoders, and how many the files refuse."""
-    stego = read_ply(out / "stego.ply")
+    stego = read_model(out / "stego.ply")
     beside = out / "decoder.sealed"
     sidecar = beside.read_bytes() if beside.exists() else None
     opened = [open_secret(stego, key, sidecar) for key in keys]
@@ -165,7 +165,7 @@ def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed
 
 def step_cost(scenes: Sequence[Scene], models: Sequence[Path], config: HideConfig) -> float:
     """Time of a hiding step over that of a plain step of the cover, with as many Gaussians, in one run."""
-    plains = [read_ply(path) for path in models]
+    plains = [read_model(path) for path in models]
     cameras = [view.camera for view in scenes[0].train]
     frames = [Similarity.identity()]
     frames += [align([view.camera for view in scene.train], cameras) for scene in scenes[1:]]

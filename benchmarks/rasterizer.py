@@ -24,7 +24,7 @@ from torch import Tensor
 
 from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
 from keyss.core import Camera, Gaussians
-from keyss.files import read_ply
+from keyss.files import read_model
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, photometric_loss
@@ -51,7 +51,7 @@ class Case:
 
     def scene(self) -> tuple[Gaussians, Camera]:
         if self.file is not None:
-            gaussians = read_ply(self.file)
+            gaussians = read_model(self.file)
             return gaussians, _camera_before(gaussians.means, self.width, self.height)
         gaussians = made_up(self.count)
         return gaussians, _camera_before(gaussians.means, self.width, self.height)

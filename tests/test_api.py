@@ -96,7 +96,7 @@ def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
 
 def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     secret = keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "secret.ply")
-    again = keyss.read_ply(tmp_path / "secret.ply")
+    again = keyss.read_model(tmp_path / "secret.ply")
     assert torch.equal(secret.means, again.means)
     assert torch.equal(secret.sh, again.sh)
     pictures = dict(keyss.render(tmp_path / "secret.ply", folders[1]))
@@ -145,7 +145,7 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     assert wrong not in (other, right, (run / "stego.ply").read_bytes())
     heads = [data[: data.index(b"end_header")].splitlines() for data in (right, wrong)]
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
-    decoy, whole = keyss.read_ply(paths[1]), keyss.read_ply(run / "stego.ply")
+    decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "stego.ply")
     stego = whole[whole.opacities >= 1 / 255]
     assert len(decoy) == len(stego) < len(whole)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
@@ -162,7 +162,7 @@ def test_a_sidecar_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> 
         keyss.reveal(tmp_path / "stego.ply", "the key")
     sidecar = run / "decoder.sealed"
     whole = keyss.reveal(tmp_path / "stego.ply", "the key", decoder=sidecar)
-    stego = keyss.read_ply(run / "stego.ply")
+    stego = keyss.read_model(run / "stego.ply")
     assert torch.equal(keyss.reveal(stego, "the key", decoder=sidecar.read_bytes()).means, whole.means)
     with pytest.raises(InputError, match="another model"):
         keyss.reveal(run / "private" / "secret-1.ply", "the key", decoder=sidecar)
@@ -204,7 +204,7 @@ def test_outputs_that_exist_are_refused_before_any_work(
         keyss.fit(folders[0], out=tmp_path)
     assert (tmp_path / "x.ply").read_text() == "mine"
     keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
-    assert len(keyss.read_ply(tmp_path / "x.ply"))
+    assert len(keyss.read_model(tmp_path / "x.ply"))
 
 
 def test_a_full_disk_leaves_no_results_but_keeps_the_work(
@@ -244,7 +244,7 @@ def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tu
     assert sealed.keys() == {"kind", "path", "bytes", "key_derivation"}  # not how many secrets there are
     assert keyss.info(run / "stego.ply").keys() == keyss.info(run / "private" / "cover.ply").keys()
     assert keyss.info(folders[0])["test_views"] == 2
-    assert keyss.info(run)["metrics"]["gaussians"] == len(keyss.read_ply(run / "stego.ply"))
+    assert keyss.info(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "stego.ply"))
     with pytest.raises(InputError, match="no such"):
         keyss.info(run / "nothing")
 
@@ -261,5 +261,5 @@ def test_public_api() -> None:
     assert set(keyss.__all__) == {
         *("Camera", "FitConfig", "Gaussians", "HideConfig", "HideResult", "KeyssError", "Scene", "Secret"),
         *("View", "WrongKeyError", "__version__", "evaluate", "fit", "generate_key", "hide", "info"),
-        *("load_scene", "read_ply", "render", "reveal", "write_ply"),
+        *("load_scene", "read_model", "render", "reveal", "write_model"),
     }

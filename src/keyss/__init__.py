@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal
     from keyss.audit import audit
     from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
-    from keyss.files import load_scene
-    from keyss.files import read_ply as read_model
-    from keyss.files import write_ply as write_model
+    from keyss.files import load_scene, read_model, write_model
     from keyss.fitting import FitConfig
     from keyss.keys import generate_key
     from keyss.methods.carry.options import CarryOptions
@@ -58,8 +56,7 @@ __all__ = [
 _HOMES = {
     "keyss.api": ("HideResult", "Secret", "evaluate", "fit", "hide", "render", "reveal"),
     "keyss.core": ("Camera", "Gaussians", "KeyssError", "Scene", "View", "WrongKeyError"),
-    "keyss.files": ("load_scene",),
-    "keyss.files.ply": ("read_model", "write_model"),
+    "keyss.files": ("load_scene", "read_model", "write_model"),
     "keyss.fitting": ("FitConfig",),
     "keyss.keys": ("generate_key",),
     "keyss.methods.carry.options": ("CarryOptions",),

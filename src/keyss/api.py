@@ -17,8 +17,8 @@ from torch import Tensor
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.files.output import OutputFolder, check_output_file
-from keyss.files.ply import write_ply
+from keyss.files.models import check_model_output, write_model
+from keyss.files.output import OutputFolder
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
@@ -227,14 +227,14 @@ def reveal(
     are not what they should be or do not belong together.
     """
     target = resolve_device(device)
-    path = None if out is None else check_output_file(out, overwrite)
+    path = None if out is None else check_model_output(out, overwrite)
     model = as_model(stego)
     if decoder is None and not isinstance(stego, Gaussians):
         decoder = sidecar_beside(Path(stego))
     secret = open_file(model, key, decoder, decoy=decoy)
     found = secret.reveal(model.to(target), frame=frame, force=force)
     if path is not None:
-        write_ply(path, found)
+        write_model(path, found)
     return found
 
 

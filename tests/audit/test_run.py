@@ -66,7 +66,7 @@ def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     assert calls == ["first", "second"]
     written = json.loads((run / "audit" / "audit.json").read_text())
     assert written == found
-    assert found["first"] == {"gaussians": len(keyss.read_ply(run / "stego.ply"))}
+    assert found["first"] == {"gaussians": len(keyss.read_model(run / "stego.ply"))}
     assert found["second"] == [2.0]
     assert found["null"] == {"models": 2, "seeds": [1, 2]}
     assert (run / "audit" / "pictures" / "a.png").exists()

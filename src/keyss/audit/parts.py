@@ -10,7 +10,8 @@ from keyss.audit.histograms import histograms
 from keyss.audit.progress import PICTURES, Found, Steps
 from keyss.audit.subject import Subject
 from keyss.core.errors import BackendError
-from keyss.fitting.image_metrics import thin
+from keyss.files.images import picture_name
+from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_null, attribute_distances
 from keyss.measure.images import compare_images, renders_of
 from keyss.measure.leaks import look_for_secret
@@ -22,7 +23,7 @@ from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.two_sample import two_sample_against_null, two_sample_auc
 from keyss.methods.learned.payload import HiddenSecret
-from keyss.runs.files import STEGO, picture_name
+from keyss.runs.files import STEGO
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64
@@ -108,7 +109,7 @@ def stegexpose(subject: Subject, seed: int, steps: Steps) -> Found:
     """
     # In the order of the photos' names, which is that of the camera's path more often than not.
     ordered = sorted(subject.cover.views, key=lambda view: view.camera.name)
-    views = thin(ordered, STEGANALYSED_VIEWS)
+    views = subsample_views(ordered, STEGANALYSED_VIEWS)
     models = (subject.nulls[0], subject.stego, subject.nulls[1])
     plain, stego, null = (
         [image.numpy() for _, image in renders_of(model, subject.cover, views)] for model in models

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
+from keyss.files.images import png_bytes
 from keyss.files.reading import read_file
 from keyss.fitting.loop import Reporter
-from keyss.runs.files import json_bytes, png_bytes, read_json
+from keyss.runs.files import json_bytes, read_json
 
 PICTURES = "pictures"  # folder in that of the audit
 _MAX_PICTURE_BYTES = 1 << 26

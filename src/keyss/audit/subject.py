@@ -16,7 +16,7 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.models import read_model, write_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
@@ -76,7 +76,7 @@ def subject_of(
     scenes = run.scenes()
     plain, *bounds = run.plain_models()
     if original is not None:
-        plain = read_ply(original)
+        plain = read_model(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
     stego, folder = run.stego.to(device), run.folder / NULLS
@@ -135,7 +135,7 @@ def _plain_model(
     name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
     model, checkpoint = folder / f"{name}.ply", folder / f"{name}.safetensors"
     if model.exists():
-        return read_ply(model)
+        return read_model(model)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -149,6 +149,6 @@ def _plain_model(
         resume=True,
         reporter=reporter,
     )
-    write_ply(model, result.gaussians)
+    write_model(model, result.gaussians)
     checkpoint.unlink(missing_ok=True)
     return result.gaussians

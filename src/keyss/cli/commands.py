@@ -171,7 +171,7 @@ def hide(
     from keyss.cli.keys import keys, warn_of_weak_keys
     from keyss.cli.tables import print_carry, print_files, print_metrics
     from keyss.core.errors import UsageError
-    from keyss.files.ply import read_ply
+    from keyss.files.models import read_model
     from keyss.methods.learned.config import PRESETS
     from keyss.methods.learned.mask import parse_mask
     from keyss.progress import reporter
@@ -188,7 +188,7 @@ def hide(
     config = PRESETS[preset]
     config = config.adapted(None if mask is None else parse_mask(mask), start)
     if max_gaussians is None and all(map(is_model, (cover, *secret))):
-        config = room_for_models(config, [read_ply(path) for path in (cover, *secret)])
+        config = room_for_models(config, [read_model(path) for path in (cover, *secret)])
     config = replace(config, fit=_schedule(config.fit, iterations, max_gaussians, seed))
     if clip_model is not None and key_encoder != "clip":
         raise UsageError("--clip-model is for --key-encoder clip")

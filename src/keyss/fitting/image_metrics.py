@@ -48,6 +48,6 @@ def mean_psnr(gaussians: Gaussians, views: Sequence[View], background: Tensor) -
     return sum(values) / len(values)
 
 
-def thin(views: Sequence[View], count: int) -> tuple[View, ...]:
-    """At most `count` of the views, evenly spread."""
+def subsample_views(views: Sequence[View], count: int) -> tuple[View, ...]:
+    """At most `count` of the views: every n-th."""
     return tuple(views[:: max(1, -(-len(views) // count))])

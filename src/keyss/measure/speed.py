@@ -16,8 +16,8 @@ import torch
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.ply import read_ply, write_ply
-from keyss.fitting.image_metrics import thin
+from keyss.files.models import read_model, write_model
+from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_gsply, transform
 from keyss.measure.robustness.reopening import Reopen
 from keyss.rendering import render
@@ -60,7 +60,7 @@ def speed(
                 revealed.append({"model": name, "seconds": reveal_seconds(stego, reopen[number - 1], file)})
             files[name] = file.stat().st_size
             ratio = render_ratio(
-                read_ply(file).to(device), plain.to(device), scene, views=views, rounds=rounds
+                read_model(file).to(device), plain.to(device), scene, views=views, rounds=rounds
             )
             rendered.append({"model": name, **ratio})
             read += [{"model": name, **found} for found in readers(file)]
@@ -79,7 +79,7 @@ def render_ratio(
     first round warms up and does not count. "ratio" is the median over pairs of pictures, so that what else
     the machine does cancels; "milliseconds" and "plain_milliseconds" are medians too.
     """
-    cameras = [view.camera for view in thin(scene.test, views)]
+    cameras = [view.camera for view in subsample_views(scene.test, views)]
     background = scene.background.to(model.device)
     times = np.zeros((rounds + 1, len(cameras), 2))
     for number in range(rounds + 1):
@@ -106,7 +106,7 @@ def reveal_seconds(stego: Path, reopen: Reopen, out: Path, *, repeats: int = 3) 
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        write_ply(out, reopen(read_ply(stego)).gaussians)
+        write_model(out, reopen(read_model(stego)).gaussians)
         seconds.append(time.perf_counter() - start)
     return median(seconds)
 
@@ -117,7 +117,7 @@ def readers(path: Path) -> list[dict[str, Any]]:
     "gaussians": how many they find, "equal": whether all values are those that we read, to the last bit. One
     that fails says why in "error", and one that is not installed in "skipped".
     """
-    expected = _columns_of(read_ply(path))
+    expected = _columns_of(read_model(path))
     found: list[dict[str, Any]] = []
     for name, read in (("plyfile", _plyfile), ("gsply", _gsply), ("splat-transform", _splat_transform)):
         try:
@@ -172,4 +172,4 @@ def _gsply(path: Path) -> Columns:
 
 def _splat_transform(path: Path) -> Columns:
     with tempfile.TemporaryDirectory() as folder:
-        return _columns_of(read_ply(transform(path, Path(folder) / "copy.ply")))
+        return _columns_of(read_model(transform(path, Path(folder) / "copy.ply")))

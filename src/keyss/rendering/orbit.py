@@ -10,6 +10,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera, Scene, View
+from keyss.files.models import is_model_path
 from keyss.rendering import render
 
 VIEWS = 96
@@ -23,7 +24,7 @@ TEST_EVERY = 8
 
 def is_model(source: str | Path | Gaussians) -> bool:
     """Whether a source is a model, or the name of one, and not a folder of photos."""
-    return isinstance(source, Gaussians) or Path(source).suffix.lower() == ".ply"
+    return isinstance(source, Gaussians) or is_model_path(source)
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from pathlib import Path
 from keyss.channels.sidecar import read_header
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene
-from keyss.files.ply import describe_ply
+from keyss.files.models import describe_model, is_model_path
 from keyss.files.scenes import load_scene
 from keyss.runs.files import METRICS, MODEL, STEGO
 from keyss.runs.metrics import FitMetrics, HideMetrics
@@ -85,8 +85,8 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
         return _scene_info(load_scene(path))
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    if path.suffix.lower() == ".ply":
-        facts = describe_ply(path)
+    if is_model_path(path):
+        facts = describe_model(path)
         lower, upper = (tuple(round(x, 4) for x in corner) for corner in (facts.lower, facts.upper))
         share = round(facts.faint_share, 4)
         return ModelInfo(

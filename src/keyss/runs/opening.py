@@ -11,7 +11,7 @@ import torch
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.ply import read_ply
+from keyss.files.models import read_model
 from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
 from keyss.methods import registry
@@ -48,7 +48,7 @@ class HidingRun:
         for name, source in zip(plain_names(len(self.opened)), self.sources, strict=True):
             path = self.folder / name
             path = Path(source) if not path.exists() and is_model(source) else path
-            found.append(read_ply(path) if path.exists() else None)
+            found.append(read_model(path) if path.exists() else None)
         return found
 
 
@@ -63,7 +63,7 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    stego, sidecar = read_ply(folder / STEGO), sidecar_beside(folder / STEGO)
+    stego, sidecar = read_model(folder / STEGO), sidecar_beside(folder / STEGO)
     found = {}
     for key in keys:
         opened = open_file(stego, key, sidecar)
@@ -114,4 +114,4 @@ def as_scene(source: PathLike | Scene | Gaussians, width: int | None, background
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
     """A model, or the one in a `.ply`, on the CPU."""
-    return source.to("cpu") if isinstance(source, Gaussians) else read_ply(source)
+    return source.to("cpu") if isinstance(source, Gaussians) else read_model(source)

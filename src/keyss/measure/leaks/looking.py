@@ -13,7 +13,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.leaks.attacks import Attack, decoder_attacks, file_attacks
 from keyss.measure.leaks.scores import SCORES, scores
 from keyss.methods.learned.payload import HiddenSecret
@@ -45,7 +45,7 @@ def look_for_secret(
     decoder. See `attack` for what comes back. Raises UsageError for no plain model and for a secret without
     test views.
     """
-    attacks = file_attacks([view.camera for view in thin(cover.train, cover_views)], seed)
+    attacks = file_attacks([view.camera for view in subsample_views(cover.train, cover_views)], seed)
     if opened is not None:
         attacks += decoder_attacks(opened, restarts=restarts, seed=seed)
     return attack(stego, plains, secret, frame, attacks, test_views=test_views)
@@ -77,7 +77,8 @@ def attack(
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
     if not secret.test:
         raise UsageError(f"leaks: the scene {secret.name} has no test views")
-    views = [View(frame.apply_camera(view.camera), view.image) for view in thin(secret.test, test_views)]
+    chosen = subsample_views(secret.test, test_views)
+    views = [View(frame.apply_camera(view.camera), view.image) for view in chosen]
     rows, pictures = [], {}
     for each in attacks:
         found = _look(each, stego, views, secret.background)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.methods.carry.carrying import Carried
 from keyss.methods.learned.opening import open_model
@@ -43,7 +43,7 @@ class Reopener:
         else:
             secret = open_secret(stego, self.key, self.sidecar)
         if isinstance(secret, Carried):
-            return Opened(filled(secret.gaussians, secret.count))
+            return Opened(compensate_pruning(secret.gaussians, secret.count))
         try:
             revealed = reveal_gaussians(stego, secret)
         except InputError:  # positions changed, so that it seems to be another model

@@ -8,7 +8,7 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
@@ -50,7 +50,7 @@ def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
     Of all weights with which Gaussians are blended, summed over pixels and views, no more than the share
     `given_up` is theirs. Never all of them.
     """
-    weights = contributions(model, [view.camera for view in thin(cover.train, VIEWS)]).double()
+    weights = contributions(model, [view.camera for view in subsample_views(cover.train, VIEWS)]).double()
     ascending, order = weights.sort(stable=True)
     least = ascending.cumsum(0) <= given_up * ascending.sum()
     least[-1] = False

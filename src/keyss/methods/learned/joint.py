@@ -11,7 +11,7 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.density import CappedStrategy
-from keyss.fitting.image_metrics import mean_psnr, thin
+from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
@@ -48,7 +48,7 @@ class JointRun:
         self.iteration = 0
         self.generator = torch.Generator().manual_seed(config.fit.seed)
         self.poses = CombinedPoses(scenes, device)
-        self.watched = [thin(placed.scene.test, 8) for placed in scenes]
+        self.watched = [subsample_views(placed.scene.test, 8) for placed in scenes]
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
         self.owners = chosen_scenes(config.poses, len(scenes))
         self.owner_order = Shuffle(len(self.owners), self.generator)

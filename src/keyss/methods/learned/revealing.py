@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.methods.base import Frame
 from keyss.methods.learned.payload import HiddenSecret, pack_secret
@@ -56,7 +56,7 @@ def reveal_gaussians(
     decoded = decode(stego, secret, secret.embedding)
     if (drawn := is_drawn(decoded)).any():
         decoded = decoded[drawn]
-    decoded = filled(decoded, secret.count)
+    decoded = compensate_pruning(decoded, secret.count)
     if frame == "cover":
         return decoded
     return secret.frame.inverse().apply_gaussians(decoded.to("cpu"))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.targets import PlacedScene
@@ -122,5 +122,5 @@ def _most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
     """The `count` Gaussians that add most to what the training views show, in their order."""
     if count >= len(plain):
         return plain
-    cameras = [view.camera for view in thin(scene.train, SELECTION_VIEWS)]
+    cameras = [view.camera for view in subsample_views(scene.train, SELECTION_VIEWS)]
     return plain[contributions(plain, cameras).topk(count).indices.sort().values]
