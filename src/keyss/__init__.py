@@ -64,9 +64,12 @@ _HOMES = {
     "keyss.runs.describe": ("info",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+_PACKAGES = ("audit", "report")  # that can be called
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"keyss.{name}")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'keyss' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOME_OF[name]), name)

@@ -141,11 +141,11 @@ def hide(
     """Hide every secret in the cover, and measure the result on the test photos.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
-    come first unless they are given. `method`: its name for its default options, or options of its own
-    (`LearnedOptions`, `CarryOptions`). What a key opens lies encrypted in the low bits of `stego.ply`, or with
-    `LearnedOptions(sidecar=True)` in a file `decoder.sealed`. `out` (a folder) gets these, `config.json`,
-    `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which `resume` goes
-    on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+    come first unless they are given. `method`: a name for default options, or a method's own options
+    (`LearnedOptions`, `CarryOptions`). What a key opens lies encrypted in the low bits of `stego.ply`; with
+    `LearnedOptions(sidecar=True)` it is in a file `decoder.sealed`. `out` (a folder) gets these,
+    `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which
+    `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     chosen, options = _method(method)
     if not 1 <= len(secrets) <= chosen.capabilities.most_secrets:
@@ -159,30 +159,23 @@ def hide(
     folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
 
     sources = [cover, *(secret.scene for secret in secrets)]
-    photos = [isinstance(source, Scene) or not is_model(source) for source in sources]
-    given = [
-        source if model is None and not own else model
-        for source, model, own in zip(
-            sources, [cover_model, *(secret.model for secret in secrets)], photos, strict=True
-        )
-    ]
-    known = [None if model is None else as_model(model) for model in given]  # type: ignore[arg-type]
-    inputs = [SceneInput(model, own) for model, own in zip(known, photos, strict=True)]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
     scenes = [as_scene(source, width, background) for source in sources]
-    trains = chosen.capabilities.trains or None in known
+    trains = chosen.capabilities.trains or any(each.model is None for each in inputs)
     context = Context(target, folder.checkpoints() if folder and trains else None, resume, reporter)
-    models = plain_models(scenes, known, options.fit, context)
-    own, *others = (Source(scene, model) for scene, model in zip(scenes, models, strict=True))
-    stego = chosen.hide(own, [KeyedSource(*each) for each in zip(others, keys, strict=True)], options, context)
+    plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
+    own, *others = map(Source, scenes, plain)
+    stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
 
-    metrics = _measured(chosen, stego, scenes, models, options, target)
+    metrics = _measured(chosen, stego, scenes, plain, options, target)
     if folder is not None:
         settings = RunConfig(
             method=chosen.name,
             cover=path_of(cover),
             secrets=tuple(path_of(secret.scene) for secret in secrets),
-            models_given=tuple(model is not None for model in given),
+            models_given=tuple(each.model is not None for each in inputs),
             width=width,
             background=colour_of(background),
             payloads=tuple(each.fingerprint() for each in stego.opened),
@@ -196,7 +189,7 @@ def hide(
         if stego.sidecar is not None:
             writers[SIDECAR] = bytes_writer(stego.sidecar)
         writers |= {
-            name: ply_writer(model) for name, model in zip(plain_names(len(secrets)), models, strict=True)
+            name: ply_writer(model) for name, model in zip(plain_names(len(secrets)), plain, strict=True)
         }
         folder.fill(writers)
     return HideResult(stego.gaussians, stego.sidecar, metrics)
@@ -304,6 +297,14 @@ def _method(chosen: str | MethodOptions) -> tuple[Method, MethodOptions]:
         return registry.of_options(chosen), chosen
     method = registry.get(chosen)
     return method, next(iter(method.presets.values()))
+
+
+def _input(source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None) -> SceneInput:
+    """A scene and the plain model that is given with it, or that it is."""
+    photos = isinstance(source, Scene) or not is_model(source)
+    if not photos and model is None:
+        model = source  # type: ignore[assignment]
+    return SceneInput(None if model is None else as_model(model), photos)
 
 
 def _check_keys(keys: Sequence[str]) -> None:

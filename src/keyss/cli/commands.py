@@ -174,8 +174,9 @@ def hide(
     from keyss.files.models import read_model
     from keyss.methods.learned.config import PRESETS
     from keyss.methods.learned.mask import parse_mask
+    from keyss.methods.learned.sizing import room_for_models
     from keyss.progress import reporter
-    from keyss.rendering.orbit import is_model, room_for_models
+    from keyss.rendering.orbit import is_model
 
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE, once for each secret")

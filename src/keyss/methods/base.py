@@ -6,7 +6,8 @@ folder tests for its name: what it can do it declares, and what it finds it give
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from keyss.channels.base import Content
+from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -106,19 +108,17 @@ class Stego:
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of its own, for metrics.json
 
 
-def option(
-    default: Any,
-    help: str,
-    *,
-    metavar: str | None = None,
-    alias: str | None = None,
-    parse: Callable[[str], Any] | None = None,
-) -> Any:
-    """A field of options that the command line has too, under its own name and `alias`.
+@dataclass(frozen=True)
+class CommandLineOption:
+    """Annotates a field of options that the command line has too, under the same name.
 
-    `metavar` stands for the value in the help; `parse` makes it of text, by default its type does.
+    A truth value becomes a flag, everything else takes one value.
     """
-    return field(default=default, metadata={"help": help, "metavar": metavar, "alias": alias, "parse": parse})
+
+    help: str
+    metavar: str | None = None  # stands for the value in the help
+    alias: str | None = None  # another name
+    parse: Callable[[str], Any] | None = None  # makes the value of text, where the type does not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,11 +139,25 @@ class MethodOptions:
 class Method(Protocol):
     """One way to hide secrets."""
 
-    name: str  # in files and on the command line, 1 to 15 ASCII characters
-    summary: str  # one line
-    capabilities: Capabilities
-    options: type[MethodOptions]
-    presets: Mapping[str, Any]  # options by name; the first is the default
+    @property
+    def name(self) -> str:
+        """In files and on the command line, 1 to 15 ASCII characters."""
+
+    @property
+    def summary(self) -> str:
+        """One line that goes on from the name."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What it can do."""
+
+    @property
+    def options(self) -> type[MethodOptions]:
+        """The class of its options."""
+
+    @property
+    def presets(self) -> Mapping[str, MethodOptions]:
+        """Options by name; the first are the default."""
 
     def prepare(self, inputs: Sequence[SceneInput], options: Any) -> Any:
         """The options with all that depends on the scenes: `inputs` of the cover, then of the secrets.
@@ -152,7 +166,7 @@ class Method(Protocol):
         """
 
     def hide(self, cover: Source, secrets: Sequence[KeyedSource], options: Any, context: Context) -> Stego:
-        """Hide the secrets with prepared options. Raises KeyssError and its children, Interrupted on Ctrl-C."""
+        """Hide the secrets; `options` are prepared. Raises KeyssError and its children, Interrupted."""
 
     def unpack(self, content: Content) -> Opened:
         """The secret that lies in what a channel gave. Raises InputError for damage."""
@@ -162,3 +176,12 @@ class Method(Protocol):
 
         Models to be rendered in the cover's frame, by the name of the attack; for `keyss audit`.
         """
+
+
+@contextmanager
+def advising(kind: type[KeyssError], advice: str) -> Iterator[None]:
+    """Adds to the message of an error from below, such as a channel's, what a user of the method can do."""
+    try:
+        yield
+    except kind as error:
+        raise type(error)(f"{error}; {advice}") from error

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from keyss.channels.base import Payload
+from keyss.channels.base import Content, Payload
+from keyss.channels.low_bits import LowBitsReader
 from keyss.channels.sidecar import open_slots, read_header
-from keyss.core.errors import UsageError, WrongKeyError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
 from keyss.methods.decoy import Decoy
-from keyss.methods.interim_extraction import extract, key_for
 from keyss.methods.learned.method import LearnedMethod
+
+_SIDECAR_METHOD = "learned"  # sidecars do not name the method; only one writes them
 
 METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod())}
 
@@ -35,18 +37,31 @@ def of_options(options: MethodOptions) -> Method:
 def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, decoy: bool = False) -> Opened:
     """What `key` opens in the low bits of `stego`, or in the bytes of a `sidecar`.
 
-    With `decoy`, a key that opens nothing gets a `Decoy`. A right key then takes as long as a wrong one: both
-    derive what a decoy needs, and only one salt is tried. Otherwise raises WrongKeyError. Raises InputError
-    for what is damaged.
+    With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
+    wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
     """
-    seed = key_for(stego, key) if decoy else None
-    try:
-        if sidecar is not None:
-            content = Payload("learned", open_slots(sidecar, DerivedKey(key, read_header(sidecar)[0])))
-            return get(content.method).unpack(content)
-        found = extract(stego, key, salts=1) if decoy else extract(stego, key)
-        return get(found.method).unpack(found)
-    except WrongKeyError:
-        if seed is None:
-            raise
-        return Decoy.of(stego, seed)
+    if sidecar is not None:
+        derived = DerivedKey(key, read_header(sidecar)[0])
+        try:
+            return _unpacked(Payload(_SIDECAR_METHOD, open_slots(sidecar, derived)))
+        except WrongKeyError:
+            if not decoy:
+                raise
+            return Decoy.of(stego, derived)
+    reader = LowBitsReader.of(stego)
+    for derived in reader.keys(key, 1) if decoy else reader.keys(key):
+        try:
+            return _unpacked(reader.extract(derived))
+        except WrongKeyError:
+            if decoy:
+                return Decoy.of(stego, derived)
+    raise WrongKeyError("this key opens nothing here")
+
+
+def _unpacked(content: Content) -> Opened:
+    if content.method not in METHODS:
+        raise InputError(
+            f"what the key opens was hidden by the method {content.method!r}; this program has "
+            f"{', '.join(METHODS)}"
+        )
+    return METHODS[content.method].unpack(content)

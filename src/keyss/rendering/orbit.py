@@ -1,4 +1,4 @@
-"""Scenes made of models: what a 3DGS model shows from all around takes the place of photos."""
+"""Cameras around a model, and the scene that pictures rendered from them make."""
 
 from __future__ import annotations
 
@@ -31,11 +31,7 @@ def is_model(source: str | Path | Gaussians) -> bool:
 def scene_of_model(
     model: Gaussians, name: str, *, size: int | None = None, background: Tensor | None = None
 ) -> Scene:
-    """Pictures of `model`, size x size, from cameras around it; every eighth is kept for testing.
-
-    The cameras stand on a spiral over a sphere and look at the middle of what can be seen; up is -y, as
-    captures made with COLMAP have it and as viewers assume.
-    """
+    """Pictures of `model`, size x size, from the cameras of `orbit`; every eighth is kept for testing."""
     background = torch.zeros(3) if background is None else background
     views = []
     for camera in orbit(model, size or IMAGE_SIZE):
@@ -52,17 +48,21 @@ def scene_of_model(
     )
 
 
-def orbit(model: Gaussians, size: int) -> list[Camera]:
-    """VIEWS square cameras around a model."""
+def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
+    """Cameras on a spiral over a sphere around a model, with pictures of size x size pixels.
+
+    All look at the middle of what can be seen of the model. Up is -y, as captures made with COLMAP have it
+    and as viewers assume.
+    """
     middle, radius = middle_and_radius(model)
     focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     reach = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     limit = math.sin(math.radians(HIGHEST))
     cameras = []
-    for index in range(VIEWS):
+    for index in range(views):
         # Equal steps of the sine of the elevation, golden steps of the azimuth: evenly over the sphere.
-        height = limit * (1 - 2 * (index + 0.5) / VIEWS)
+        height = limit * (1 - 2 * (index + 0.5) / views)
         azimuth = index * math.pi * (3 - math.sqrt(5))
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from torch import Tensor
 
@@ -65,7 +65,9 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
     if name not in registry.METHODS:
         known = ", ".join(registry.METHODS)
         raise InputError(f"{path}: method {name!r} is not known; this program has {known}")
-    return read_record(path, RunConfig[registry.METHODS[name].options])  # type: ignore[name-defined]
+    generic: Any = RunConfig
+    config: RunConfig[MethodOptions] = read_record(path, generic[registry.METHODS[name].options])
+    return config
 
 
 def path_of(source: PathLike | Scene | Gaussians) -> str | None:

@@ -77,9 +77,7 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     return HidingRun(folder, config, metrics, stego, data, secrets, own, sources)
 
 
-def open_file(
-    stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False
-) -> Opened:
+def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
     """What the key opens; see `registry.open_model`. Errors name the sidecar's file."""
     if sidecar is None or isinstance(sidecar, bytes):
         return registry.open_model(stego, key, sidecar=sidecar, decoy=decoy)

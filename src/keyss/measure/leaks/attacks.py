@@ -26,7 +26,7 @@ from keyss.measure.leaks.opacities import (
 from keyss.measure.white_box import search_embeddings
 from keyss.methods.learned.payload import HiddenSecret
 from keyss.methods.learned.revealing import decode
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 
 THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing

@@ -14,7 +14,7 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.fitting.sampling import Shuffle
 from keyss.measure.robustness.changes import Change
 from keyss.rendering import render
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 
 VIEWS = 64  # in which purification looks for what is used
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from keyss.channels.base import Channel, PreparedCover, RecordPlan, RecordRequest, Records
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.methods.carry.quantise import Codec
 from keyss.methods.carry.subsampling import most_visible_rows
 from keyss.methods.carry.table import Table
@@ -33,7 +33,7 @@ class CarriedSecret:
 
     def compensated(self) -> Gaussians:
         """The Gaussians that are left, made to cover what all did."""
-        return filled(self.gaussians, self.count)
+        return compensate_pruning(self.gaussians, self.count)
 
     def fingerprint(self) -> str:
         """16 hexadecimal digits by which a whole secret is recognised; they say nothing without it."""

@@ -6,34 +6,44 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from keyss.channels.base import Content, Records
+from keyss.channels.base import Content, PreparedCover, RecordRequest, Records
+from keyss.channels.low_bits import LOW_BITS
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
-from keyss.methods.base import Capabilities, Context, Frame, KeyedSource, Opened, SceneInput, Source, Stego
+from keyss.methods.base import (
+    Capabilities,
+    Context,
+    Frame,
+    KeyedSource,
+    SceneInput,
+    Source,
+    Stego,
+    advising,
+)
 from keyss.methods.carry.carrying import (
-    Carried,
-    Carriers,
-    derive_all,
-    embed_derived,
-    extract_derived,
-    usable_carriers,
+    NAME,
+    CarriedSecret,
+    check_degrees,
+    decode,
+    encode_all,
+    record_request,
+    subsampled_counts,
 )
 from keyss.methods.carry.dither import cost, dither
 from keyss.methods.carry.options import PRESETS, CarryOptions
-from keyss.methods.carry.plan import PREFIX_BYTES, Size, check_degrees, plan, room, thinned
-from keyss.methods.carry.quantise import Codec
-from keyss.methods.carry.thinning import most_visible
+from keyss.methods.carry.subsampling import most_visible
 
-NAME = "carry"
+_PRUNE = "--prune-to-fit leaves out the least visible"
+_DITHER = "--dither gives it new low bits, at a price, and --method learned --sidecar needs none"
 
 
 @dataclass(frozen=True)
 class OpenedCarried:
     """A carried secret as its key opens it; see `keyss.methods.base.Opened`."""
 
-    carried: Carried
+    carried: CarriedSecret
     frame: None = None
     decode: None = None
 
@@ -41,7 +51,7 @@ class OpenedCarried:
         """Gaussians that were lost with their carriers, the others make up for."""
         if frame == "cover":
             raise UsageError("a carried secret never lay in the cover's coordinates: leave out --frame cover")
-        return filled(self.carried.gaussians, self.carried.count)
+        return self.carried.compensated()
 
     def fingerprint(self) -> str:
         return self.carried.fingerprint()
@@ -64,15 +74,17 @@ class CarryMethod:
     presets: Mapping[str, CarryOptions] = PRESETS
 
     def prepare(self, inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-        """Unchanged; refuses models that do not fit and covers whose low bits are not random."""
-        cover, *secrets = (each.model for each in inputs)
-        degree = options.fit.sh_degree  # of models that are to be fitted
-        sizes = [Size(0, degree) if each is None else _size(each) for each in secrets]
-        check_degrees(sizes, degree if cover is None else cover.sh_degree)
+        """Unchanged; refuses given models that do not fit, and a cover whose low bits are not random."""
+        cover, *others = (each.model for each in inputs)
+        secrets = [model for model in others if model is not None]
+        if cover is not None and secrets:
+            check_degrees(LOW_BITS, cover, secrets)
         if cover is not None and not options.dither:
-            count = int(usable_carriers(cover).sum())
-            if not options.prune_to_fit:  # secrets that are to be fitted count as empty
-                plan(sizes, count, len(cover), cover.sh_degree)
+            with advising(InputError, _DITHER):
+                prepared = LOW_BITS.prepare(cover)
+            if not options.prune_to_fit and len(secrets) == len(others):
+                with advising(UsageError, _PRUNE):
+                    prepared.plan_records([_request(model) for model in secrets])
         return options
 
     def hide(
@@ -80,47 +92,48 @@ class CarryMethod:
     ) -> Stego:
         """Carry the secrets, and open each again as its reader will.
 
-        Raises UsageError for secrets that are too large, InputError for a cover whose low bits are not random.
+        Raises UsageError for too large secrets, InputError for a cover whose low bits are not random.
         """
         start = time.monotonic()
-        models = [each.source.model for each in secrets]
-        sizes = [_size(model) for model in models]
-        check_degrees(sizes, cover.model.sh_degree)
+        models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
+        check_degrees(LOW_BITS, cover.model, models)
         carrier = dither(cover.model, os.urandom(32)) if options.dither else cover.model
-        usable = usable_carriers(carrier)
-        count = int(usable.sum())
+        with advising(InputError, _DITHER):
+            prepared = LOW_BITS.prepare(carrier)
+        details = _details(prepared, models)
         if options.prune_to_fit:
-            kept = thinned(sizes, count, carrier.sh_degree)
-            models = [most_visible(model, most) for model, most in zip(models, kept, strict=True)]
-        keys = derive_all(carrier, [each.key for each in secrets])
-        stego = embed_derived(carrier, list(zip(keys, models, strict=True)), usable=usable)
-        written = Carriers.of(stego)
-        opened = [extract_derived(written, own[0]) for own in keys]
+            counts = subsampled_counts(prepared, models)
+            models = [most_visible(model, count) for model, count in zip(models, counts, strict=True)]
+        with advising(UsageError, _PRUNE):
+            records = encode_all(prepared, models)
+        stego = prepared.embed(list(zip(keys, records, strict=True)))
+        opened = [self.unpack(LOW_BITS.extract(stego, key)) for key in keys]
         seconds = time.monotonic() - start
-        if [len(carried.gaussians) for carried in opened] != [len(model) for model in models]:
+        if [len(each.carried.gaussians) for each in opened] != [len(model) for model in models]:
             raise RuntimeError("what was written does not open again as it should")
-        details = {
-            "carriers": count,
-            "room": room(sizes, count, carrier.sh_degree),
-            "gaussians_of_secrets": [size.count for size in sizes],
-            "bits_of_a_gaussian": [carried.bits for carried in opened],
-        }
+        details["bits_per_gaussian"] = [each.carried.bits for each in opened]
         if options.dither:
             details["dither_psnr"] = round(cost(cover.model, carrier), 1)
-        return Stego(stego, None, tuple(OpenedCarried(each) for each in opened), seconds, details=details)
+        return Stego(stego, None, tuple(opened), seconds, details=details)
 
-    def unpack(self, content: Content) -> Opened:
+    def unpack(self, content: Content) -> OpenedCarried:
         """The Gaussians that are left. Raises InputError for damage."""
         if not isinstance(content, Records):
             raise InputError("what the key opens is damaged: expected records, got one payload")
-        codec = Codec.unpack(content.header[PREFIX_BYTES:])
-        count = int.from_bytes(content.header[2:PREFIX_BYTES], "little")
-        return OpenedCarried(Carried(codec.decode(content.records), count, codec.table.total))
+        return OpenedCarried(decode(content))
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """None: without a key, low bits that carry something are as random as any."""
         return {}
 
 
-def _size(model: Gaussians) -> Size:
-    return Size(len(model), model.sh_degree)
+def _details(prepared: PreparedCover, models: Sequence[Gaussians]) -> dict[str, Any]:
+    return {
+        "carriers": prepared.carriers,
+        "capacity": prepared.record_capacity([_request(model) for model in models]),
+        "gaussians_before_pruning": [len(model) for model in models],
+    }
+
+
+def _request(model: Gaussians) -> RecordRequest:
+    return record_request(len(model), model.sh_degree)

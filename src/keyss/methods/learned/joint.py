@@ -16,13 +16,13 @@ from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
-from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.scramble import LEAST_OPACITY
 from keyss.methods.learned.start import HIDDEN_SLOPE, logit_limits, make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
+from keyss.methods.learned.visibility import possibly_seen
 from keyss.rendering import render_with_meta
-from keyss.rendering.visibility import possibly_seen
 
 LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
 

@@ -13,13 +13,11 @@ from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Capabilities, Context, KeyedSource, Opened, SceneInput, Source, Stego
 from keyss.methods.learned.options import PRESETS, LearnedOptions
 
-NAME = "learned"
-
 
 class LearnedMethod:
     """See `keyss.methods.base.Method`."""
 
-    name = NAME
+    name = "learned"
     summary = "train one model that shows both"
     capabilities = Capabilities(
         trains=True,

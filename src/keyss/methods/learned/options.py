@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import MethodOptions, option
+from keyss.methods.base import CommandLineOption, MethodOptions
 from keyss.methods.learned.mask import Mask, parse_mask
 
 Scenes = Literal["both", "cover", "secret"]  # "both": all, however many secrets there are
@@ -22,9 +22,10 @@ class LearnedOptions(MethodOptions):
     iterations: int | None = None
     max_gaussians: int | None = None
 
-    start: Literal["warm", "points"] = option(
-        "warm", "Start from plain models, or from sparse points (the paper's)."
-    )
+    start: Annotated[
+        Literal["warm", "points"],
+        CommandLineOption("Start from plain models, or from sparse points (the paper's)."),
+    ] = "warm"
     points: Scenes = "both"  # start from points: whose sparse points (combined SfM initialisation)
     poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
     densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
@@ -32,12 +33,14 @@ class LearnedOptions(MethodOptions):
     # drawn from a pose of its own and compared with its photo. The paper has the first kind only.
     common_poses: float = 0.1
 
-    mask: Mask = option(  # theta
-        ("op",),
-        "Attributes that the decoder changes, some of these; more than op take a network.",
-        metavar="op,ro,sc,xyz,sh",
-        parse=parse_mask,
-    )
+    mask: Annotated[  # theta
+        Mask,
+        CommandLineOption(
+            "Attributes that the decoder changes, some of these; more than op take a network.",
+            metavar="op,ro,sc,xyz,sh",
+            parse=parse_mask,
+        ),
+    ] = ("op",)
     decoder: Literal["curve", "network"] = "curve"  # the paper has a network
     conditioning: Literal["gate", "bias"] = "gate"  # how the key enters the decoder; bias: the paper's
     hidden: tuple[int, int] = (64, 64)  # widths of a network's common branch
@@ -47,15 +50,18 @@ class LearnedOptions(MethodOptions):
     residuals: Literal["signed", "one-sided"] = "signed"  # one-sided: ReLU on all but the opacity's
     decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
     weight_decay: float = 1e-4
-    key_encoder: Literal["argon2", "clip"] = option(
-        "argon2", "What conditions the decoder; encryption is always under Argon2id's derived key."
-    )
-    clip_model: str | None = option(
-        None, "CLIP for --key-encoder clip; by default ViT-L/14 in the cache.", metavar="FOLDER"
-    )
-    sidecar: bool = option(
-        False, "Write what a key opens to decoder.sealed, not into the low bits of stego.ply."
-    )
+    key_encoder: Annotated[
+        Literal["argon2", "clip"],
+        CommandLineOption("What conditions the decoder; the encryption is always under Argon2id's key."),
+    ] = "argon2"
+    clip_model: Annotated[
+        str | None,
+        CommandLineOption("CLIP for --key-encoder clip; without it ViT-L/14 in the cache.", metavar="FOLDER"),
+    ] = None
+    sidecar: Annotated[
+        bool,
+        CommandLineOption("Write what a key opens to decoder.sealed, not into the low bits of stego.ply."),
+    ] = False
 
     cover_weight: float = 0.5  # beta_cover
     secret_weight: float = 0.5  # beta_secret, of each secret

@@ -10,17 +10,19 @@ from dataclasses import asdict, replace
 import torch
 from torch import Tensor
 
-from keyss.channels.low_bits import byte_plan
-from keyss.channels.low_bits.container import embed
+from keyss.channels.base import Payload
+from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.low_bits.spread import check_payload_fits
 from keyss.channels.sidecar import seal_sidecar
 from keyss.core.alignment import align
+from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.base import Context, KeyedSource, Source, Stego
+from keyss.methods.base import Context, KeyedSource, Source, Stego, advising
 from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.joint import JointRun, decoder_shape
 from keyss.methods.learned.options import LearnedOptions
@@ -34,6 +36,9 @@ from keyss.methods.learned.scramble import (
     with_lengths_of_the_cover,
 )
 from keyss.methods.learned.targets import PlacedScene
+
+NAME = "learned"
+SIDECAR_ADVICE = "--sidecar writes a file beside it instead"
 
 
 def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context) -> Stego:
@@ -81,7 +86,9 @@ def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions,
     if run.warm:
         stego = stego[run.drawn().cpu()]
     scrambles: list[Scramble | None] = [None] * len(keys)
-    if run.warm and not options.sidecar:  # a sidecar is for files that will be rounded, which no scramble survives
+    if (
+        run.warm and not options.sidecar
+    ):  # a sidecar is for files that will be rounded, which no scramble survives
         for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
             if options.decoder == "curve":  # a network would see the difference
                 stego = with_lengths_of_the_cover(stego, decoder.band)
@@ -99,13 +106,15 @@ def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions,
     ]
     counts = [int(is_drawn(decode(stego, secret, secret.embedding)).sum()) for secret in hidden]
     packed = [pack_secret(replace(secret, count=count)) for secret, count in zip(hidden, counts, strict=True)]
-    sealed = None
+    sidecar, entropy = None, _discarded(run, derived)
     if options.sidecar:
-        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(run, derived))
+        sidecar = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=entropy)
     else:
-        stego = embed(stego, list(zip(keys, packed, strict=True)))
+        payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
+        with advising(KeyssError, SIDECAR_ADVICE):
+            stego = LOW_BITS.prepare(stego).embed(payloads, entropy=entropy)
     opened = tuple(OpenedSecret(unpack_secret(each)) for each in packed)
-    return Stego(stego, sealed, opened, seconds, options.fit.iterations)
+    return Stego(stego, sidecar, opened, seconds, options.fit.iterations)
 
 
 def training_options(options: LearnedOptions) -> LearnedOptions:
@@ -133,7 +142,8 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
     gaussians, known = options.fit.max_gaussians, [model for model in models if model is not None]
     if options.start == "warm" and len(known) == len(models):
         gaussians = min(gaussians, sum(len(model) for model in known))
-    byte_plan.check_room(_largest_payload(options), gaussians, len(models) - 1, options.fit.sh_degree)
+    with advising(UsageError, SIDECAR_ADVICE):
+        check_payload_fits(_largest_payload(options), gaussians, len(models) - 1, options.fit.sh_degree)
 
 
 def _largest_payload(options: LearnedOptions) -> int:

@@ -14,7 +14,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.targets import PlacedScene
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 
 # Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
 # higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a

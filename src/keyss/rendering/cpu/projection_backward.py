@@ -98,9 +98,9 @@ def project_backward(
 
     means2d_gradient and means2d_absgrad are of this camera only. camera_gradient has one row per piece of
     work: the sums over its Gaussians for rotation (9), translation (3) and position (3). With need_colors
-    or need_camera false, colors_gradient or camera_gradient is not touched. `channels` is 0 after `blend`,
-    and the number of channels after `blend_features`: those of the colours, and one for the depth where
-    there is one more.
+    or need_camera false, colors_gradient or camera_gradient is not touched. `channels` is 0 where colours
+    were drawn from the footprints, else the number of channels: those of the colours, and one for the depth
+    where there is one more.
     """
     count = means.shape[0]
     with_depth = channels > colors.shape[2]
