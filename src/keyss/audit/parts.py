@@ -22,8 +22,7 @@ from keyss.measure.sealwatch_detectors import sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.two_sample import two_sample_against_null, two_sample_auc
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.runs.files import STEGO
+from keyss.runs.files import SIDECAR, STEGO
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64
@@ -142,7 +141,7 @@ def leaks(subject: Subject, seed: int, steps: Steps) -> Found:
             subject.cover,
             secret,
             frame,
-            opened=opened if isinstance(opened, HiddenSecret) else None,
+            opened=getattr(opened, "secret", None),
             seed=seed,
         )
         for number, row in enumerate(rows, start=1):
@@ -169,7 +168,7 @@ def speed(subject: Subject, seed: int, steps: Steps) -> Found:
         subject.reopeners,
         subject.scenes,
         [plain if plain is not None else model for plain, model in zip(plains, subject.models, strict=True)],
-        sidecar=subject.run.sidecar,
+        sidecar=None if subject.run.sidecar is None else subject.run.folder / SIDECAR,
         device=subject.device,
         progress=steps,
     )
@@ -203,8 +202,5 @@ PARTS: dict[str, Part] = {
 
 def _score(subject: Subject, distance: float) -> float | None:
     """The paper's composite score (eq. 10) of the cover and the mean secret, where there are photos."""
-    cover, secrets = subject.run.metrics.get("cover"), subject.run.metrics.get("secrets") or []
-    found = [each["psnr"] for each in secrets if "psnr" in each]
-    if not cover or not found:
-        return None
-    return composite_score(cover["psnr"], fmean(found), distance)
+    found = [each.psnr for each in subject.run.metrics.secrets]
+    return composite_score(subject.run.metrics.cover.psnr, fmean(found), distance)

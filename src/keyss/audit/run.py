@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.metadata import version as version_of
 from typing import Any
 
@@ -17,8 +18,9 @@ from keyss.files.output import OutputFolder
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.rendering import Backend, resolve_device
 from keyss.report import write_report
+from keyss.runs.config import PathLike
 from keyss.runs.files import bytes_writer, json_writer
-from keyss.runs.opening import HidingRun, PathLike, fingerprint, open_run
+from keyss.runs.opening import HidingRun, open_run
 
 AUDIT, FOLDER = "audit.json", "audit"
 FORMAT = 1
@@ -78,7 +80,7 @@ def audit(
         "seconds": round(time.monotonic() - started, 1),
         "run": _facts(opened),
         "null": {"models": null, "seeds": seeds},
-        "wrong_key": opened.metrics.get("wrong_key"),
+        "wrong_key": None if opened.metrics.wrong_key is None else asdict(opened.metrics.wrong_key),
         **results,
     }
     writers = {f"{PICTURES}/{name}": bytes_writer(data) for name, data in pictures.items()}
@@ -90,7 +92,7 @@ def audit(
 def _inputs(subject: Subject, seeds: Sequence[int], seed: int) -> dict[str, Any]:
     """What finished parts depend on."""
     return {
-        "payloads": [fingerprint(secret) for secret in subject.run.opened],
+        "payloads": [secret.fingerprint() for secret in subject.run.opened],
         "stego": subject.stego.digest(),
         "original": subject.original.digest(),
         "scenes": [scene.digest() for scene in subject.scenes],
@@ -103,11 +105,11 @@ def _facts(run: HidingRun) -> dict[str, Any]:
     cover, *secrets = run.sources
     return {
         "path": str(run.folder),
-        "method": run.method,
+        "method": run.config.method,
         "cover": cover,
         "secrets": secrets,
-        "width": run.width,
+        "width": run.config.width,
         "gaussians": len(run.stego),
-        "config": run.settings.get("config"),
+        "config": asdict(run.config.options),
         "versions": {"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     }

@@ -5,14 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from keyss.core.alignment import align
-from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.errors import OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -20,10 +18,9 @@ from keyss.files.models import read_model, write_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
+from keyss.measure.hiding import frame_of
 from keyss.measure.robustness import Reopener
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import read_sidecar
-from keyss.runs.opening import HidingRun, Opened, revealed
+from keyss.runs.opening import HidingRun
 
 NULLS = "private/null"  # plain models of the cover from other seeds, in a run's folder
 
@@ -54,8 +51,7 @@ class Subject:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model."""
-        sidecar = None if self.run.sidecar is None else read_sidecar(self.run.sidecar)
-        return [Reopener(key, sidecar) for key in self.run.keys]
+        return [Reopener(key, self.run.sidecar) for key in self.run.keys]
 
     @property
     def secrets(self) -> tuple[Scene, ...]:
@@ -80,8 +76,8 @@ def subject_of(
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
     stego, folder = run.stego.to(device), run.folder / NULLS
-    config = _fit_config(run)
-    if original is not None or run.settings["models_given"][0]:  # whose size is not that of this run
+    config = run.config.options.fit
+    if original is not None or run.config.models_given[0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
     nulls = [
         _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
@@ -91,9 +87,9 @@ def subject_of(
         run=run,
         scenes=tuple(scenes),
         stego=stego,
-        revealed=tuple(revealed(stego, secret).to(device) for secret in run.opened),
+        revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
         frames=tuple(
-            _frame(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
+            frame_of(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
         ),
         original=plain.to(device),
         bounds=tuple(None if bound is None else bound.to(device) for bound in bounds),
@@ -104,27 +100,8 @@ def subject_of(
 
 def null_seeds(run: HidingRun, nulls: int, seed: int) -> list[int]:
     """From which the plain models are trained: those after the run's own."""
-    first = _fit_config(run).seed + seed
+    first = run.config.options.fit.seed + seed
     return [first + index for index in range(1, nulls + 1)]
-
-
-def _frame(secret: Opened, scene: Scene, cover: Scene) -> Similarity:
-    """Where the secret lies; one that is carried lies nowhere, and is looked for where it might have been."""
-    if isinstance(secret, HiddenSecret):
-        return secret.frame
-    return align([view.camera for view in scene.train], [view.camera for view in cover.train])
-
-
-def _fit_config(run: HidingRun) -> FitConfig:
-    """How the run trained its plain models. Raises InputError."""
-    known = {field.name for field in fields(FitConfig)}
-    try:
-        values: dict[str, Any] = run.settings["config"]["fit"]
-        return FitConfig(**{name: value for name, value in values.items() if name in known})
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{run.folder}: its configuration tells nothing of plain models ({error})"
-        ) from error
 
 
 def _plain_model(

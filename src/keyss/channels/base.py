@@ -63,7 +63,9 @@ Content = Payload | Records
 class PreparedCover(Protocol):
     """A cover whose room in a channel is known: what fits is known before anything else runs."""
 
-    cover: Gaussians
+    @property
+    def cover(self) -> Gaussians:
+        """The cover."""
 
     @property
     def carriers(self) -> int:

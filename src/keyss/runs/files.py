@@ -14,6 +14,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
 from keyss.files.models import write_model
+from keyss.runs.records import write_record
 
 STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
     "stego.ply",
@@ -43,6 +44,11 @@ def bytes_writer(data: bytes) -> Callable[[Path], None]:
 def png_writer(image: Tensor) -> Callable[[Path], None]:
     """For `OutputFolder.fill`: writes an image [H, W, 3] uint8."""
     return bytes_writer(png_bytes(image))
+
+
+def record_writer(record: Any) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes a record."""
+    return lambda path: write_record(path, record)
 
 
 def json_writer(data: dict[str, Any]) -> Callable[[Path], None]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from keyss.methods.learned.config import PRESETS, HideConfig
 
 from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
@@ -17,7 +18,6 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.keys import random_embeddings
-from keyss.methods.learned.config import PRESETS, HideConfig
 from keyss.methods.learned.joint import JointRun, combine_densification
 from keyss.methods.learned.pipeline import Hidden, hide_scenes
 from keyss.methods.learned.revealing import decode, open_secret, reveal_gaussians

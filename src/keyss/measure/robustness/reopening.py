@@ -7,12 +7,8 @@ from dataclasses import dataclass, field
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.carry.carrying import Carried
-from keyss.methods.learned.opening import open_model
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import open_secret, reveal_gaussians
+from keyss.methods.registry import open_model
 
 
 @dataclass(frozen=True)
@@ -37,15 +33,9 @@ class Reopener:
     def __call__(self, stego: Gaussians) -> Opened:
         """Raises WrongKeyError and InputError as `open_model` and `open_secret` do."""
         stego = stego.to("cpu")
-        secret: Carried | HiddenSecret
-        if self.sidecar is None:
-            secret = open_model(stego, self.key)
-        else:
-            secret = open_secret(stego, self.key, self.sidecar)
-        if isinstance(secret, Carried):
-            return Opened(compensate_pruning(secret.gaussians, secret.count))
+        secret = open_model(stego, self.key, sidecar=self.sidecar)
         try:
-            revealed = reveal_gaussians(stego, secret)
+            revealed = secret.reveal(stego)
         except InputError:  # positions changed, so that it seems to be another model
-            revealed = reveal_gaussians(stego, secret, force=True)
-        return Opened(revealed, secret.frame)
+            revealed = secret.reveal(stego, force=True)
+        return Opened(revealed, secret.frame or Similarity.identity())

@@ -1,1 +1,1 @@
-"""A secret as quantised Gaussians in the low bits of the cover: no training, nearly no loss."""
+"""The carry method: a secret as quantised Gaussians in the low bits of the cover, nearly without loss."""

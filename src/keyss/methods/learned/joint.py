@@ -16,8 +16,8 @@ from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
-from keyss.methods.learned.config import HideConfig, chosen_scenes
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.scramble import LEAST_OPACITY
 from keyss.methods.learned.start import HIDDEN_SLOPE, logit_limits, make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
@@ -37,7 +37,7 @@ class JointRun:
         self,
         scenes: Sequence[PlacedScene],  # the cover, then the secrets
         embeddings: Sequence[Tensor],  # [64] of each secret's key
-        config: HideConfig,
+        config: LearnedOptions,
         device: torch.device,
     ) -> None:
         self.config = config
@@ -228,7 +228,7 @@ class JointRun:
         self.iteration = int(meta["iteration"])
 
 
-def decoder_shape(config: HideConfig) -> DecoderShape:
+def decoder_shape(config: LearnedOptions) -> DecoderShape:
     """The sizes of the decoder that `config` asks for."""
     return DecoderShape(
         mask=config.mask,

@@ -1,27 +1,33 @@
-"""How large a hiding of given models is, and how long it trains."""
+"""Size and length of the joint training where nothing but models is given."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-from keyss.core.gaussians import Gaussians
-from keyss.methods.learned.config import HideConfig
+from keyss.methods.base import SceneInput
+from keyss.methods.learned.options import LearnedOptions
+
+ITERATIONS = 400  # at most
+GENTLE = 0.1  # factor on the rates
 
 
-def room_for_models(config: HideConfig, models: Sequence[Gaussians]) -> HideConfig:
-    """`config` with a cap that holds all `models`, the SH degree they need, and a short, gentle schedule.
+def sized(options: LearnedOptions, inputs: Sequence[SceneInput]) -> LearnedOptions:
+    """`options` for the cover and secrets of `inputs`; unchanged where one of them has photos.
 
-    Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are. Where
-    nothing has to be left out the start is right already, and large steps would only do harm.
+    Where models are all there is, the published model holds the Gaussians of all of them unless
+    `options.max_gaussians` says otherwise. If nothing has to be left out the start is right already: the
+    training is short and gentle, for large steps would only do harm.
     """
-    return replace(
-        config,
-        warm_rate=0.1,
-        fit=replace(
-            config.fit,
-            iterations=min(config.fit.iterations, 400),
-            max_gaussians=max(16, sum(len(model) for model in models)),
-            sh_degree=max(1, *(model.sh_degree for model in models)),
-        ),
+    models = [each.model for each in inputs if each.model is not None and not each.photos]
+    total = sum(len(model) for model in models)
+    if len(models) < len(inputs) or (options.max_gaussians or total) < total:
+        return options
+    fit = replace(
+        options.fit,
+        iterations=options.iterations or min(options.fit.iterations, ITERATIONS),
+        max_gaussians=options.max_gaussians or max(16, total),
+        # Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are.
+        sh_degree=max(1, *(model.sh_degree for model in models)),
     )
+    return replace(options, fit=fit, warm_rate=GENTLE * options.warm_rate)

@@ -12,7 +12,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
-from keyss.methods.learned.config import HideConfig, chosen_scenes
+from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.targets import PlacedScene
 from keyss.rendering.contributions import contributions
 
@@ -36,14 +36,14 @@ class Start:
     curves: tuple[tuple[list[float], list[float]], ...] | None
 
 
-def make_start(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
+def make_start(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
     """The start for the cover (first of `scenes`) and its secrets."""
     if config.start == "points":
         return _from_points(scenes, config, generator)
     return _from_models(scenes, config)
 
 
-def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
+def _from_points(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
     """Combined SfM points: an equal share of the cap for every scene, what one leaves goes to the others."""
     fit = config.fit
     chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
@@ -56,7 +56,7 @@ def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: t
     return Start(Gaussians.cat(parts), None)
 
 
-def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
+def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Start:
     """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     # What is never drawn would lie among the hidden.

@@ -1,0 +1,32 @@
+"""What somebody makes of a stego model who has no key, and has read the source of this method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from keyss.core.gaussians import Gaussians
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.start import DRAWN_LOGIT, opacity_curve
+
+_OPAQUE_LOGIT = 3.0  # 95 %
+
+
+def known_remaps(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
+    """`stego` with the opacity remap of each of so many secrets, and what is transparent for all of them.
+
+    A Gaussian of a secret that left its opacity band while training would be among the last.
+    """
+    decoder = Decoder(DecoderShape()).to(stego.device)
+    decoder.prepare(stego, torch.ones_like(decoder.key))
+    logits, shown = stego.opacity_logits, {}
+    stray = logits < DRAWN_LOGIT
+    for secret in range(secrets):
+        knots, values = opacity_curve(secret)
+        decoder.set_curve(knots, values)
+        shown[f"secret {secret + 1}"] = decoder(stego, decoder.key)
+        stray = stray & ~((logits > knots[1]) & (logits < knots[4]))
+    outside = stego[stray]
+    opaque = torch.full_like(outside.opacity_logits, _OPAQUE_LOGIT)
+    return {**shown, "outside the bands": replace(outside, opacity_logits=opaque)}
