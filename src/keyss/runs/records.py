@@ -1,0 +1,62 @@
+"""Typed records in JSON files: frozen dataclasses, read and written by msgspec.
+
+A file's record has the integer field `version`, whose default is the version that this program writes and
+reads. Fields that the class does not have are passed over; everything else must be of the types it states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from keyss.core.errors import InputError
+from keyss.files.atomic import write_bytes
+from keyss.files.reading import read_file
+
+MOST_BYTES = 16 * 2**20
+
+T = TypeVar("T")
+
+
+class _Versioned(msgspec.Struct):
+    version: int
+
+
+def read_record(path: Path, type: type[T], *, at_most: int = MOST_BYTES) -> T:
+    """The record of a dataclass in a JSON file of at most so many bytes.
+
+    Raises InputError that names the file and the place in it: for a file that is missing, too large or no
+    JSON, for another version, and for values of other types than the class states.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: missing; expected a file that keyss wrote")
+    data = read_file(path, at_most)
+    expected = _version_of(type)
+    try:
+        found = msgspec.json.decode(data, type=_Versioned).version
+        if found != expected:
+            raise InputError(
+                f"{path}: expected version {expected}, got {found}; "
+                "make it again with this version of keyss, or read it with the one that wrote it"
+            )
+        return msgspec.json.decode(data, type=type)
+    except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
+        raise InputError(f"{path}: expected a record of keyss, version {expected}: {error}") from error
+
+
+def write_record(path: Path, record: Any) -> None:
+    """Write the JSON of a dataclass, atomically. Raises OutputError."""
+    write_bytes(path, record_bytes(record))
+
+
+def record_bytes(record: Any) -> bytes:
+    """JSON of a dataclass, for people and programs; NaN and infinite numbers become null."""
+    return msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
+
+
+def _version_of(type: Any) -> int:
+    version: int = next(field.default for field in fields(type) if field.name == "version")
+    return version

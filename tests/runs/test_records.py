@@ -1,0 +1,88 @@
+"""Records in files: what comes back, and what is refused with the file's name."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from keyss.core.errors import InputError
+from keyss.runs.records import read_record, record_bytes, write_record
+
+
+@dataclass(frozen=True)
+class Scores:
+    values: tuple[float, ...]
+    best: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    version: int = 3
+    name: str
+    scores: dict[str, Scores]
+    note: str | None = None
+
+
+RECORD = Record(name="Füchse 狐", scores={"a": Scores((1.5, 2.0), None), "b": Scores((), 0.1)})
+
+
+def test_what_was_written_comes_back(tmp_path: Path) -> None:
+    write_record(tmp_path / "record.json", RECORD)
+    assert read_record(tmp_path / "record.json", Record) == RECORD
+    assert json.loads((tmp_path / "record.json").read_text())["version"] == 3
+
+
+def test_numbers_that_json_does_not_have_become_null() -> None:
+    data = json.loads(record_bytes(Scores((1.0,), math.nan)))
+    assert data == {"values": [1.0], "best": None}
+    assert json.loads(record_bytes(Scores((), math.inf)))["best"] is None
+
+
+def test_unknown_fields_are_passed_over_and_whole_numbers_are_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    path.write_text('{"version": 3, "name": "n", "later": [1], "scores": {"a": {"values": [1], "best": 2}}}')
+    assert read_record(path, Record).scores["a"] == Scores((1.0,), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "truncated"),
+        ("{", "truncated"),
+        ("[]", "Expected `object`"),
+        ("{}", "`version`"),
+        ('{"version": 2}', "expected version 3, got 2"),
+        ('{"version": "3"}', r"at `\$\.version`"),
+        ('{"version": true}', r"at `\$\.version`"),
+        ('{"version": ' + 5000 * "1" + "}", "version"),
+        ('{"version": 3}', "`name`"),
+        ('{"version": 3, "name": 1, "scores": {}}', r"Expected `str`, got `int` - at `\$\.name`"),
+        ('{"version": 3, "name": "n", "scores": {"a": {"values": [null], "best": 1}}}', r"values\[0\]"),
+        ('{"version": 3, "name": "n", "scores": {"a": {"values": ["1"], "best": 1}}}', r"values\[0\]"),
+        ('{"version": 3, "name": "n", "scores": {"a": {"values": [NaN], "best": 1}}}', "malformed"),
+        ('{"version": 3, "name": "\\ud83e", "scores": {}}', "surrogate|malformed"),
+        ('{"version": 3, "name": "n", "scores": ' + 100_000 * "[", "expected a record"),
+        ('{"version": 3, "a": ' + 100_000 * "[", "expected a record"),
+        (b"\xff\xfe\x00", "malformed"),
+        (b'{"version": 3, "name": "\xff", "scores": {}}', "expected a record"),
+    ],
+    ids=lambda value: repr(value)[:20],
+)
+def test_anything_else_is_refused(tmp_path: Path, text: str | bytes, said: str) -> None:
+    path = tmp_path / "record.json"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    with pytest.raises(InputError, match=said) as raised:
+        read_record(path, Record)
+    assert str(path) in str(raised.value)
+
+
+def test_a_file_that_is_missing_or_too_large(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="missing"):
+        read_record(tmp_path / "record.json", Record)
+    write_record(tmp_path / "record.json", RECORD)
+    with pytest.raises(InputError, match="at most 10 bytes"):
+        read_record(tmp_path / "record.json", Record, at_most=10)
