@@ -6,7 +6,6 @@ reads. Fields that the class does not have are passed over; everything else must
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,7 +33,7 @@ def read_record(path: Path, type: type[T], *, at_most: int = MOST_BYTES) -> T:
     if not path.exists():
         raise InputError(f"{path}: missing; expected a file that keyss wrote")
     data = read_file(path, at_most)
-    expected = _version_of(type)
+    expected = _default_version(type)
     try:
         found = msgspec.json.decode(data, type=_Versioned).version
         if found != expected:
@@ -57,6 +56,5 @@ def record_bytes(record: Any) -> bytes:
     return msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
 
 
-def _version_of(type: Any) -> int:
-    version: int = next(field.default for field in fields(type) if field.name == "version")
-    return version
+def _default_version(type: Any) -> int:
+    return int(type.version)  # a field's default is an attribute of its class
