@@ -13,6 +13,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from keyss._version import __version__
+from keyss.audit.methods import as_opened, metrics_of
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
@@ -205,13 +206,14 @@ def hide(
         resume=resume,
         reporter=reporter,
     )
-    metrics = measure_hiding(
+    quality_found = measure_hiding(
         hidden.stego.to(target),
-        hidden.secrets,
+        [as_opened(each) for each in hidden.secrets],
         scenes,
         [plain.to(target) for plain in hidden.plains],
         seed=config.fit.seed,
     )
+    metrics = metrics_of(quality_found, len(hidden.stego))
     metrics |= {
         "iterations": config.fit.iterations,
         "seconds": round(hidden.seconds, 1),
@@ -334,14 +336,15 @@ def evaluate(
         )
     else:
         bounds = [read_ply(opened.folder / name) for name in plain_names(len(learned))]
-        metrics = opened.metrics | measure_hiding(
+        found = measure_hiding(
             opened.stego.to(target),
-            learned,
+            [as_opened(each) for each in learned],
             opened.scenes(),
             [bound.to(target) for bound in bounds],
             wrong_keys=wrong_keys,
             seed=seed,
         )
+        metrics = opened.metrics | metrics_of(found, len(opened.stego))
     write_bytes(opened.folder / METRICS, json_bytes(metrics))
     return metrics
 

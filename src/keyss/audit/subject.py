@@ -11,35 +11,37 @@ from typing import Any
 
 import torch
 
-from keyss.core.alignment import align
+from keyss.audit.methods import as_opened, opener
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
 from keyss.files.ply import read_ply, write_ply
+from keyss.files.reading import read_file
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
+from keyss.measure.hiding import frame_of
 from keyss.measure.robustness import Reopener
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import read_sidecar
-from keyss.runs.opening import HidingRun, Opened, revealed
+from keyss.methods.base import Opened
+from keyss.runs.opening import HidingRun
 
-NULLS = "private/null"  # plain models of the cover from other seeds, in a run's folder
+CONTROLS = "private/controls"  # plain models of the cover from other seeds, in a run's folder
 
 
 @dataclass(frozen=True)
-class Subject:
+class AuditSubject:
     """Everything that the parts of an audit look at; models on `device`."""
 
     run: HidingRun
     scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
     stego: Gaussians
+    opened: tuple[Opened, ...]
     revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
     frames: tuple[Similarity, ...]  # from those to the cover's
     original: Gaussians  # plain model of the cover
-    bounds: tuple[Gaussians | None, ...]  # plain models of the secrets, where there are some
-    nulls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
+    baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, where there are some
+    controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
     device: torch.device
 
     @property
@@ -54,8 +56,8 @@ class Subject:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model."""
-        sidecar = None if self.run.sidecar is None else read_sidecar(self.run.sidecar)
-        return [Reopener(key, sidecar) for key in self.run.keys]
+        sidecar = None if self.run.sidecar is None else read_file(self.run.sidecar)
+        return [Reopener(key, opener(sidecar)) for key in self.run.keys]
 
     @property
     def secrets(self) -> tuple[Scene, ...]:
@@ -68,51 +70,46 @@ def subject_of(
     seeds: Sequence[int],
     device: torch.device,
     reporter: Reporter,
-) -> Subject:
+) -> AuditSubject:
     """Read, reveal and fit what the audit needs; plain models are kept in the run's folder and used again.
 
     `original`: a plain model of the cover, by default the run's own. Raises UsageError where there is none.
     """
     scenes = run.scenes()
-    plain, *bounds = run.plain_models()
+    plain, *baselines = run.plain_models()
     if original is not None:
         plain = read_ply(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
-    stego, folder = run.stego.to(device), run.folder / NULLS
+    stego, folder = run.stego.to(device), run.folder / CONTROLS
     config = _fit_config(run)
     if original is not None or run.settings["models_given"][0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
-    nulls = [
+    controls = tuple(
         _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
         for seed in seeds
-    ]
-    return Subject(
+    )
+    opened = tuple(map(as_opened, run.opened))
+    return AuditSubject(
         run=run,
         scenes=tuple(scenes),
         stego=stego,
-        revealed=tuple(revealed(stego, secret).to(device) for secret in run.opened),
+        opened=opened,
+        revealed=tuple(secret.reveal(stego).to(device) for secret in opened),
         frames=tuple(
-            _frame(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
+            frame_of(secret, scene, scenes[0]) for secret, scene in zip(opened, scenes[1:], strict=True)
         ),
         original=plain.to(device),
-        bounds=tuple(None if bound is None else bound.to(device) for bound in bounds),
-        nulls=tuple(nulls),
+        baselines=tuple(None if model is None else model.to(device) for model in baselines),
+        controls=controls,
         device=device,
     )
 
 
-def null_seeds(run: HidingRun, nulls: int, seed: int) -> list[int]:
+def control_seeds(run: HidingRun, controls: int, seed: int) -> list[int]:
     """From which the plain models are trained: those after the run's own."""
     first = _fit_config(run).seed + seed
-    return [first + index for index in range(1, nulls + 1)]
-
-
-def _frame(secret: Opened, scene: Scene, cover: Scene) -> Similarity:
-    """Where the secret lies; one that is carried lies nowhere, and is looked for where it might have been."""
-    if isinstance(secret, HiddenSecret):
-        return secret.frame
-    return align([view.camera for view in scene.train], [view.camera for view in cover.train])
+    return [first + index for index in range(1, controls + 1)]
 
 
 def _fit_config(run: HidingRun) -> FitConfig:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814  # the constant SH basis function
+DRAWN_OPACITY = 1 / 255  # below it 3DGS rasterizers draw nothing
 
 
 @dataclass(frozen=True)

@@ -2,88 +2,132 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from torch import Tensor
 
+from keyss.core.alignment import align
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import Quality, mean_psnr, quality
 from keyss.keys import random_embeddings
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import decode, reveal_gaussians
+from keyss.methods.base import Opened
+
+
+@dataclass(frozen=True)
+class BaselineQuality:
+    """Plain 3DGS of the same scenes; None where there is no plain model of one."""
+
+    cover: Quality | None
+    secrets: tuple[Quality | None, ...]
+
+
+@dataclass(frozen=True)
+class PsnrRange:
+    """PSNR in dB over several wrong keys."""
+
+    mean: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
+class WrongKeys:
+    """What decoders make of wrong embeddings, against test photos."""
+
+    keys: int
+    vs_cover: PsnrRange  # means over the decoders
+    vs_secrets: tuple[PsnrRange, ...]  # each decoder's, seen from the cameras of its secret
+
+
+@dataclass(frozen=True)
+class HidingQuality:
+    """Cover and secrets on their test photos, and what they are to be compared with."""
+
+    cover: Quality
+    secrets: tuple[Quality, ...]
+    baseline: BaselineQuality
+    wrong_key: WrongKeys | None  # None where keys condition no decoder
+    chance_level: tuple[float, ...]  # dB, the stego cover itself against each secret's photos
 
 
 def measure_hiding(
     stego: Gaussians,
-    opened: Sequence[HiddenSecret],
+    opened: Sequence[Opened],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
-    bounds: Sequence[Gaussians],  # plain models of the scenes, each in its own frame
+    baselines: Sequence[Gaussians | None],  # plain models of the scenes, each in its own frame
     *,
     wrong_keys: int = 32,
     seed: int = 0,
-) -> dict[str, Any]:
-    """Qualities of cover and secrets, their bounds, and what wrong keys show.
+) -> HidingQuality:
+    """Qualities of cover and secrets, of plain models, and what wrong keys show.
 
-    `bound`: the plain models. `wrong_key`: PSNR of what the decoders make of wrong embeddings (drawn as those
-    of random keys fall), against the cover's photos and, seen from the secrets' own cameras, against theirs;
-    only somebody who has a decoder but not its key would see that. `floor` is the stego cover itself against
-    the secrets' photos, which a wrong key should look like.
+    Wrong keys are embeddings drawn as those of random keys fall. Only somebody who has a decoder but not its
+    key would see what they show; it should look like the cover, that is, be at the chance level.
     Raises UsageError for no wrong keys at all.
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     cover, secrets = scenes[0], scenes[1:]
-    revealed = [reveal_gaussians(stego, each).to(stego.device) for each in opened]
+    revealed = [each.reveal(stego).to(stego.device) for each in opened]
     wrong = random_embeddings(wrong_keys, torch.Generator().manual_seed(seed))
-    return {
-        "cover": _quality(cover, stego),
-        "secrets": [_quality(secret, model) for secret, model in zip(secrets, revealed, strict=True)],
-        "bound": {
-            "cover": _quality(cover, bounds[0]),
-            "secrets": [_quality(secret, model) for secret, model in zip(secrets, bounds[1:], strict=True)],
-        },
-        "wrong_key": {"keys": wrong_keys, **what_wrong_keys_show(stego, opened, scenes, wrong)},
-        "gaussians": len(stego),
-    }
-
-
-def what_wrong_keys_show(
-    stego: Gaussians, opened: Sequence[HiddenSecret], scenes: Sequence[Scene], embeddings: Tensor
-) -> dict[str, Any]:
-    """PSNRs of what the decoders make of embeddings [E, 64] that are not theirs; see `measure_hiding`."""
-    cover, secrets = scenes[0], scenes[1:]
-    against_cover: list[float] = []
-    against_secrets: list[list[float]] = [[] for _ in secrets]
-    for embedding in embeddings:
-        shown = 0.0
-        for index, (each, secret) in enumerate(zip(opened, secrets, strict=True)):
-            decoy = decode(stego, each, embedding)
-            shown += _psnr_in(cover, decoy) / len(opened)
-            against_secrets[index].append(_psnr_in(secret, each.frame.inverse().apply_gaussians(decoy)))
-        against_cover.append(shown)
-    return {
-        "vs_cover": {"mean": sum(against_cover) / len(against_cover), "min": min(against_cover)},
-        "vs_secrets": [{"mean": sum(v) / len(v), "max": max(v)} for v in against_secrets],
-        "floor": [
-            _psnr_in(secret, each.frame.inverse().apply_gaussians(stego))
+    plain_cover, *plain_secrets = (
+        None if model is None else _quality(scene, model)
+        for scene, model in zip(scenes, baselines, strict=True)
+    )
+    return HidingQuality(
+        cover=_quality(cover, stego),
+        secrets=tuple(_quality(secret, model) for secret, model in zip(secrets, revealed, strict=True)),
+        baseline=BaselineQuality(plain_cover, tuple(plain_secrets)),
+        wrong_key=what_wrong_keys_show(stego, opened, scenes, wrong),
+        chance_level=tuple(
+            _psnr_in(secret, frame_of(each, secret, cover).inverse().apply_gaussians(stego))
             for each, secret in zip(opened, secrets, strict=True)
-        ],
-    }
+        ),
+    )
 
 
-def _quality(scene: Scene, model: Gaussians) -> dict[str, float]:
-    result: Quality = quality(model, scene.test, _background(scene, model))
-    return asdict(result)
+@torch.no_grad()
+def what_wrong_keys_show(
+    stego: Gaussians, opened: Sequence[Opened], scenes: Sequence[Scene], embeddings: Tensor
+) -> WrongKeys | None:
+    """PSNRs of what the decoders make of embeddings [E, 64] that are not theirs; None without decoders."""
+    cover = scenes[0]
+    decoders: list[tuple[Callable[[Gaussians, Tensor], Gaussians], Similarity, Scene]] = [
+        (each.decode, frame_of(each, secret, cover), secret)
+        for each, secret in zip(opened, scenes[1:], strict=True)
+        if each.decode is not None
+    ]
+    if not decoders:
+        return None
+    shown = [[decode(stego, embedding) for decode, _, _ in decoders] for embedding in embeddings]
+    vs_secrets = (
+        [_psnr_in(secret, frame.inverse().apply_gaussians(models[index])) for models in shown]
+        for index, (_, frame, secret) in enumerate(decoders)
+    )
+    vs_cover = [fmean(_psnr_in(cover, model) for model in models) for models in shown]
+    return WrongKeys(len(embeddings), _range(vs_cover), tuple(map(_range, vs_secrets)))
+
+
+def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
+    """From the secret's frame into the cover's; where it never was there, to where the cameras fit best."""
+    if opened.frame is not None:
+        return opened.frame
+    return align([view.camera for view in secret.train], [view.camera for view in cover.train])
+
+
+def _range(values: Sequence[float]) -> PsnrRange:
+    return PsnrRange(fmean(values), min(values), max(values))
+
+
+def _quality(scene: Scene, model: Gaussians) -> Quality:
+    return quality(model, scene.test, scene.background.to(model.device))
 
 
 def _psnr_in(scene: Scene, model: Gaussians) -> float:
-    return mean_psnr(model, scene.test, _background(scene, model))
-
-
-def _background(scene: Scene, model: Gaussians) -> torch.Tensor:
-    return scene.background.to(model.device)
+    return mean_psnr(model, scene.test, scene.background.to(model.device))

@@ -7,16 +7,12 @@ from dataclasses import dataclass, field
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
 from keyss.core.similarity import Similarity
-from keyss.methods.carry.carrying import Carried
-from keyss.methods.learned.opening import open_model
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import open_secret, reveal_gaussians
+from keyss.methods.base import Opened
 
 
 @dataclass(frozen=True)
-class Opened:
+class Reopened:
     """A secret as it was revealed."""
 
     gaussians: Gaussians  # in the secret's own frame
@@ -24,7 +20,7 @@ class Opened:
 
 
 # Raises a KeyssError when the secret cannot be opened.
-Reopen = Callable[[Gaussians], Opened]
+Reopen = Callable[[Gaussians], Reopened]
 
 
 @dataclass(frozen=True)
@@ -32,20 +28,14 @@ class Reopener:
     """`reopener(stego)` is what `keyss reveal` gives, with `--force` where the model asks for it."""
 
     key: str = field(repr=False)
-    sidecar: bytes | None = field(default=None, repr=False)
+    open: Callable[[Gaussians, str], Opened] = field(repr=False)  # stego model on the CPU, key
 
-    def __call__(self, stego: Gaussians) -> Opened:
-        """Raises WrongKeyError and InputError as `open_model` and `open_secret` do."""
+    def __call__(self, stego: Gaussians) -> Reopened:
+        """Raises WrongKeyError and InputError as `open` does."""
         stego = stego.to("cpu")
-        secret: Carried | HiddenSecret
-        if self.sidecar is None:
-            secret = open_model(stego, self.key)
-        else:
-            secret = open_secret(stego, self.key, self.sidecar)
-        if isinstance(secret, Carried):
-            return Opened(filled(secret.gaussians, secret.count))
+        secret = self.open(stego, self.key)
         try:
-            revealed = reveal_gaussians(stego, secret)
+            revealed = secret.reveal(stego)
         except InputError:  # positions changed, so that it seems to be another model
-            revealed = reveal_gaussians(stego, secret, force=True)
-        return Opened(revealed, secret.frame)
+            revealed = secret.reveal(stego, force=True)
+        return Reopened(revealed, secret.frame or Similarity.identity())
