@@ -75,8 +75,8 @@ def print_steganalysis(found: Steganalysis, console: Console | None = None) -> N
 
 def print_verdicts(run: Path, console: Console | None = None) -> None:
     """What an audit comes to: a line for each measure, beside its bound or null."""
-    from keyss.report.reading import read_audit
     from keyss.report.verdicts import headline, verdicts
+    from keyss.runs.audit_record import read_audit
 
     lines = verdicts(read_audit(run))
     table = Table(box=None, pad_edge=False, header_style="bold")

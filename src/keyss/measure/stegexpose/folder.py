@@ -36,7 +36,7 @@ class Steganalysis:
     @property
     def mean_fusion(self) -> float | None:
         """Over the images that have one."""
-        fusions = [row.scores.fusion for row in self.rows if not math.isnan(row.scores.fusion)]
+        fusions = [fusion for row in self.rows if not math.isnan(fusion := _fusion(row.scores))]
         return sum(fusions) / len(fusions) if fusions else None
 
 
@@ -98,9 +98,13 @@ def _files(folder: Path) -> list[Path]:
 
 def _row(path: Path, threshold: float, fast: bool) -> Row:
     scores = score_file(path, stop_below=threshold if fast else None)
-    fusion = scores.fusion
+    fusion = _fusion(scores)
     guess = 0 if math.isnan(fusion) else math.floor(fusion * path.stat().st_size / 3 + 0.5)
     return Row(path.name, scores, fusion > threshold, guess)
+
+
+def _fusion(scores: Scores) -> float:
+    return math.nan if scores.fusion is None else scores.fusion
 
 
 def _spelled(score: float | None) -> str:

@@ -134,7 +134,7 @@ class Decoder(nn.Module):
         """
         if self.shape.conditioning == "bias":
             return 1.0
-        cosine = float(F.cosine_similarity(embedding, self.key, dim=0))
+        cosine = float(F.cosine_similarity(embedding.detach(), self.key, dim=0))
         return min(1.0, max(0.0, (cosine - GATE_SHUT) / (GATE_OPEN - GATE_SHUT)))
 
 
