@@ -25,7 +25,7 @@ from keyss.channels.low_bits.container import embed
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.sidecar import seal_sidecar
+from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -49,7 +49,7 @@ def main() -> None:
     anchors = choose_anchors(plain, generator)
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
     payload = [(right, pack_secret(secret))]
-    stego, sidecar = embed(plain, payload), seal_sidecar(payload)
+    stego, sidecar = embed(plain, payload), encrypt_sidecar(payload)
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"

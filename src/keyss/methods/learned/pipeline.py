@@ -13,7 +13,7 @@ from torch import Tensor
 from keyss.channels.base import Payload
 from keyss.channels.low_bits import LOW_BITS
 from keyss.channels.low_bits.spread import check_payload_fits
-from keyss.channels.sidecar import seal_sidecar
+from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.alignment import align
 from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
@@ -86,9 +86,7 @@ def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions,
     if run.warm:
         stego = stego[run.drawn().cpu()]
     scrambles: list[Scramble | None] = [None] * len(keys)
-    if (
-        run.warm and not options.sidecar
-    ):  # a sidecar is for files that will be rounded, which no scramble survives
+    if run.warm and not options.sidecar:  # which is for files that will be rounded: no scramble survives that
         for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
             if options.decoder == "curve":  # a network would see the difference
                 stego = with_lengths_of_the_cover(stego, decoder.band)
@@ -106,11 +104,11 @@ def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions,
     ]
     counts = [int(is_drawn(decode(stego, secret, secret.embedding)).sum()) for secret in hidden]
     packed = [pack_secret(replace(secret, count=count)) for secret, count in zip(hidden, counts, strict=True)]
+    payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
     sidecar, entropy = None, _discarded(run, derived)
     if options.sidecar:
-        sidecar = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=entropy)
+        sidecar = encrypt_sidecar(payloads, entropy=entropy)
     else:
-        payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
         with advising(KeyssError, SIDECAR_ADVICE):
             stego = LOW_BITS.prepare(stego).embed(payloads, entropy=entropy)
     opened = tuple(OpenedSecret(unpack_secret(each)) for each in packed)
