@@ -14,11 +14,11 @@ import pytest
 import torch
 
 import keyss
-from keyss import FitConfig, HideConfig, Secret
+from keyss import FitConfig, LearnedOptions, Secret
 from keyss.core import InputError, OutputError, Scene, WrongKeyError
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
-CONFIG = HideConfig(
+CONFIG = LearnedOptions(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
 )
 
@@ -259,7 +259,16 @@ def test_public_api() -> None:
     with pytest.raises(AttributeError):
         _ = keyss.nothing
     assert set(keyss.__all__) == {
-        *("Camera", "FitConfig", "Gaussians", "HideConfig", "HideResult", "KeyssError", "Scene", "Secret"),
+        *(
+            "Camera",
+            "FitConfig",
+            "Gaussians",
+            "LearnedOptions",
+            "HideResult",
+            "KeyssError",
+            "Scene",
+            "Secret",
+        ),
         *("View", "WrongKeyError", "__version__", "evaluate", "fit", "generate_key", "hide", "info"),
         *("load_scene", "read_model", "render", "reveal", "write_model"),
     }

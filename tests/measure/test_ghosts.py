@@ -11,8 +11,8 @@ import keyss
 from keyss.core import Gaussians, Scene
 from keyss.keys import random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.pipeline import hide_scenes
 from keyss.methods.learned.start import opacity_curve
+from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _psnr, _scenes
 from tiny_scenes import random_gaussians
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from keyss.methods.carry.plan import Size, plan
 
 import keyss
 from channels.low_bits.trained_like import trained_like
@@ -31,8 +32,7 @@ from keyss.measure.robustness.changes import (
 )
 from keyss.measure.robustness.retraining import purification
 from keyss.methods.carry import embed
-from keyss.methods.carry.plan import Size, plan
-from keyss.methods.learned.pipeline import hide_scenes
+from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _moved, _scenes
 from tiny_scenes import random_gaussians, tiny_scene
 

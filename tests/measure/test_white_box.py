@@ -7,8 +7,8 @@ from torch import Tensor
 
 from keyss.core import Gaussians
 from keyss.measure.white_box import search_embeddings
-from keyss.methods.learned.pipeline import Hidden, hide_scenes
 from keyss.methods.learned.revealing import decode
+from methods.learned.hiding import Hidden, hide_scenes
 from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
 
 RESTARTS = 4
