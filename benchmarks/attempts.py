@@ -21,10 +21,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import torch
+from keyss.channels.low_bits.container import embed
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits.container import embed
 from keyss.channels.sidecar import seal_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians

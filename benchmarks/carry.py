@@ -23,6 +23,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from keyss.methods.carry.plan import Size, room
+
 from channels.low_bits.trained_like import trained_like
 from keyss import read_model, write_model
 from keyss.core import Gaussians, KeyssError, Scene
@@ -32,7 +34,6 @@ from keyss.fitting.image_metrics import mean_psnr
 from keyss.methods.carry import embed, extract
 from keyss.methods.carry.carrying import usable_carriers
 from keyss.methods.carry.dither import cost
-from keyss.methods.carry.plan import Size, room
 from keyss.rendering import render
 
 KEY = "the key of the benchmark"

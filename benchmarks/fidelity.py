@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from keyss.methods.learned.config import PRESETS, HideConfig
 
 import keyss
 from keyss.core import Scene, WrongKeyError
@@ -33,7 +34,6 @@ from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.plain import PlainRun
 from keyss.keys import DerivedKey, KeyDerivation, random_embeddings
 from keyss.measure.hiding import what_wrong_keys_show
-from keyss.methods.learned.config import PRESETS, HideConfig
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.pipeline import training_salt
 from keyss.methods.learned.revealing import open_secret

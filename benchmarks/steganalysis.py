@@ -20,9 +20,10 @@ from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.steganalysis import features, held_out_scores, parts, standard_error
 from keyss.channels.low_bits.byte_plan import SALTS
 from keyss.channels.low_bits.container import embed_derived
+
+from channels.low_bits.steganalysis import features, held_out_scores, parts, standard_error
 from keyss.files.models import read_model
 from keyss.keys import DerivedKey
 from keyss.methods.carry import carrying

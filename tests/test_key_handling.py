@@ -17,7 +17,7 @@ from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels.sidecar import seal_sidecar, unseal_sidecar
 from keyss.cli import commands, main
 from keyss.core.errors import KeyssError
-from keyss.fitting.loop import Silent
+from keyss.fitting.loop import SilentReporter
 from keyss.keys import DerivedKey, KeyDerivation
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -28,7 +28,7 @@ SPELLINGS = [
 ]
 
 
-class _CtrlC(Silent):
+class _CtrlC(SilentReporter):
     """Presses it in the middle of hiding."""
 
     hiding = False

@@ -25,7 +25,7 @@ def timer() -> Timer:
 
 
 def console(terminal: bool) -> Console:
-    return Console(file=io.StringIO(), force_terminal=terminal, width=120)
+    return Console(file=io.StringIO(), force_terminal=terminal, color_system=None, width=120)
 
 
 def text(of: Console) -> str:

@@ -11,8 +11,8 @@ import keyss
 from keyss import FitConfig, LearnedOptions, Secret
 from keyss.audit import audit
 from keyss.cli import main
-from keyss.report.reading import read_audit
 from keyss.report.verdicts import verdicts
+from keyss.runs.audit_record import read_audit
 
 pytestmark = pytest.mark.slow
 CONFIG = LearnedOptions(fit=FitConfig(max_gaussians=20_000))
@@ -38,7 +38,7 @@ def test_bonsai_hides_fox_within_the_promised_losses(run: Path) -> None:
 
 
 def test_an_audit_finds_nothing_of_the_fox(run: Path) -> None:
-    audit(run, ["a key for a fox"], null=2, only=["leaks", "robustness"])
+    audit(run, ["a key for a fox"], controls=2, only=["leaks", "robustness"])
     words = {line.measure: line.word for line in verdicts(read_audit(run))}
     assert words["the secret's shapes in them"] == "fine"
     assert words["loss of a random 25% of the Gaussians"] == "fine"
@@ -57,7 +57,7 @@ def test_a_carried_fox_is_not_to_be_told_from_none(run: Path, real_data: Path, t
         cover_model=plain[0],
         out=out,
     )
-    audit(out, ["a key for a fox"], null=2, only=["parameters", "leaks"])
+    audit(out, ["a key for a fox"], controls=2, only=["parameters", "leaks"])
     words = {line.measure: line.word for line in verdicts(read_audit(out))}
     for measure in ("attributes of the Gaussians", "classifier between models", "leaks without the key"):
         assert words[measure] == "fine"

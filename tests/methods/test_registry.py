@@ -145,6 +145,7 @@ def test_from_the_command_line(
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     monkeypatch.setenv("KEYSS_KEY", KEY)
+    monkeypatch.setenv("COLUMNS", "160")
     with pytest.raises(SystemExit):
         main(["hide", "--method", "whole", "--help"])
     said = capsys.readouterr().out

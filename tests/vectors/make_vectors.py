@@ -23,6 +23,7 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 
 from channels.low_bits.trained_like import trained_like  # noqa: E402
+from keyss.channels.sidecar import seal_sidecar  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 
@@ -72,7 +73,10 @@ def main() -> None:
     sealing["cell"] = cell()
     (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    stego = embed(trained_like(400), [(key, trained_like(8, 1))], entropy=bytes(32))
+    sealed = {"key": key, "payload": b"a payload".hex()}
+    (FOLDER / "sidecar.json").write_text(json.dumps(sealed, indent=1) + "\n")
+    (FOLDER / "sidecar.sealed").write_bytes(seal_sidecar([(key, b"a payload")], entropy=bytes(32)))
+    stego = embed(trained_like(400), [(key, trained_like(8, 1, 1))], entropy=bytes(32))
     write_ply(FOLDER / "carried.ply", stego)
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar, get_type_hints
 
+import msgspec
 from torch import Tensor
 
 from keyss.core.errors import InputError
@@ -15,30 +15,45 @@ from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
 from keyss.files.reading import read_file
 from keyss.fitting.loop import Reporter
-from keyss.runs.files import json_bytes, read_json
+from keyss.runs.audit_record import Audit
+from keyss.runs.records import read_record, write_record
 
-PICTURES = "pictures"  # folder in that of the audit
 _MAX_PICTURE_BYTES = 1 << 26
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Found:
+class PartResult(Generic[T]):
     """What a part of an audit returns."""
 
-    sections: dict[str, Any]  # of audit.json
+    section: T  # of `Audit`
     pictures: dict[str, Tensor] = field(default_factory=dict)  # [H, W, 3] uint8 by file name
 
 
-class Kept:
+@dataclass(frozen=True, kw_only=True)
+class _FinishedPart(Generic[T]):
+    version: int = 1
+    section: T
+    pictures: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Inputs:
+    version: int = 1
+    digest: str
+
+
+class FinishedParts:
     """Finished parts in a folder; `inputs` is what must be the same for them to mean the same."""
 
-    def __init__(self, folder: Path, inputs: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, inputs: dict[str, object]) -> None:
         self.folder = folder
-        digest = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+        now = _Inputs(digest=hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).hexdigest())
         path = folder / "inputs.json"
         if not path.exists():
-            write_bytes(path, json_bytes({"digest": digest}))
-        elif read_json(path) != {"digest": digest}:
+            write_record(path, now)
+        elif read_record(path, _Inputs) != now:
             raise InputError(
                 f"{folder}: belongs to an audit with other settings or inputs; "
                 "give the same ones, or start anew with --overwrite"
@@ -47,23 +62,23 @@ class Kept:
     def has(self, part: str) -> bool:
         return (self.folder / f"{part}.json").exists()
 
-    def keep(self, part: str, found: Found) -> None:
-        for name, picture in found.pictures.items():
+    def keep(self, part: str, result: PartResult[Any]) -> None:
+        for name, picture in result.pictures.items():
             (self.folder / part).mkdir(exist_ok=True)
             write_bytes(self.folder / part / name, png_bytes(picture))
-        written = json_bytes({"sections": found.sections, "pictures": sorted(found.pictures)})
-        write_bytes(self.folder / f"{part}.json", written)
+        kept = _FinishedPart(section=result.section, pictures=tuple(result.pictures))
+        write_record(self.folder / f"{part}.json", kept)
 
-    def take(self, part: str) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Sections and pictures (PNG files by name) of a part that was kept."""
-        kept = read_json(self.folder / f"{part}.json")
-        pictures = {
-            name: read_file(self.folder / part / name, _MAX_PICTURE_BYTES) for name in kept["pictures"]
-        }
-        return kept["sections"], pictures
+    def take(self, part: str) -> tuple[Any, dict[str, bytes]]:
+        """Section and pictures (PNG files by name) of a part that was kept."""
+        section = get_type_hints(Audit)[part]
+        path = self.folder / f"{part}.json"
+        kept: _FinishedPart[Any] = read_record(path, _FinishedPart[section])  # type: ignore[valid-type]
+        folder = self.folder / part
+        return kept.section, {name: read_file(folder / name, _MAX_PICTURE_BYTES) for name in kept.pictures}
 
 
-class Steps:
+class PartProgress:
     """Progress of one part: call it with (done, of how many, at what)."""
 
     def __init__(self, reporter: Reporter, title: str) -> None:

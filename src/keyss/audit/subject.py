@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -20,23 +21,26 @@ from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
 from keyss.measure.robustness import Reopener
+from keyss.methods import registry
+from keyss.methods.base import Opened
 from keyss.runs.opening import HidingRun
 
-NULLS = "private/null"  # plain models of the cover from other seeds, in a run's folder
+CONTROLS = "private/controls"  # plain models of the cover from other seeds, in a run's folder
 
 
 @dataclass(frozen=True)
-class Subject:
+class AuditSubject:
     """Everything that the parts of an audit look at; models on `device`."""
 
     run: HidingRun
     scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
     stego: Gaussians
+    opened: tuple[Opened, ...]
     revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
     frames: tuple[Similarity, ...]  # from those to the cover's
     original: Gaussians  # plain model of the cover
-    bounds: tuple[Gaussians | None, ...]  # plain models of the secrets, where there are some
-    nulls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
+    baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, where there are some
+    controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
     device: torch.device
 
     @property
@@ -51,7 +55,8 @@ class Subject:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model."""
-        return [Reopener(key, self.run.sidecar) for key in self.run.keys]
+        opener = partial(registry.open_model, sidecar=self.run.sidecar)
+        return [Reopener(key, opener) for key in self.run.keys]
 
     @property
     def secrets(self) -> tuple[Scene, ...]:
@@ -64,44 +69,45 @@ def subject_of(
     seeds: Sequence[int],
     device: torch.device,
     reporter: Reporter,
-) -> Subject:
+) -> AuditSubject:
     """Read, reveal and fit what the audit needs; plain models are kept in the run's folder and used again.
 
     `original`: a plain model of the cover, by default the run's own. Raises UsageError where there is none.
     """
     scenes = run.scenes()
-    plain, *bounds = run.plain_models()
+    plain, *baselines = run.plain_models()
     if original is not None:
         plain = read_model(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
-    stego, folder = run.stego.to(device), run.folder / NULLS
+    stego, folder = run.stego.to(device), run.folder / CONTROLS
     config = run.config.options.fit
     if original is not None or run.config.models_given[0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
-    nulls = [
+    controls = tuple(
         _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
         for seed in seeds
-    ]
-    return Subject(
+    )
+    return AuditSubject(
         run=run,
         scenes=tuple(scenes),
         stego=stego,
+        opened=run.opened,
         revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
         frames=tuple(
             frame_of(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
         ),
         original=plain.to(device),
-        bounds=tuple(None if bound is None else bound.to(device) for bound in bounds),
-        nulls=tuple(nulls),
+        baselines=tuple(None if model is None else model.to(device) for model in baselines),
+        controls=controls,
         device=device,
     )
 
 
-def null_seeds(run: HidingRun, nulls: int, seed: int) -> list[int]:
+def control_seeds(run: HidingRun, controls: int, seed: int) -> list[int]:
     """From which the plain models are trained: those after the run's own."""
     first = run.config.options.fit.seed + seed
-    return [first + index for index in range(1, nulls + 1)]
+    return [first + index for index in range(1, controls + 1)]
 
 
 def _plain_model(

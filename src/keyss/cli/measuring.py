@@ -90,7 +90,7 @@ def audit(
     original: Annotated[
         Path | None, optional("FILE", "Plain 3DGS model of the cover to compare with.", "the run's own")
     ] = None,
-    null: Annotated[
+    controls: Annotated[
         int, arg(metavar="N", help="Plain models of the cover from other seeds, to compare with; 2 or more.")
     ] = 3,
     only: Annotated[
@@ -120,7 +120,7 @@ def audit(
         run,
         chosen,
         original=original,
-        null=null,
+        controls=controls,
         only=only,
         seed=checked_seed(seed),
         device=device,

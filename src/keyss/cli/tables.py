@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from keyss.fitting.image_metrics import Quality
+    from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
 
@@ -75,8 +75,8 @@ def print_steganalysis(found: Steganalysis, console: Console | None = None) -> N
 
 def print_verdicts(run: Path, console: Console | None = None) -> None:
     """What an audit comes to: a line for each measure, beside its bound or null."""
-    from keyss.report.reading import read_audit
     from keyss.report.verdicts import headline, verdicts
+    from keyss.runs.audit_record import read_audit
 
     lines = verdicts(read_audit(run))
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -111,8 +111,8 @@ class _QualityRow:
     """A name, a quality or a PSNR alone, the baseline's quality, and a number of Gaussians."""
 
     name: str
-    found: Quality | float
-    baseline: Quality | None = None
+    found: ImageQuality | float
+    baseline: ImageQuality | None = None
     gaussians: int | None = None
 
     def cells(self) -> list[str]:

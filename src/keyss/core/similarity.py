@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -93,35 +92,6 @@ class Similarity:
             opacity_logits=gaussians.opacity_logits,
             sh=_rotate_sh(gaussians.sh, self.rotation),
         )
-
-    def to_json(self) -> dict[str, Any]:
-        """A JSON-compatible dict of the exact values."""
-        return {
-            "scale": self.scale,
-            "rotation": self.rotation.tolist(),
-            "translation": self.translation.tolist(),
-        }
-
-    @staticmethod
-    def from_json(data: object) -> Similarity:
-        """The similarity that `to_json` described. Raises ValueError for anything else."""
-        if not isinstance(data, dict) or data.keys() != {"scale", "rotation", "translation"}:
-            raise ValueError("similarity: expected an object with scale, rotation and translation")
-        rows = data["rotation"]
-        if not isinstance(rows, list) or len(rows) != 3:
-            raise ValueError("similarity: expected three rows of rotation")
-        rotation = torch.stack([_numbers(row) for row in rows])
-        return Similarity(float(_numbers([data["scale"]], 1)), rotation, _numbers(data["translation"]))
-
-
-def _numbers(data: object, count: int = 3) -> Tensor:
-    """[count] float64 of a list of JSON numbers."""
-    if not isinstance(data, list) or len(data) != count or not all(type(v) in (int, float) for v in data):
-        raise ValueError(f"similarity: expected {count} number(s), got {str(data)[:80]}")
-    try:
-        return torch.tensor([float(value) for value in data], dtype=torch.float64)
-    except OverflowError as error:
-        raise ValueError("similarity: a number is too large") from error
 
 
 def _quaternion(rotation: Tensor) -> Tensor:

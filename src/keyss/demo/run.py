@@ -22,7 +22,7 @@ from keyss.files.atomic import write_bytes
 from keyss.files.output import OutputFolder
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import Interrupted, Reporter, Silent
+from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.methods.learned.options import LearnedOptions
 from keyss.rendering import Backend
 from keyss.runs import files as results
@@ -72,7 +72,7 @@ def run_demo(
     _clear(out)
     try:
         cover, secret = (
-            _scene(out / SCENES / which, views, width, height, seed, reporter or Silent())
+            _scene(out / SCENES / which, views, width, height, seed, reporter or SilentReporter())
             for which in (COVER, SECRET)
         )
         key = f"demo-key-{seed}"

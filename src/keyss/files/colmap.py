@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path, PureWindowsPath
 
 from keyss.core.errors import InputError
-from keyss.files.colmap_model import find_model, read_model
-from keyss.files.layout import Layout, Photo, hold_out, refuse_duplicates
+from keyss.files.colmap_model import find_model, read_sparse_model
+from keyss.files.layout import Photo, SceneLayout, hold_out, refuse_duplicates
 
 
 def is_colmap(folder: Path) -> bool:
@@ -14,7 +14,7 @@ def is_colmap(folder: Path) -> bool:
     return find_model(folder) is not None
 
 
-def read_colmap(folder: Path) -> Layout:
+def read_colmap(folder: Path) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
 
     Image names may hold subfolders but never leave `images/`. Raises InputError for a broken model and
@@ -23,7 +23,7 @@ def read_colmap(folder: Path) -> Layout:
     model_folder = find_model(folder)
     if model_folder is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
-    model = read_model(model_folder)
+    model = read_sparse_model(model_folder)
     photos = [
         Photo(
             folder / "images" / _inside(model_folder, image.name),
@@ -34,7 +34,7 @@ def read_colmap(folder: Path) -> Layout:
         for image in model.images
     ]
     refuse_duplicates(model_folder, photos)
-    return Layout(*hold_out(model_folder, photos), model.points)
+    return SceneLayout(*hold_out(model_folder, photos), model.points)
 
 
 def _inside(model_folder: Path, name: str) -> str:

@@ -1,12 +1,15 @@
 """COLMAP's sparse models on disk: cameras, images and points, as `.bin` or `.txt`.
 
-The bytes may be hostile: counts are compared with the bytes that are left before anything is allocated,
-and a file must end where its last record ends. Format: https://colmap.github.io/format.html
+Read by hand because pycolmap is a large package for three small files, and trusts them. The bytes may be
+hostile: counts are compared with the bytes that are left before anything is allocated, and a file must end
+where its last record ends. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
 
+import math
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,9 +18,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from keyss.core.errors import InputError
-from keyss.files.layout import Points, viewmat_from_quaternion
+from keyss.files.layout import MAX_COORDINATE, PointCloud
 from keyss.files.lens import Lens, make_lens
 from keyss.files.reading import read_file, read_text
 
@@ -58,7 +62,7 @@ class SparseModel:
 
     lenses: dict[int, Lens]  # by camera id
     images: tuple[ModelImage, ...]
-    points: Points  # in the order of their ids
+    points: PointCloud  # in the order of their ids
 
 
 def find_model(folder: Path) -> Path | None:
@@ -69,20 +73,24 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
-def read_model(folder: Path) -> SparseModel:
+def read_sparse_model(folder: Path) -> SparseModel:
     """The model in `folder`, from `.bin` files where `cameras.bin` is there, else from `.txt`.
 
     Raises InputError when a file is missing, truncated, longer than it says, or holds values that no
     reconstruction has (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
     """
     if (folder / "cameras.bin").is_file():
-        lenses = _cameras_bin(folder / "cameras.bin")
-        images = _images_bin(folder / "images.bin")
+        cameras = list(_cameras_bin(folder / "cameras.bin"))
+        images = tuple(_images_bin(folder / "images.bin"))
         points = _points_bin(folder / "points3D.bin")
     else:
-        lenses = _cameras_txt(folder / "cameras.txt")
-        images = _images_txt(folder / "images.txt")
+        cameras = list(_cameras_txt(folder / "cameras.txt"))
+        images = tuple(_images_txt(folder / "images.txt"))
         points = _points_txt(folder / "points3D.txt")
+    lenses = dict(cameras)
+    if len(lenses) < len(cameras):
+        camera_id, _ = Counter(camera_id for camera_id, _ in cameras).most_common(1)[0]
+        raise InputError(f"{folder}: expected every camera once, found id {camera_id} twice")
     for image in images:
         if image.camera_id not in lenses:
             raise InputError(
@@ -129,6 +137,9 @@ class _Records:
             )
         self.offset += size
 
+    def doubles(self, count: int) -> tuple[float, ...]:
+        return self.take(f"<{count}d", "camera parameters")
+
     def count(self, record_size: int, what: str) -> int:
         """A count of records of at least `record_size` bytes each, which the rest of the file must hold."""
         (count,) = self.take("<Q", f"the number of {what}")
@@ -157,32 +168,38 @@ class _Records:
             )
 
 
-def _cameras_bin(path: Path) -> dict[int, Lens]:
+def _image(where: str, name: str, camera_id: int, pose: Sequence[float]) -> ModelImage:
+    """`pose`: a quaternion wxyz of any length, then a translation, both from world to camera."""
+    *quaternion, x, y, z = pose
+    if not 1e-8 < math.hypot(*quaternion) < math.inf:
+        raise InputError(f"{where}: expected a rotation quaternion, found {quaternion}")
+    if not all(abs(t) <= MAX_COORDINATE for t in (x, y, z)):
+        raise InputError(f"{where}: expected a finite translation, found {[x, y, z]}")
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # scipy's order is xyzw
+    viewmat[:3, 3] = x, y, z
+    return ModelImage(name, camera_id, viewmat)
+
+
+def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
     records = _Records(path)
-    lenses: dict[int, Lens] = {}
     for _ in range(records.count(24, "cameras")):
         camera_id, number, width, height = records.take("<IiQQ", "a camera")
         model = _MODEL_NAMES[number] if 0 <= number < len(_MODEL_NAMES) else f"number {number}"
-        where = f"{path}: camera {camera_id}"
-        lens = _lens(where, model, width, height, lambda n: records.take(f"<{n}d", "camera parameters"))
-        _add(lenses, camera_id, lens, where)
+        yield camera_id, _lens(f"{path}: camera {camera_id}", model, width, height, records.doubles)
     records.end()
-    return lenses
 
 
-def _images_bin(path: Path) -> tuple[ModelImage, ...]:
+def _images_bin(path: Path) -> Iterator[ModelImage]:
     records = _Records(path)
-    images = []
     for _ in range(records.count(73, "images")):
         image_id, *pose, camera_id = records.take("<I7dI", "an image")
-        viewmat = viewmat_from_quaternion(f"{path}: image {image_id}", pose[:4], pose[4:])
-        images.append(ModelImage(records.name(), camera_id, viewmat))
+        yield _image(f"{path}: image {image_id}", records.name(), camera_id, pose)
         records.skip(24 * records.count(24, "observations"), "observations")
     records.end()
-    return tuple(images)
 
 
-def _points_bin(path: Path) -> Points:
+def _points_bin(path: Path) -> PointCloud:
     records = _Records(path)
     data, end = records.data, len(records.data)
     count = records.count(51, "points")
@@ -205,88 +222,62 @@ def _points_bin(path: Path) -> Points:
     raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
     points = raw.view(fields)[:, 0]
     points = points[np.argsort(points["id"], kind="stable")]
-    return Points.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
+    return PointCloud.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
 
 
-def _cameras_txt(path: Path) -> dict[int, Lens]:
-    lenses: dict[int, Lens] = {}
-    for number, line in _lines(path):
-        where = f"{path}, line {number}"
-        words = line.split()
-        if len(words) < 4:
-            raise InputError(
-                f"{where}: expected `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`, found {line[:80]!r}"
-            )
-        camera_id, width, height = (_parse(int, where, words[i]) for i in (0, 2, 3))
-        lens = _lens(where, words[1], width, height, partial(_floats, where, words[4:]))
-        _add(lenses, camera_id, lens, where)
-    return lenses
+def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
+    for where, words in _rows(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."):
+        camera_id, width, height = (_number(int, where, words[i]) for i in (0, 2, 3))
+        yield camera_id, _lens(where, words[1], width, height, partial(_floats, where, words[4:]))
 
 
-def _images_txt(path: Path) -> tuple[ModelImage, ...]:
-    images = []
-    lines = iter(enumerate(read_text(path).split("\n"), 1))
-    for number, line in lines:
+def _images_txt(path: Path) -> Iterator[ModelImage]:
+    for where, words in _rows(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", lines=2):
+        yield _image(where, words[9], _number(int, where, words[8]), _floats(where, words[1:8], 7))
+
+
+def _points_txt(path: Path) -> PointCloud:
+    xyz, rgb, ids = [], [], []
+    for where, words in _rows(path, "POINT3D_ID X Y Z R G B ERROR TRACK..."):
+        ids.append(_number(int, where, words[0]))
+        xyz.append(_floats(where, words[1:4], 3))
+        rgb.append([_number(int, where, word) for word in words[4:7]])
+        if not all(0 <= c <= 255 for c in rgb[-1]):
+            raise InputError(f"{where}: expected colours of 0 to 255, found {rgb[-1]}")
+    order = sorted(range(len(ids)), key=ids.__getitem__)
+    positions = np.array(xyz, dtype=np.float64).reshape(-1, 3)[order]
+    return PointCloud.checked(path, positions, np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order])
+
+
+def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:
+    """(where, words) of each record, which takes so many `lines`, of which the first has a `layout`.
+
+    The last word is all the rest of its line (names of images may hold spaces), or split further if the
+    layout ends in `...`, and then it may be missing.
+    """
+    most = len(layout.split())
+    is_open = layout.endswith("...")
+    numbered = iter(enumerate(read_text(path).split("\n"), 1))
+    for number, line in numbered:
         if not line.strip() or line.startswith("#"):
             continue
-        where = f"{path}, line {number}"
-        words = line.strip().split(maxsplit=9)
-        if len(words) < 10:
-            raise InputError(
-                f"{where}: expected `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, found {line[:80]!r}"
-            )
-        pose = _floats(where, words[1:8], 7)
-        viewmat = viewmat_from_quaternion(where, pose[:4], pose[4:])
-        images.append(ModelImage(words[9], _parse(int, where, words[8]), viewmat))
-        next(lines, None)  # the line of observations, which may be empty
-    return tuple(images)
+        words = line.split() if is_open else line.strip().split(maxsplit=most - 1)
+        if len(words) < most - is_open:
+            raise InputError(f"{path}, line {number}: expected `{layout}`, found {line[:80]!r}")
+        yield f"{path}, line {number}", words
+        for _ in range(lines - 1):
+            next(numbered, None)  # the line of an image's observations, which may be empty
 
 
-def _points_txt(path: Path) -> Points:
-    xyz, rgb, ids = [], [], []
-    for number, line in _lines(path):
-        where = f"{path}, line {number}"
-        words = line.split(maxsplit=8)
-        if len(words) < 8:
-            raise InputError(
-                f"{where}: expected `POINT3D_ID X Y Z R G B ERROR TRACK...`, found {line[:80]!r}"
-            )
-        ids.append(_parse(int, where, words[0]))
-        xyz.append(_floats(where, words[1:4], 3))
-        color = [_parse(int, where, word) for word in words[4:7]]
-        if not all(0 <= c <= 255 for c in color):
-            raise InputError(f"{where}: expected colours of 0 to 255, found {color}")
-        rgb.append(color)
-    order = sorted(range(len(ids)), key=ids.__getitem__)
-    return Points.checked(
-        path,
-        np.array(xyz, dtype=np.float64).reshape(-1, 3)[order],
-        np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order],
-    )
-
-
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    for number, line in enumerate(read_text(path).split("\n"), 1):
-        if line.strip() and not line.startswith("#"):
-            yield number, line
-
-
-def _parse(kind: Callable[[str], _T], where: str, word: str) -> _T:
+def _number(kind: Callable[[str], _T], where: str, word: str) -> _T:
     try:
         return kind(word)
     except ValueError as error:
-        raise InputError(
-            f"{where}: expected a number ({getattr(kind, '__name__', kind)}), found {word[:40]!r}"
-        ) from error
+        name = getattr(kind, "__name__", kind)
+        raise InputError(f"{where}: expected a number ({name}), found {word[:40]!r}") from error
 
 
 def _floats(where: str, words: Sequence[str], count: int) -> list[float]:
     if len(words) != count:
         raise InputError(f"{where}: expected {count} numbers, found {len(words)}")
-    return [_parse(float, where, word) for word in words]
-
-
-def _add(lenses: dict[int, Lens], camera_id: int, lens: Lens, where: str) -> None:
-    if camera_id in lenses:
-        raise InputError(f"{where}: expected every camera once, found id {camera_id} twice")
-    lenses[camera_id] = lens
+    return [_number(float, where, word) for word in words]

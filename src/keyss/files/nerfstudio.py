@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import InputError
-from keyss.files.layout import Layout, Photo, Points, hold_out
+from keyss.files.layout import Photo, PointCloud, SceneLayout, hold_out
 from keyss.files.point_cloud import read_point_cloud
 from keyss.files.transforms import find_image, inside, read_transforms
 
@@ -16,7 +16,7 @@ def is_nerfstudio(folder: Path) -> bool:
     return (folder / "transforms.json").is_file()
 
 
-def read_nerfstudio(folder: Path) -> Layout:
+def read_nerfstudio(folder: Path) -> SceneLayout:
     """The photos, and the points of `ply_file_path` where it is given.
 
     `train_filenames` and `test_filenames` (or `val_filenames`) make the split; with only one of the two,
@@ -26,10 +26,10 @@ def read_nerfstudio(folder: Path) -> Layout:
     """
     path = folder / "transforms.json"
     meta, photos = read_transforms(path)
-    points = Points.none()
+    points = PointCloud.none()
     if meta.get("ply_file_path") is not None:
         points = read_point_cloud(folder / inside(path, meta["ply_file_path"]))
-    return Layout(*_split(path, meta, photos), points)
+    return SceneLayout(*_split(path, meta, photos), points)
 
 
 def _split(

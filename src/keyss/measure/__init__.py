@@ -4,18 +4,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from keyss.measure.distances import against_null, attribute_distances
+    from keyss.measure.distances import against_controls, attribute_distances
     from keyss.measure.hiding import measure_hiding
     from keyss.measure.images import compare_images
     from keyss.measure.leaks import look_for_secret
     from keyss.measure.roc import stegexpose_roc
     from keyss.measure.sealwatch_detectors import sealwatch_roc
     from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
-    from keyss.measure.two_sample import two_sample_against_null, two_sample_auc
+    from keyss.measure.two_sample import two_sample_against_controls, two_sample_auc
     from keyss.measure.white_box import search_embeddings
 
 __all__ = [
-    "against_null",
+    "against_controls",
     "attribute_distances",
     "compare_images",
     "composite_score",
@@ -25,12 +25,12 @@ __all__ = [
     "search_embeddings",
     "sinkhorn_3d",
     "stegexpose_roc",
-    "two_sample_against_null",
+    "two_sample_against_controls",
     "two_sample_auc",
 ]
 
 _HOME_OF = {
-    "against_null": "distances",
+    "against_controls": "distances",
     "attribute_distances": "distances",
     "compare_images": "images",
     "composite_score": "sinkhorn",
@@ -40,7 +40,7 @@ _HOME_OF = {
     "search_embeddings": "white_box",
     "sinkhorn_3d": "sinkhorn",
     "stegexpose_roc": "roc",
-    "two_sample_against_null": "two_sample",
+    "two_sample_against_controls": "two_sample",
     "two_sample_auc": "two_sample",
 }
 

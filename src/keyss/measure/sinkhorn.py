@@ -8,6 +8,8 @@ which nobody sees. `keyss.measure.distances` has none of these faults.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
@@ -21,22 +23,35 @@ REGULARISATION = 0.01
 Doubles = npt.NDArray[np.float64]
 
 
-def sinkhorn_3d(original: Gaussians, other: Gaussians) -> dict[str, float]:
-    """Sinkhorn distances of five histograms, in [0, 1]; their `sum` (KeySS, eq. 9) and their `mean`.
+@dataclass(frozen=True)
+class Sinkhorn3D:
+    """Sinkhorn distances of five histograms, each in [0, 1]."""
+
+    opacity: float
+    rotation: float
+    scale: float
+    position: float
+    colour: float
+    mean: float
+    sum: float  # KeySS, eq. 9; the paper's tables give sums
+
+
+def sinkhorn_3d(original: Gaussians, other: Gaussians) -> Sinkhorn3D:
+    """3D-Sinkhorn of two models.
 
     The histograms, of 100 bins, are of opacities and of the lengths of scales (as standard deviations), raw
     quaternions, positions and constant colour coefficients, each model's divided by its own maximum. The
     range of `original`'s values is divided into bins; what of `other` lies outside it is dropped, and if that
     is all of it, the distance is 1. Cost: the difference of the bins' centres. Entropic regularisation: 0.01,
     so d(p, p) > 0; at most 1,000 iterations, as is POT's default. Not symmetric.
-    The paper's tables give sums. Raises UsageError for an empty model.
+    Raises UsageError for an empty model.
     """
     if not (len(original) and len(other)):
         raise UsageError("expected two models with Gaussians in them, got an empty one")
     ours, theirs = _magnitudes(original), _magnitudes(other)
-    result = {name: _sinkhorn(ours[name], theirs[name]) for name in ours}
-    total = sum(result.values())
-    return {**result, "mean": total / len(result), "sum": total}
+    found = {name: _sinkhorn(ours[name], theirs[name]) for name in ours}
+    total = sum(found.values())
+    return Sinkhorn3D(**found, mean=total / len(found), sum=total)
 
 
 def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> float:

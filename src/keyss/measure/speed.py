@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from statistics import median
@@ -16,13 +17,54 @@ import torch
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.models import read_model, write_model
+from keyss.files.ply import read_ply, write_ply
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_gsply, transform
 from keyss.measure.robustness.reopening import Reopen
 from keyss.rendering import render
 
 Columns = dict[str, np.ndarray[Any, Any]]
+
+
+@dataclass(frozen=True)
+class RenderTime:
+    """How long a picture of a model takes, beside one of a plain model of the same scene; medians."""
+
+    model: str
+    ratio: float  # the median over pairs of pictures, so that what else the machine does cancels
+    seconds: float
+    plain_seconds: float
+    gaussians: int
+    plain_gaussians: int
+
+
+@dataclass(frozen=True)
+class ReaderResult:
+    """Whether somebody else's program reads a file of ours."""
+
+    reader: str
+    file: str
+    loads: bool | None  # whether all values are those that we read, to the last bit; None: not installed
+    gaussians: int | None = None  # that it finds
+    note: str | None = None  # why it fails, or how to install it
+
+
+@dataclass(frozen=True)
+class FileSize:
+    """A file that is published, or that revealing gives."""
+
+    name: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class SpeedResult:
+    """Times, sizes and readers of the published model ("stego") and of what the keys reveal ("secret N")."""
+
+    render: tuple[RenderTime, ...]
+    reveal_seconds: tuple[float, ...]  # from file to file for each secret, key derivation included
+    files: tuple[FileSize, ...]
+    readers: tuple[ReaderResult, ...]
 
 
 def speed(
@@ -36,20 +78,16 @@ def speed(
     rounds: int = 15,
     device: torch.device | str = "cpu",
     progress: Callable[[int, int, str], None] | None = None,
-) -> dict[str, Any]:
-    """Times, sizes and readers of the published model and of what the keys reveal. JSON-able.
+) -> SpeedResult:
+    """Measure the published model, and what the keys reveal, beside plain models of the same scenes.
 
-    "render": for the published model and each revealed one what `render_ratio` says, beside the plain model
-    of its scene. "reveal": seconds from file to file for each secret (median of three), reading, key
-    derivation and writing included. "files": bytes. "readers": see `readers`, of the published and the
-    revealed files. `progress`: called with models done, models in all, and the next one's name. Raises
-    KeyssError where a secret does not open.
+    `progress`: called with models done, models in all, and the next one's name. Raises KeyssError where a
+    secret does not open.
     """
     names = ["stego", *(f"secret {number}" for number in range(1, len(scenes)))]
-    files: dict[str, int] = {}
-    if sidecar is not None:
-        files["sidecar"] = sidecar.stat().st_size
-    rendered, revealed, read = [], [], []
+    files = [] if sidecar is None else [FileSize("sidecar", sidecar.stat().st_size)]
+    rendered, revealed = [], []
+    read: list[ReaderResult] = []
     with tempfile.TemporaryDirectory() as folder:
         for number, (name, scene, plain) in enumerate(zip(names, scenes, plains, strict=True)):
             if progress is not None:
@@ -57,27 +95,25 @@ def speed(
             file = stego
             if number > 0:
                 file = Path(folder) / f"{number}.ply"
-                revealed.append({"model": name, "seconds": reveal_seconds(stego, reopen[number - 1], file)})
-            files[name] = file.stat().st_size
-            ratio = render_ratio(
-                read_model(file).to(device), plain.to(device), scene, views=views, rounds=rounds
-            )
-            rendered.append({"model": name, **ratio})
-            read += [{"model": name, **found} for found in readers(file)]
+                revealed.append(reveal_seconds(stego, reopen[number - 1], file))
+            files.append(FileSize(name, file.stat().st_size))
+            model = read_ply(file).to(device)
+            found = render_time(name, model, plain.to(device), scene, views=views, rounds=rounds)
+            rendered.append(found)
+            read += [replace(each, file=name) for each in readers(file)]
     if progress is not None:
         progress(len(names), len(names), "")
-    return {"render": rendered, "reveal": revealed, "files": files, "readers": read}
+    return SpeedResult(tuple(rendered), tuple(revealed), tuple(files), tuple(read))
 
 
 @torch.no_grad()
-def render_ratio(
-    model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
-) -> dict[str, Any]:
-    """How long a picture of `model` takes as a ratio to one of `plain`, from a scene's test cameras.
+def render_time(
+    name: str, model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
+) -> RenderTime:
+    """How long a picture of `model`, called `name`, takes beside one of `plain`, from a scene's test cameras.
 
     Each round draws at most `views` views with both, one right after the other and the first in turns; the
-    first round warms up and does not count. "ratio" is the median over pairs of pictures, so that what else
-    the machine does cancels; "milliseconds" and "plain_milliseconds" are medians too.
+    first round warms up and does not count.
     """
     cameras = [view.camera for view in subsample_views(scene.test, views)]
     background = scene.background.to(model.device)
@@ -91,14 +127,9 @@ def render_ratio(
                     torch.cuda.synchronize()
                 times[number, index, which] = time.perf_counter() - start
     counted = times[1:].reshape(-1, 2)
-    milliseconds, plain_milliseconds = 1000 * np.median(counted, axis=0)
-    return {
-        "ratio": float(np.median(counted[:, 0] / counted[:, 1])),
-        "milliseconds": float(milliseconds),
-        "plain_milliseconds": float(plain_milliseconds),
-        "gaussians": len(model),
-        "plain_gaussians": len(plain),
-    }
+    seconds, plain_seconds = np.median(counted, axis=0).tolist()
+    ratio = float(np.median(counted[:, 0] / counted[:, 1]))
+    return RenderTime(name, ratio, seconds, plain_seconds, len(model), len(plain))
 
 
 def reveal_seconds(stego: Path, reopen: Reopen, out: Path, *, repeats: int = 3) -> float:
@@ -106,29 +137,25 @@ def reveal_seconds(stego: Path, reopen: Reopen, out: Path, *, repeats: int = 3) 
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        write_model(out, reopen(read_model(stego)).gaussians)
+        write_ply(out, reopen(read_ply(stego)).gaussians)
         seconds.append(time.perf_counter() - start)
     return median(seconds)
 
 
-def readers(path: Path) -> list[dict[str, Any]]:
-    """Whether other people's programs read a .ply of ours: plyfile, gsply and splat-transform.
-
-    "gaussians": how many they find, "equal": whether all values are those that we read, to the last bit. One
-    that fails says why in "error", and one that is not installed in "skipped".
-    """
-    expected = _columns_of(read_model(path))
-    found: list[dict[str, Any]] = []
+def readers(path: Path) -> list[ReaderResult]:
+    """Whether other people's programs read a .ply of ours: plyfile, gsply and splat-transform."""
+    expected = _columns_of(read_ply(path))
+    found: list[ReaderResult] = []
     for name, read in (("plyfile", _plyfile), ("gsply", _gsply), ("splat-transform", _splat_transform)):
         try:
             columns = read(path)
         except BackendError as error:
-            found.append({"reader": name, "skipped": f"{error}"})
+            found.append(ReaderResult(name, path.name, None, note=f"{error}"))
         except (KeyssError, OSError, ValueError, KeyError) as error:
-            found.append({"reader": name, "error": f"{error}"})
+            found.append(ReaderResult(name, path.name, False, note=f"{error}"))
         else:
             equal = all(np.array_equal(columns[key], values) for key, values in expected.items())
-            found.append({"reader": name, "gaussians": len(columns["means"]), "equal": equal})
+            found.append(ReaderResult(name, path.name, equal, len(columns["means"])))
     return found
 
 
@@ -172,4 +199,4 @@ def _gsply(path: Path) -> Columns:
 
 def _splat_transform(path: Path) -> Columns:
     with tempfile.TemporaryDirectory() as folder:
-        return _columns_of(read_model(transform(path, Path(folder) / "copy.ply")))
+        return _columns_of(read_ply(transform(path, Path(folder) / "copy.ply")))

@@ -7,9 +7,9 @@ what two samples of one distribution give, 1 is told apart without fail.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,18 +17,36 @@ import numpy.typing as npt
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.measure.features import features
+from keyss.measure.roc import delong
 
 LEAST, MOST = 100, 10_000  # Gaussians of each model
 FOLDS = 5
 _CELLS = 8  # along each axis
 _TREES, _LEAVES = 50, 16
 
-Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
 
 
-def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> dict[str, float]:
-    """`auc` of boosted trees that tell single Gaussians of `b` from those of `a`, `low` and `high`.
+@dataclass(frozen=True)
+class AucInterval:
+    """The area under a ROC curve, and its 95 % confidence interval."""
+
+    auc: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class TwoSample:
+    """What the classifier says of a model and of controls."""
+
+    stego: tuple[AucInterval, ...]  # the model against each control
+    control: tuple[AucInterval, ...]  # each pair of controls
+    original: tuple[AucInterval, ...] = ()  # the cover's own plain model against each control
+
+
+def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> AucInterval:
+    """AUC of boosted trees that tell single Gaussians of `b` from those of `a`.
 
     The mean over five folds, and its 95 % confidence interval by DeLong's method (1988). Trees see
     `keyss.measure.features.features`, of as many Gaussians of one model as of the other: random subsets (by
@@ -52,27 +70,29 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> dict[str, fl
         *(_held_out(values, is_b, fold == index, seed) for index in range(FOLDS)), strict=True
     )
     auc, margin = fmean(aucs), 1.96 * sum(variances) ** 0.5 / FOLDS
-    return {"auc": auc, "low": max(auc - margin, 0.0), "high": min(auc + margin, 1.0)}
+    return AucInterval(auc, max(auc - margin, 0.0), min(auc + margin, 1.0))
 
 
-def two_sample_against_null(
-    model: Gaussians, plain_models: Sequence[Gaussians], *, seed: int = 0
-) -> dict[str, Any]:
-    """How well `model` is told from plain models of the same scene, beside how well these from each other.
+def two_sample_against_controls(
+    model: Gaussians,
+    controls: Sequence[Gaussians],
+    *,
+    original: Gaussians | None = None,
+    seed: int = 0,
+) -> TwoSample:
+    """How well `model` is told from control models of the same scene, beside how well these from each other.
 
-    `auc` and `null` are means; `against_plain` and `between_plain` hold what `two_sample_auc` says of each
-    plain model and of each pair. Raises UsageError for fewer than two plain models.
+    `original`: another model of the scene, told from the controls too. Raises UsageError for fewer than two
+    controls.
     """
-    if len(plain_models) < 2:
-        raise UsageError(f"a null needs at least two plain models of the scene, got {len(plain_models)}")
-    against = [two_sample_auc(plain, model, seed=seed) for plain in plain_models]
-    between = [two_sample_auc(one, two, seed=seed) for one, two in combinations(plain_models, 2)]
-    return {
-        "auc": fmean(each["auc"] for each in against),
-        "null": fmean(each["auc"] for each in between),
-        "against_plain": against,
-        "between_plain": between,
-    }
+    if len(controls) < 2:
+        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
+    others = () if original is None else (original,)
+    return TwoSample(
+        stego=tuple(two_sample_auc(each, model, seed=seed) for each in controls),
+        control=tuple(two_sample_auc(one, two, seed=seed) for one, two in combinations(controls, 2)),
+        original=tuple(two_sample_auc(each, other, seed=seed) for each in controls for other in others),
+    )
 
 
 def _folds(positions: npt.NDArray[np.float32], seed: int) -> Ints:
@@ -98,17 +118,3 @@ def _held_out(
         trees.fit(values[~held_out], is_b[~held_out])
         scores = trees.decision_function(values[held_out])
     return delong(scores[~is_b[held_out]], scores[is_b[held_out]])
-
-
-def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
-    """AUC of scores [N] and [P], ties counted half, and its variance by DeLong, DeLong and Clarke-Pearson.
-
-    By ranks, as in Sun and Xu (2014).
-    """
-    from scipy.stats import rankdata
-
-    n, p = len(negatives), len(positives)
-    ranks = rankdata(np.concatenate([negatives, positives]))
-    below = (ranks[n:] - rankdata(positives)) / n  # the share of negatives below each positive
-    above = 1 - (ranks[:n] - rankdata(negatives)) / p
-    return float(below.mean()), float(below.var(ddof=1) / p + above.var(ddof=1) / n)

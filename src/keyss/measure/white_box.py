@@ -6,47 +6,50 @@ can look for the vector under which it exchanges most, and needs no key, no cove
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.keys import random_embeddings
-from keyss.methods.learned.decoder import Decoder
 
 
 @torch.enable_grad()
 def search_embeddings(
-    decoder: Decoder,
+    decode: Callable[[Gaussians, Tensor], Gaussians],  # `keyss.methods.base.Opened.decode`
     stego: Gaussians,
     *,
     restarts: int = 8,
     steps: int = 150,
-    sample: int = 4000,
+    most: int = 20_000,
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
     """[restarts, 64] unit vectors under which the decoder seems to show another scene, the best first.
 
-    Gradient ascent from random starts on the mean change of the opacities of up to `sample` Gaussians, less
-    `balance` times the change of their mean: what makes some visible and as much of others invisible is a
-    scene in place of a scene, while what only adds or only removes is not. With 0 all change counts, which
-    finds a secret that needs more Gaussians than the cover. A decoder with a gate gives no gradient: then the
-    random starts come back.
+    Gradient ascent from random starts on the mean change of the opacities, less `balance` times the change of
+    their mean: what makes some visible and as much of others invisible is a scene in place of a scene, while
+    what only adds or only removes is not. With 0 all change counts, which finds a secret that needs more
+    Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded. Where the
+    decoded opacities have no gradient in the embedding, the random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
-    if decoder.shape.conditioning == "gate":
-        return random_embeddings(restarts, generator)
-    chosen = torch.randperm(len(stego), generator=generator)[:sample]
-    part = stego.detach()[chosen.to(stego.device)]
+    part = stego.detach()
+    if len(part) > most:
+        part = part[torch.randperm(len(part), generator=generator)[:most].to(stego.device)]
 
     def exchanged(direction: Tensor) -> Tensor:
-        change = decoder(part, F.normalize(direction, dim=0), stego).opacities - part.opacities
+        change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities
         score: Tensor = change.abs().mean() - balance * change.mean().abs()
         return score
 
+    starts = random_embeddings(restarts, generator)
+    if not exchanged(starts[0].to(stego.device).requires_grad_()).requires_grad:
+        return starts
     found = []
-    for start in random_embeddings(restarts, generator):
+    for start in starts:
         direction = start.to(stego.device).requires_grad_()
         optimizer = torch.optim.Adam([direction], lr=0.02)
         for _ in range(steps):

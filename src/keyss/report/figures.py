@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from keyss.report.markup import Html, element
 from keyss.report.numbers import times
+from keyss.report.untrusted import clean
 
 # Each stands for the CSS variable of this name; page.css says what it looks like in light and dark.
 _INK, _MUTED, _GRID, _STEGO, _LIMIT, _PAGE = (
@@ -84,8 +85,8 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Points joined by a line."""
+class RocCurve:
+    """Shares of renders called suspect: of controls (x), of the published model (y)."""
 
     name: str
     x: Sequence[float]
@@ -93,15 +94,15 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Losses:
+class AttackCurve:
     """What an attack costs, from strength to strength."""
 
     name: str
     points: Sequence[tuple[float, float | None]]  # dB of the cover and of the secret; None: it does not open
 
 
-def ratio_bars(ratios: Sequence[tuple[str, float]], limit: float, description: str) -> Html:
-    """Ratios to the null, all above 0, as bars that start from 1, on a logarithmic axis."""
+def ratio_bars(ratios: Sequence[tuple[str, float]], limit: float, description: str) -> Markup:
+    """Ratios to the seed-to-seed variation, all above 0, as bars that start from 1, on a logarithmic axis."""
     names = [_short(name) for name, _ in ratios]
     values = [min(max(value, 1e-3), 1e6) for _, value in ratios]
 
@@ -116,7 +117,7 @@ def ratio_bars(ratios: Sequence[tuple[str, float]], limit: float, description: s
             axes.annotate(times(value), (1.02, row), xycoords=("axes fraction", "data"), va="center")
         axes.axvline(1, color=_INK, linewidth=1)
         axes.axvline(limit, color=_LIMIT, linewidth=1, linestyle="--")
-        _note(axes, 1, "null", "right")
+        _note(axes, 1, "controls", "right")
         _note(axes, limit, "limit", "left")
         axes.set_yticks(rows, names)
         axes.invert_yaxis()
@@ -125,12 +126,12 @@ def ratio_bars(ratios: Sequence[tuple[str, float]], limit: float, description: s
         ticks = [t for t in (0.01, 0.1, 0.5, 1, 2, 5, 10, 20, 50, 100, 1e3, 1e4, 1e5) if low <= t <= high]
         axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
         axes.minorticks_off()
-        axes.set_xlabel("distance from the plain models, in units of the null")
+        axes.set_xlabel("distance from the controls, as a multiple of that between them")
 
     return _figure("ratios", 0.9 + 0.28 * len(values), description, draw)
 
 
-def intervals(rows: Sequence[Interval], limit: float, description: str) -> Html:
+def intervals(rows: Sequence[Interval], limit: float, description: str) -> Markup:
     """AUCs with their intervals, one below the other."""
 
     def draw(axes: Axes) -> None:
@@ -156,14 +157,14 @@ def histogram(
     name: str,
     edges: Sequence[float],
     stego: Sequence[float],
-    plain: Sequence[Sequence[float]],
+    controls: Sequence[Sequence[float]],
     description: str,
-) -> Html:
-    """Shares of the Gaussians in bins: the published model filled, each plain model a line."""
+) -> Markup:
+    """Shares of the Gaussians in bins: the published model filled, each control a line."""
 
     def draw(axes: Axes) -> None:
         axes.stairs(stego, edges, fill=True, color=_STEGO, alpha=0.45, linewidth=0)
-        for shares in plain:
+        for shares in controls:
             axes.stairs(shares, edges, color=_INK, linewidth=0.9, alpha=0.75)
         axes.set_title(_short(name), loc="left", fontsize=9.5)
         axes.set_ylim(bottom=0)
@@ -175,7 +176,7 @@ def histogram(
     return _figure(f"histogram-{name}", 1.75, description, draw, width=3.2)
 
 
-def roc(curves: Sequence[Curve], description: str) -> Html:
+def roc(curves: Sequence[RocCurve], description: str) -> Markup:
     """Receiver operating characteristics: the share of marked renders found, against false alarms."""
 
     def draw(axes: Axes) -> None:
@@ -193,7 +194,7 @@ def roc(curves: Sequence[Curve], description: str) -> Html:
     return _figure("roc", 3.6, description, draw)
 
 
-def losses(name: str, curves: Sequence[Losses], description: str) -> Html:
+def losses(name: str, curves: Sequence[AttackCurve], description: str) -> Markup:
     """What attacks cost the secret (y), against what they cost the cover (x), both in dB.
 
     Where the secret does not open a hollow mark stands above all others; attacks after which it never does
@@ -240,7 +241,7 @@ def _mark_lost(axes: Axes, top: float, lost: float) -> None:
 
 def _figure(
     name: str, height: float, description: str, draw: Callable[[Axes], None], width: float = _WIDTH
-) -> Html:
+) -> Markup:
     with matplotlib.rc_context(), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of glyphs that its font lacks: the browser's has them
         matplotlib.rcdefaults()
@@ -251,10 +252,11 @@ def _figure(
         written = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         figure.savefig(written, format="svg", metadata=nothing)
-    return element("div", _for_a_page(written.getvalue()), class_="plot", role="img", aria_label=description)
+    figure_of = Markup('<div class="plot" role="img" aria-label="{}">{}</div>')
+    return figure_of.format(clean(description), _for_a_page(written.getvalue()))
 
 
-def _for_a_page(svg: str) -> Html:
+def _for_a_page(svg: str) -> Markup:
     """matplotlib's SVG without what belongs to a file, and with colours as variables."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r' (?:width|height)="[\d.]+pt"', "", svg, count=2)
@@ -262,7 +264,7 @@ def _for_a_page(svg: str) -> Html:
     used = set(re.findall(r"#([\w-]+)", svg))
     svg = re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", svg)
     svg = re.sub("#0[1-6]0[1-6]0[1-9]", lambda match: f"var({_VARIABLES[match[0]]})", svg)
-    return Html(svg.strip())
+    return Markup(svg.strip())
 
 
 def _note(axes: Axes, x: float, text: str, side: str) -> None:
@@ -281,4 +283,5 @@ def _note(axes: Axes, x: float, text: str, side: str) -> None:
 
 
 def _short(name: str, longest: int = _LONGEST_NAME) -> str:
+    name = clean(name)
     return name if len(name) <= longest else name[: longest - 1] + "…"

@@ -44,6 +44,11 @@ def integer(value: float | None) -> str:
     return number(value, 0)
 
 
+def numbered(name: str, index: int, count: int) -> str:
+    """A name, with its number if there are several."""
+    return f"{name} {index + 1}" if count > 1 else name
+
+
 def bytes_text(value: float | None) -> str:
     """A size of a file, in powers of 1000."""
     if value is None or not math.isfinite(value):

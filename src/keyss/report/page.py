@@ -1,61 +1,144 @@
-"""The page around the sections: one file that loads nothing and, by its own policy, may not."""
+"""The page: one file that loads nothing and, by its own policy, may not."""
 
 from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
-from collections.abc import Sequence
 from importlib.resources import files
+from pathlib import PurePath
 
-from keyss.report.markup import Html, element, join
-from keyss.report.sections import Section
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from keyss.measure.images import ImageComparison
+from keyss.measure.robustness.survival import mean_over_draws
+from keyss.report import numbers, plots
+from keyss.report.untrusted import AuditPictures, clean, flat
+from keyss.report.verdicts import auc_text, detector_rocs, headline, verdicts
+from keyss.runs.audit_record import Audit, ImagesResult
+
+_STYLES = ("page.css", "pictures.css", "print.css")
+_HOW = "`keyss audit RUN --key-file KEY` measures it"
+_EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and audits after it have it"
 
 
-def page(title: str, facts: Html, sections: Sequence[Section]) -> str:
-    """A whole HTML document."""
+def page(audit: Audit, pictures: AuditPictures) -> str:
+    """A whole HTML document. Raises InputError for pictures and curves that are not as they should be."""
     script = _asset("slider.js")
-    style = "".join(_asset(name) for name in ("page.css", "pictures.css", "print.css"))
-    # Should markup ever slip through the escaping, browsers run no script but this one and fetch nothing.
-    policy = (
-        "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
-        f"script-src 'sha256-{_digest(script)}'; base-uri 'none'; form-action 'none'"
+    lines, notes = verdicts(audit), _not_measured(audit)
+    found = {  # section by section: its title, and whether there is anything in it
+        "verdict": ("Verdict", lines),
+        "pictures": ("Pictures", audit.images and audit.images.pictures),
+        "images": ("Against the test photos", audit.images),
+        "wrong-keys": ("Wrong keys", audit.wrong_key),
+        "leaks": ("Leaks without the key", audit.leaks),
+        "statistics": ("The model's statistics", audit.parameters),
+        "renders": ("Detectors on renders", audit.stegexpose),
+        "robustness": ("What survives", audit.robustness),
+        "speed": ("Speed, files and readers", audit.speed),
+        "not-measured": ("Not measured", notes),
+        "configuration": ("Configuration and versions", audit.run.config or audit.run.versions),
+    }
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            audit=audit,
+            title=_title(audit),
+            sections={name: title for name, (title, content) in found.items() if content},
+            pictures=pictures,
+            lines=lines,
+            headline=headline(lines),
+            notes=notes,
+            comparisons=_comparisons(audit.images) if audit.images else [],
+            detectors=[*detector_rocs(audit, "StegExpose"), *detector_rocs(audit, "sealwatch")],
+            changes=mean_over_draws(audit.robustness.changes) if audit.robustness else [],
+            style=Markup("".join(map(_asset, _STYLES))),
+            script=Markup(script),
+            script_digest=b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        )
     )
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=policy),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("meta", name="referrer", content="no-referrer"),
-        element("title", f"{title} · keyss"),
-        element("style", Html(style)),
-    )
-    links = [element("li", element("a", section.title, href=f"#{section.id}")) for section in sections]
-    body = element(
-        "body",
-        element(
-            "header",
-            element("h1", title),
-            element("p", "This page shows the secret: keep it as you keep the key.", class_="warning"),
-            facts,
-            element("nav", element("ul", *links), aria_label="Sections"),
-        ),
-        element("main", *(_section(section) for section in sections)),
-        element("script", Html(script)),
-    )
-    return f"<!doctype html>\n{element('html', head, body, lang='en')}\n"
 
 
-def _section(section: Section) -> Html:
-    heading = element("h2", section.title, id=f"{section.id}-title")
-    return element(
-        "section", join([heading, section.content]), id=section.id, aria_labelledby=f"{section.id}-title"
+def prose(text: str) -> Markup:
+    """Text in which `backquotes` mark what is typed."""
+    code = Markup("<code>{}</code>")
+    return Markup("").join(
+        code.format(part) if i % 2 else part for i, part in enumerate(clean(text).split("`"))
     )
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("keyss.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_finalized,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    formats = (
+        numbers.bytes_text,
+        numbers.difference,
+        numbers.integer,
+        numbers.number,
+        numbers.numbered,
+        numbers.seconds_text,
+        numbers.significant,
+        numbers.times,
+        auc_text,
+        flat,
+        prose,
+    )
+    environment.filters |= {each.__name__: each for each in formats}
+    environment.globals["plots"] = plots
+    return environment
+
+
+def _finalized(value: object) -> object:
+    """What goes into the page for an expression: texts of others as one printable line."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return clean(value)
+    return "" if value is None else value
+
+
+def _title(audit: Audit) -> str:
+    """What is hidden where."""
+    cover, *secrets = (PurePath(path).name or path for path in (audit.run.cover, *audit.run.secrets))
+    return f"{' and '.join(secrets) or 'A secret'}, hidden in {cover}"
+
+
+def _comparisons(images: ImagesResult) -> list[tuple[str, ImageComparison]]:
+    """The comparisons of an audit with their names, each followed by its baseline."""
+    found = [("cover, published", images.cover), ("cover, plain 3DGS (baseline)", images.cover_baseline)]
+    for index, secret in enumerate(images.secrets):
+        name = numbers.numbered("secret", index, len(images.secrets))
+        found.append((f"{name}, revealed", secret))
+        if index < len(images.secret_baselines):
+            found.append((f"{name}, plain 3DGS (baseline)", images.secret_baselines[index]))
+    return [(name, comparison) for name, comparison in found if comparison is not None]
+
+
+def _not_measured(audit: Audit) -> list[str]:
+    """What an audit could have, and has not."""
+    parts = {
+        "Images against the test photos": audit.images,
+        "Wrong keys": audit.wrong_key,
+        "Leaks without the key": audit.leaks,
+        "Statistics of the model": audit.parameters,
+        "StegExpose": audit.stegexpose,
+        "Robustness": audit.robustness,
+        "Speed, files and readers": audit.speed,
+    }
+    notes = [
+        f"{name}: {_EVALUATE if name == 'Wrong keys' else _HOW}."
+        for name, found in parts.items()
+        if not found
+    ]
+    if audit.stegexpose and audit.stegexpose.sealwatch_missing:
+        notes.append(f"sealwatch: {audit.stegexpose.sealwatch_missing}")
+    return notes
 
 
 def _asset(name: str) -> str:
     return files("keyss.report").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def _digest(script: str) -> str:
-    return b64encode(hashlib.sha256(script.encode()).digest()).decode()

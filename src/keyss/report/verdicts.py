@@ -6,29 +6,30 @@ something of it. *missed*: nothing shows, but the hiding does not do as well as 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from keyss.report.numbers import decibel, difference, integer, number, times
-from keyss.report.reading import Part
-from keyss.report.survival import survivals
+from keyss.measure.images import ImageComparison
+from keyss.measure.leaks.scores import LeakScores
+from keyss.measure.robustness.survival import mean_over_draws
+from keyss.measure.roc import Roc
+from keyss.report.numbers import decibel, difference, number, times
+from keyss.runs.audit_record import Audit, RenderDetection
 
 QUALITY_LOSS = 1.0  # dB that cover or secret may be below plain 3DGS of the same photos
-INVISIBLE = 45.0  # dB from which on nobody sees a difference: models that are their own bound have 120
-DISTANCE_RATIO = 1.5  # of a distance from a plain model, to the one between two plain models
+INVISIBLE = 45.0  # dB from which on nobody sees a difference: models that are their own baseline have 120
+DISTANCE_RATIO = 1.5  # of a distance from a control, to the one between two controls
 TWO_SAMPLE_AUC = 0.6  # of a classifier that tells the Gaussians of two models apart
 AS_THE_PLAIN_MODEL = 0.01  # more than that of the cover's own plain model an AUC may be
 IMAGE_AUC = 0.1  # distance from 0.5 of a detector's AUC on renders
-LEAK_PSNR = 1.0  # dB nearer to the secret's photos than an innocent model comes
+LEAK_PSNR = 1.0  # dB nearer to the secret's photos than a control comes
 LEAK_SSIM = 0.05
-LEAK_GRADIENT = 0.1  # correlation of coarse gradients with the photos', above an innocent model's
+LEAK_GRADIENT = 0.1  # correlation of coarse gradients with the photos', above a control's
 PRUNING, PRUNED = "random pruning", 0.25  # the share of the Gaussians that is removed ...
 PRUNING_LOSS = 1.5  # ... and the dB that it may cost the secret more than the cover
 
-PROGRAMS = {"stegexpose": "StegExpose", "sealwatch": "sealwatch"}
-_SEALWATCH = ("spa", "ws", "spam")  # each with a ROC of its own
-
+Program = Literal["StegExpose", "sealwatch"]
 Word = Literal["fine", "visible", "missed"]
 
 
@@ -38,28 +39,42 @@ class Verdict:
 
     measure: str
     value: str
-    beside: str  # the bound or the null that the value means something beside
+    beside: str  # the baseline or the control that the value means something beside
     limit: str
     word: Word
     section: str  # where more of it is
 
 
-def verdicts(audit: Part) -> list[Verdict]:
-    """The lines of what the audit measured, most important first. Raises InputError."""
-    lines = (
-        _cover(audit),
-        *_secrets(audit),
-        _wrong_keys(audit),
-        _leaks(audit),
-        _shapes(audit),
-        _distances(audit),
-        _two_sample(audit),
-        _detectors(audit, "stegexpose"),
-        _detectors(audit, "sealwatch"),
-        _pruning(audit),
-        _readers(audit),
-    )
-    return [line for line in lines if line is not None]
+@dataclass(frozen=True)
+class DetectorRocs:
+    """One detector on renders: of the published model, and of two controls."""
+
+    name: str
+    published: Roc
+    control: Roc | None
+
+    def excess(self) -> float:
+        """How much further from guessing it is than between controls."""
+        return abs(self.published.auc - 0.5) - (abs(self.control.auc - 0.5) if self.control else 0.0)
+
+    def is_suspicious(self) -> bool:
+        undecided = self.published.low <= 0.5 <= self.published.high
+        return self.excess() > IMAGE_AUC and not undecided
+
+
+def verdicts(audit: Audit) -> list[Verdict]:
+    """The lines of what the audit measured, most important first."""
+    return [
+        *_qualities(audit),
+        *_wrong_keys(audit),
+        *_leaks(audit),
+        *_distances(audit),
+        *_two_sample(audit),
+        *_detectors(audit, "StegExpose"),
+        *_detectors(audit, "sealwatch"),
+        *_pruning(audit),
+        *_readers(audit),
+    ]
 
 
 def headline(lines: Sequence[Verdict]) -> str:
@@ -81,39 +96,50 @@ def headline(lines: Sequence[Verdict]) -> str:
     return " ".join(parts)
 
 
-def auc_text(part: Part) -> str:
+def auc_text(roc: Roc | None) -> str:
     """An AUC with its interval: 0.54 (0.43 to 0.65)."""
-    low, high = part.number("low"), part.number("high")
-    interval = "" if low is None or high is None else f" ({number(low, 2)} to {number(high, 2)})"
-    return number(part.number("auc"), 2) + interval
+    if roc is None:
+        return number(None)
+    return f"{number(roc.auc, 2)} ({number(roc.low, 2)} to {number(roc.high, 2)})"
 
 
-def rocs(audit: Part, key: str, which: Literal["", "_null"] = "") -> list[tuple[str, Part]]:
-    """The ROCs that a program's detectors have in an audit, with their names; null: between plain models."""
-    program, name = audit.part(key + which), PROGRAMS[key]
-    found = [(name, program.part("roc"))]
-    found += [(f"{name} {each.upper()}", program.part(each).part("roc")) for each in _SEALWATCH]
-    return [(name, roc) for name, roc in found if roc]
+def detector_rocs(audit: Audit, program: Program) -> list[DetectorRocs]:
+    """What a program's detectors find on renders."""
+    if audit.stegexpose is None:
+        return []
+    control = _rocs(audit.stegexpose.control, program)
+    published = _rocs(audit.stegexpose.published, program)
+    return [DetectorRocs(name, found, control.get(name)) for name, found in published.items()]
 
 
-def _cover(audit: Part) -> Verdict | None:
-    images = audit.part("images")
-    return _quality("cover on test photos", images.part("cover"), images.part("cover_bound"), "visible")
+def _rocs(found: RenderDetection, program: Program) -> dict[str, Roc]:
+    if program == "StegExpose":
+        return {program: found.stegexpose.roc}
+    if found.sealwatch is None:
+        return {}
+    detectors = {"SPA": found.sealwatch.spa, "WS": found.sealwatch.ws, "SPAM": found.sealwatch.spam}
+    return {f"{program} {name}": each.roc for name, each in detectors.items() if each is not None}
 
 
-def _secrets(audit: Part) -> Iterable[Verdict | None]:
-    images = audit.part("images")
-    secrets, bounds = images.parts("secrets"), images.parts("secret_bounds")
-    for index, (secret, bound) in enumerate(zip(secrets, bounds, strict=False), start=1):
-        name = f"secret {index}" if len(secrets) > 1 else "secret"
-        yield _quality(f"{name} on test photos", secret, bound, "missed")
+def _qualities(audit: Audit) -> Iterator[Verdict]:
+    if audit.images is None:
+        return
+    images = audit.images
+    yield from _quality("cover on test photos", images.cover, images.cover_baseline, "visible")
+    for index, (secret, baseline) in enumerate(
+        zip(images.secrets, images.secret_baselines, strict=False), start=1
+    ):
+        name = f"secret {index}" if len(images.secrets) > 1 else "secret"
+        yield from _quality(f"{name} on test photos", secret, baseline, "missed")
 
 
-def _quality(measure: str, found: Part, bound: Part, otherwise: Word) -> Verdict | None:
-    got, limit = found.part("mean").number("psnr"), bound.part("mean").number("psnr")
-    if got is None or limit is None:
-        return None
-    return Verdict(
+def _quality(
+    measure: str, found: ImageComparison, baseline: ImageComparison | None, otherwise: Word
+) -> Iterator[Verdict]:
+    if baseline is None:
+        return
+    got, limit = found.mean.psnr, baseline.mean.psnr
+    yield Verdict(
         measure,
         decibel(got),
         f"{decibel(limit)}, plain 3DGS",
@@ -123,50 +149,46 @@ def _quality(measure: str, found: Part, bound: Part, otherwise: Word) -> Verdict
     )
 
 
-def _wrong_keys(audit: Part) -> Verdict | None:
-    wrong = audit.part("wrong_key")
-    pairs = [
-        (shown, floor)
-        for each, floor in zip(wrong.parts("vs_secrets"), wrong.numbers("floor"), strict=False)
-        if (shown := each.number("max")) is not None
-    ]
-    if not pairs:
-        return None
-    shown, floor = max(pairs, key=lambda pair: pair[0] - pair[1])
-    return Verdict(
+def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
+    if audit.wrong_key is None or not audit.wrong_key.chance_level:
+        return
+    wrong = audit.wrong_key
+    pairs = zip(wrong.shown.vs_secrets, wrong.chance_level, strict=False)
+    shown, chance = max(((each.max, chance) for each, chance in pairs), key=lambda pair: pair[0] - pair[1])
+    yield Verdict(
         "wrong keys",
-        f"{decibel(shown)}, best of {integer(wrong.number('keys'))}",
-        f"{decibel(floor)}, published model",
+        f"{decibel(shown)}, best of {wrong.shown.keys:,}",
+        f"{decibel(chance)}, published model",
         f"at most {decibel(LEAK_PSNR, 1)} more",
-        "fine" if shown - floor <= LEAK_PSNR else "visible",
+        "fine" if shown - chance <= LEAK_PSNR else "visible",
         "wrong-keys",
     )
 
 
-def _leaks(audit: Part) -> Verdict | None:
-    psnr, ssim = _largest_leak(audit, "psnr"), _largest_leak(audit, "ssim")
-    if psnr is None or ssim is None:
-        return None
-    return Verdict(
+def _leaks(audit: Audit) -> Iterator[Verdict]:
+    secrets = audit.leaks.secrets if audit.leaks else ()
+    leaks = [attack.leak for attacks in secrets for attack in attacks if not attack.with_key]
+    if not leaks:
+        return
+    worst = LeakScores.combined(max, leaks)
+    yield Verdict(
         "leaks without the key",
-        f"{difference(psnr)} dB, {difference(ssim, 3)} SSIM",
+        f"{difference(worst.psnr)} dB, {difference(worst.ssim, 3)} SSIM",
         "0, plain model",
         f"at most {decibel(LEAK_PSNR, 1)} and {LEAK_SSIM} SSIM",
-        "fine" if psnr <= LEAK_PSNR and ssim <= LEAK_SSIM else "visible",
+        "fine" if worst.psnr <= LEAK_PSNR and worst.ssim <= LEAK_SSIM else "visible",
         "leaks",
     )
-
-
-def _shapes(audit: Part) -> Verdict | None:
-    """Fog is nearer to most photos than darkness is. What is left when colours are fitted is the secret."""
-    psnr, ssim = _largest_leak(audit, "psnr_fitted"), _largest_leak(audit, "ssim_fitted")
-    gradient = _largest_leak(audit, "gradient_coarse")
-    if psnr is None or ssim is None or gradient is None:
-        return None
-    within = psnr <= LEAK_PSNR and ssim <= LEAK_SSIM and gradient <= LEAK_GRADIENT
-    return Verdict(
+    # Haze is nearer to most photos than darkness is. What is left when colours are fitted is the secret.
+    within = (
+        worst.psnr_fitted <= LEAK_PSNR
+        and worst.ssim_fitted <= LEAK_SSIM
+        and worst.gradient_coarse <= LEAK_GRADIENT
+    )
+    yield Verdict(
         "the secret's shapes in them",
-        f"{difference(psnr)} dB, {difference(ssim, 3)} SSIM, {difference(gradient)} gradients",
+        f"{difference(worst.psnr_fitted)} dB, {difference(worst.ssim_fitted, 3)} SSIM, "
+        f"{difference(worst.gradient_coarse)} gradients",
         "0, plain model; colours fitted",
         f"at most {decibel(LEAK_PSNR, 1)}, {LEAK_SSIM} and {LEAK_GRADIENT}",
         "fine" if within else "visible",
@@ -174,24 +196,16 @@ def _shapes(audit: Part) -> Verdict | None:
     )
 
 
-def _largest_leak(audit: Part, score: str) -> float | None:
-    attacks = [attack for attacks in audit.lists("leaks", 500) for attack in attacks]
-    leaks = [attack.part("leak") for attack in attacks if not attack.flag("control")]
-    return _largest(leaks, lambda leak: leak.number(score))
-
-
-def _distances(audit: Part) -> Verdict | None:
-    attributes = audit.part("distances").named("attributes", 100)
-    ratios = {n: ratio for n, part in attributes.items() if (ratio := part.number("ratio")) is not None}
+def _distances(audit: Audit) -> Iterator[Verdict]:
+    attributes = audit.parameters.distances if audit.parameters else {}
+    ratios = {name: each.ratio for name, each in attributes.items() if each.ratio is not None}
     if not ratios:
-        return None
-    plain = {
-        n: part.number("ratio") or 0.0 for n, part in audit.part("distances").named("original", 100).items()
-    }
+        return
+    plain = {name: each.original for name, each in attributes.items() if each.original is not None}
     worst = max(ratios, key=lambda name: ratios[name] / max(plain.get(name, 0.0), DISTANCE_RATIO))
     own = f"; the cover's plain model {times(plain[worst])}" if worst in plain else ""
     within = ratios[worst] <= max(DISTANCE_RATIO, 1.01 * plain.get(worst, 0.0))
-    return Verdict(
+    yield Verdict(
         "attributes of the Gaussians",
         f"{worst} {times(ratios[worst])}",
         f"1×, between plain models{own}",
@@ -201,17 +215,17 @@ def _distances(audit: Part) -> Verdict | None:
     )
 
 
-def _two_sample(audit: Part) -> Verdict | None:
-    part = audit.part("two_sample")
-    stego = _largest(part.parts("stego", 1000), lambda each: each.number("auc"))
-    null = _largest(part.parts("null", 1000), lambda each: each.number("auc"))
-    if stego is None:
-        return None
-    own = _largest(part.parts("original", 1000), lambda each: each.number("auc"))
-    beside = [] if null is None else [f"{number(null, 2)}, between plain models"]
+def _two_sample(audit: Audit) -> Iterator[Verdict]:
+    found = audit.parameters.two_sample if audit.parameters else None
+    if found is None or not found.stego:
+        return
+    stego = max(each.auc for each in found.stego)
+    control = max((each.auc for each in found.control), default=None)
+    own = max((each.auc for each in found.original), default=None)
+    beside = [] if control is None else [f"{number(control, 2)}, between plain models"]
     beside += [] if own is None else [f"the cover's plain model {number(own, 2)}"]
     within = stego <= max(TWO_SAMPLE_AUC, 0.0 if own is None else own + AS_THE_PLAIN_MODEL)
-    return Verdict(
+    yield Verdict(
         "classifier between models",
         f"AUC {number(stego, 2)}",
         "; ".join(beside),
@@ -221,72 +235,48 @@ def _two_sample(audit: Part) -> Verdict | None:
     )
 
 
-def _detectors(audit: Part, key: str) -> Verdict | None:
-    """One line for all detectors of a program: the one that finds most beyond its null."""
-    nulls = dict(rocs(audit, key, "_null"))
-    curves = [(name, roc, nulls.get(name)) for name, roc in rocs(audit, key) if roc.number("auc") is not None]
-    if not curves:
-        return None
-    name, roc, null = max(curves, key=lambda curve: _suspicion(*curve[1:]))
-    return Verdict(
-        f"{PROGRAMS[key]} on renders",
-        f"AUC {auc_text(roc)}" + (f", {name}" if len(curves) > 1 else ""),
-        "0.5, guessing" if null is None else f"{auc_text(null)}, between plain models",
+def _detectors(audit: Audit, program: Program) -> Iterator[Verdict]:
+    """One line for all detectors of a program: the one that finds most beyond what it does in controls."""
+    found = detector_rocs(audit, program)
+    if not found:
+        return
+    worst = max(found, key=lambda each: (each.is_suspicious(), each.excess()))
+    yield Verdict(
+        f"{program} on renders",
+        f"AUC {auc_text(worst.published)}" + (f", {worst.name}" if len(found) > 1 else ""),
+        f"{auc_text(worst.control)}, between plain models" if worst.control else "0.5, guessing",
         f"{IMAGE_AUC} further from 0.5, or within interval",
-        "visible" if _suspicion(roc, null)[0] else "fine",
+        "visible" if worst.is_suspicious() else "fine",
         "renders",
     )
 
 
-def _suspicion(roc: Part, null: Part | None) -> tuple[bool, float]:
-    """Whether an AUC is too much further from guessing than that between plain models, and by how much."""
-    auc, low, high = roc.number("auc") or 0.0, roc.number("low"), roc.number("high")
-    plain = 0.5 if null is None else null.number("auc")
-    beyond = abs(auc - 0.5) - (0.0 if plain is None else abs(plain - 0.5))
-    undecided = low is not None and high is not None and low <= 0.5 <= high
-    return beyond > IMAGE_AUC and not undecided, beyond
-
-
-def _pruning(audit: Part) -> Verdict | None:
-    found = (each for each in survivals(audit) if (each.attack, each.strength) == (PRUNING, PRUNED))
-    pruned = next(found, None)
-    if pruned is None or pruned.cover.loss is None or not pruned.secrets:
-        return None
-    opens = all(secret.opens for secret in pruned.secrets)
-    worst = max((secret.loss for secret in pruned.secrets if secret.loss is not None), default=None)
-    if opens and worst is None:
-        return None
-    within = opens and worst is not None and worst - pruned.cover.loss <= PRUNING_LOSS
-    return Verdict(
+def _pruning(audit: Audit) -> Iterator[Verdict]:
+    changes = mean_over_draws(audit.robustness.changes) if audit.robustness else []
+    pruned = next((each for each in changes if (each.attack, each.strength) == (PRUNING, PRUNED)), None)
+    if pruned is None or pruned.cover is None or not pruned.secrets:
+        return
+    opens, worst = all(each.opens for each in pruned.secrets), max(each.loss for each in pruned.secrets)
+    within = opens and worst - pruned.cover.loss <= PRUNING_LOSS
+    yield Verdict(
         f"loss of a random {PRUNED:.0%} of the Gaussians",
-        f"secret {_change(worst)}" if opens else "the secret does not open",
-        f"cover {_change(pruned.cover.loss)}",
+        f"secret {difference(-worst)} dB" if opens else "the secret does not open",
+        f"cover {difference(-pruned.cover.loss)} dB",
         f"at most {decibel(PRUNING_LOSS, 1)} more",
         "fine" if within else "missed",
         "robustness",
     )
 
 
-def _change(loss: float | None) -> str:
-    return f"{difference(None if loss is None else -loss)} dB"
-
-
-def _readers(audit: Part) -> Verdict | None:
-    readers = [
-        reader for reader in audit.part("speed").parts("readers", 500) if reader.flag("loads") is not None
-    ]
-    if not readers:
-        return None
-    loads = sum(reader.flag("loads") is True for reader in readers)
-    return Verdict(
+def _readers(audit: Audit) -> Iterator[Verdict]:
+    loads = [each.loads for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
+    if not loads:
+        return
+    yield Verdict(
         "other readers of the file",
-        f"{loads} of {len(readers)}",
+        f"{sum(loads)} of {len(loads)}",
         "",
         "all",
-        "fine" if loads == len(readers) else "missed",
+        "fine" if all(loads) else "missed",
         "speed",
     )
-
-
-def _largest(parts: Iterable[Part], read: Callable[[Part], float | None]) -> float | None:
-    return max((value for part in parts if (value := read(part)) is not None), default=None)

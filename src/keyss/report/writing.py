@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
 from keyss.report.page import page
-from keyss.report.reading import Pictures, read_audit
-from keyss.report.sections import facts, sections, title
+from keyss.report.untrusted import AuditPictures, check_bounds
+from keyss.runs.audit_record import read_audit
 
 REPORT = "report.html"
 
@@ -21,6 +22,9 @@ def write_report(run_folder: Path | str) -> Path:
     """
     run = Path(run_folder)
     audit = read_audit(run)
-    html = page(title(audit), facts(audit), sections(audit, Pictures(run)))
-    write_bytes(run / REPORT, html.encode())
+    try:
+        check_bounds(audit)
+    except RecursionError as error:
+        raise InputError(f"{run}: the audit's configuration is nested too deeply") from error
+    write_bytes(run / REPORT, page(audit, AuditPictures(run)).encode())
     return run / REPORT

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from keyss._version import __version__
-from keyss.fitting.image_metrics import Quality
+from keyss.fitting.image_metrics import ImageQuality
 from keyss.measure.hiding import HidingQuality
 
 
@@ -28,7 +28,7 @@ class HideMetrics(HidingQuality):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitMetrics(Quality):
+class FitMetrics(ImageQuality):
     """A plain model on the test photos."""
 
     version: int = 1

@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from keyss.methods.learned.config import PRESETS, HideConfig
 
 from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.fitting.loop import Interrupted, Silent
+from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.keys import random_embeddings
 from keyss.methods.learned.joint import JointRun, combine_densification
 from keyss.methods.learned.options import PRESETS, LearnedOptions
@@ -151,7 +152,7 @@ def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: 
     reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1], force=True)
 
 
-class _InterruptAt(Silent):
+class _InterruptAt(SilentReporter):
     """Presses Ctrl-C at one iteration of one stage."""
 
     def __init__(self, stage: str, iteration: int) -> None:
@@ -171,7 +172,7 @@ def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, 
     scenes = _scenes()[0][:2]
     config = replace(base, fit=replace(CONFIG.fit, iterations=40, grow_every=5))
 
-    def run(resume: bool, reporter: Silent | None = None) -> Hidden:
+    def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
         return hide_scenes(
             scenes, KEYS[:1], config, sidecar=True, checkpoints=tmp_path, resume=resume, reporter=reporter
         )

@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, get_args
+from typing import get_args
 
 import torch
+from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.keys import random_embeddings
 from keyss.measure.leaks.attributes import Attribute, Side, clusters, outliers
 from keyss.measure.leaks.opacities import (
-    by_the_source,
     faint,
     inverted,
     least_contributing,
     matched,
     opaque,
-    outside_the_bands,
     rescaled,
 )
 from keyss.measure.white_box import search_embeddings
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import decode
 from keyss.rendering.contributions import contributions
 
 THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing
 DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
-BANDS = 3  # secrets that somebody tries who reads the source
-SEARCH_SAMPLE = 1000  # Gaussians that embeddings are searched on; more find no other
 
 Shown = Iterator[tuple[str, Gaussians]]
+Decode = Callable[[Gaussians, Tensor], Gaussians]
+Parameter = str | int | float | list[float]
 
 
 @dataclass(frozen=True)
@@ -44,9 +41,9 @@ class Attack:
 
     name: str
     sentence: str
-    parameters: dict[str, Any]  # JSON-able
+    parameters: dict[str, Parameter]
     show: Callable[[Gaussians], Shown]  # labels and what is rendered, as many as somebody would try
-    control: bool = False  # no attack: shows what there is to find
+    with_key: bool = False  # no attack: shows what there is to find
 
 
 def file_attacks(cover_cameras: Sequence[Camera], seed: int = 0) -> list[Attack]:
@@ -89,57 +86,56 @@ def file_attacks(cover_cameras: Sequence[Camera], seed: int = 0) -> list[Attack]
             {"clusters": list(CLUSTERS), "seed": seed},
             lambda model: _clusters(model, seed),
         ),
-        Attack(
-            "by the source",
-            "Opacities by the curve that this program's source tells, and what lies in none of its bands.",
-            {"bands": BANDS},
-            _by_the_source,
-        ),
     ]
 
 
-def decoder_attacks(
-    secret: HiddenSecret, *, restarts: int = 2, steps: int = 150, seed: int = 0
-) -> list[Attack]:
-    """What somebody sees who got a secret's decoder and all that is sealed with it, and the key's own view.
+def source_attack(views: Callable[[Gaussians], Mapping[str, Gaussians]]) -> Attack:
+    """The attack of somebody who read the source of the methods: `keyss.methods.base.Method.attacks`.
 
-    A decoder with a gate gives the search no gradient: all that it shows is what random embeddings show. But
-    a gate can be read, so for who holds such a decoder the control is an attack.
+    `views` gives the same names for every model.
+    """
+    return Attack(
+        "by the source",
+        "What this program's source tells somebody to try.",
+        {},
+        lambda model: iter(views(model).items()),
+    )
+
+
+def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed: int = 0) -> Attack:
+    """What somebody sees who got a secret's decoder and all that is encrypted with it, but not the key.
+
+    `decode`: see `keyss.methods.base.Opened`. Where embeddings get no gradient, the search shows no more than
+    random embeddings do.
     """
 
     def search(model: Gaussians) -> Shown:
-        decoder = secret.decoder.to(model.device)
         found = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
             found[name] = search_embeddings(
-                decoder,
-                model,
-                restarts=restarts,
-                steps=steps,
-                sample=SEARCH_SAMPLE,
-                balance=balance,
-                seed=seed,
+                decode, model, restarts=restarts, steps=steps, balance=balance, seed=seed
             )
         for name, embeddings in found.items():
             for index, embedding in enumerate(embeddings, start=1):
-                yield f"{name}, {index}", decode(model, secret, embedding)
+                yield f"{name}, {index}", decode(model, embedding)
 
-    conditioning = secret.decoder.shape.conditioning
-    return [
-        Attack(
-            "decoder without its key",
-            "Random embeddings, and those under which the decoder changes most, searched by gradient.",
-            {"conditioning": conditioning, "restarts": restarts, "steps": steps, "seed": seed},
-            search,
-        ),
-        Attack(
-            "with the key",
-            "The control: what there is to find.",
-            {"conditioning": conditioning},
-            lambda model: iter([("the key's embedding", decode(model, secret, secret.embedding))]),
-            control=True,
-        ),
-    ]
+    return Attack(
+        "decoder without its key",
+        "Random embeddings, and those under which the decoder changes most, searched by gradient.",
+        {"restarts": restarts, "steps": steps, "seed": seed},
+        search,
+    )
+
+
+def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
+    """What there is to find: the secret in the cover's frame, as its key reveals it in a model."""
+    return Attack(
+        "with the key",
+        "No attack: what there is to find.",
+        {},
+        lambda model: iter([("revealed", reveal(model))]),
+        with_key=True,
+    )
 
 
 def _restored(model: Gaussians) -> Shown:
@@ -177,12 +173,6 @@ def _clusters(model: Gaussians, seed: int) -> Shown:
     for count in CLUSTERS:
         for index, part in enumerate(clusters(model, count, seed), start=1):
             yield f"{index} of {count}", part
-
-
-def _by_the_source(model: Gaussians) -> Shown:
-    for secret in range(BANDS):
-        yield f"secret {secret + 1}", by_the_source(model, secret)
-    yield "outside the bands", opaque(outside_the_bands(model, BANDS))
 
 
 def _below(threshold: float) -> str:

@@ -1,7 +1,7 @@
 """What somebody sees who turns up the opacities of a model's faint Gaussians and leaves out the others.
 
-A learned secret's Gaussians are transparent in the cover; figures 2 and 6 of the paper show this attack on
-other methods. Functions take a model and give what the attacker renders, and change nothing in place.
+Transparent Gaussians may be those of a secret; figures 2 and 6 of the KeySS paper show this attack. Functions
+take a model and give what the attacker renders, and change nothing in place.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.start import DRAWN_LOGIT, opacity_curve
 
 OPAQUE = 0.99  # as much as one Gaussian covers in 3DGS
 _BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, so that no outlier sets the scale
@@ -63,25 +61,3 @@ def inverted(model: Gaussians) -> Gaussians:
 def least_contributing(model: Gaussians, weights: Tensor, share: float) -> Gaussians:
     """The `share` of the Gaussians that add least to what is seen: `weights` [N] of `contributions`."""
     return model[weights.argsort(stable=True)[: round(share * len(model))]]
-
-
-def by_the_source(model: Gaussians, secret: int) -> Gaussians:
-    """With the opacities that this program's source tells of a warm start's secret (0, 1, ...)."""
-    decoder = Decoder(DecoderShape()).to(model.device)
-    decoder.prepare(model, torch.ones_like(decoder.key))
-    decoder.set_curve(*opacity_curve(secret))
-    shown: Gaussians = decoder(model, decoder.key)
-    return shown
-
-
-def outside_the_bands(model: Gaussians, secrets: int) -> Gaussians:
-    """The Gaussians alone that are never drawn but lie in no band of the first so many secrets.
-
-    A Gaussian of a secret that left its band while training would be one of them.
-    """
-    logits = model.opacity_logits
-    stray = logits < DRAWN_LOGIT
-    for secret in range(secrets):
-        knots, _ = opacity_curve(secret)
-        stray = stray & ~((logits > knots[1]) & (logits < knots[4]))
-    return model[stray]

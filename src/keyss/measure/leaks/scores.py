@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass
+from statistics import fmean
 
 import torch
 import torch.nn.functional as F
@@ -14,8 +16,31 @@ from keyss.fitting.image_metrics import psnr
 from keyss.fitting.losses import Target, ssim
 from keyss.rendering import render
 
-SCORES = ("psnr", "ssim", "gradient", "gradient_coarse", "psnr_fitted", "ssim_fitted")
-COARSE = 64  # pixels of the longer side, at which ghosts that are slightly out of place still count
+COARSE = 64  # pixels of the longer side, at which shapes that are slightly out of place still count
+
+
+@dataclass(frozen=True)
+class LeakScores:
+    """How well pictures show photos: means over views, or differences of such.
+
+    Without the fit of colours any light cloud is nearer to a photo than black: plain PSNR and SSIM tell that
+    something is seen, not that it is the secret.
+    """
+
+    psnr: float  # dB
+    ssim: float  # as in 3DGS
+    gradient: float  # `gradient_correlation`
+    gradient_coarse: float  # the same of `coarse` images
+    psnr_fitted: float  # after `fit_colours`, dB
+    ssim_fitted: float
+
+    @staticmethod
+    def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
+        """Each score by a function of that of all rows."""
+        return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
+
+    def __sub__(self, other: LeakScores) -> LeakScores:
+        return LeakScores(*(a - b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
 def gradient_correlation(image: Tensor, reference: Tensor) -> float:
@@ -50,20 +75,15 @@ def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> dict[str, float]:
-    """How well a model shows the views' photos: means over the views of SCORES.
-
-    PSNR in dB, SSIM as in 3DGS; `gradient_correlation`, of whole and of `coarse` images; and the first two
-    after `fit_colours`. Without the fit any light cloud is nearer to a photo than black: plain PSNR and SSIM
-    tell that something is seen, not that it is the secret.
-    """
+def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> LeakScores:
+    """How well a model shows the views' photos."""
     rows = []
     for view in views:
         photo = view.image.to(model.device).float() / 255
         image = render(model, view.camera, background).clamp(0, 1)
         fitted, target = fit_colours(image, photo).clamp(0, 1), Target.of(photo)
         rows.append(
-            (
+            LeakScores(
                 psnr(image, photo),
                 float(ssim(image, target)),
                 gradient_correlation(image, photo),
@@ -72,9 +92,7 @@ def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> dict[
                 float(ssim(fitted, target)),
             )
         )
-    return {
-        name: sum(column) / len(rows) for name, column in zip(SCORES, zip(*rows, strict=True), strict=True)
-    }
+    return LeakScores.combined(fmean, rows)
 
 
 def _gradients(image: Tensor) -> Tensor:

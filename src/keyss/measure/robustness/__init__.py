@@ -2,7 +2,25 @@
 
 from keyss.measure.robustness.changes import Change
 from keyss.measure.robustness.conversions import converters
-from keyss.measure.robustness.reopening import Opened, Reopener
-from keyss.measure.robustness.survival import default_changes, robustness, verdicts
+from keyss.measure.robustness.reopening import Reopened, Reopener
+from keyss.measure.robustness.survival import (
+    BreakdownPoint,
+    ChangeResult,
+    breakdown_points,
+    default_changes,
+    mean_over_draws,
+    robustness,
+)
 
-__all__ = ["Change", "Opened", "Reopener", "converters", "default_changes", "robustness", "verdicts"]
+__all__ = [
+    "BreakdownPoint",
+    "Change",
+    "ChangeResult",
+    "Reopened",
+    "Reopener",
+    "breakdown_points",
+    "converters",
+    "default_changes",
+    "mean_over_draws",
+    "robustness",
+]

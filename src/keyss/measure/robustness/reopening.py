@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.methods.registry import open_model
+from keyss.methods.base import Opened
 
 
 @dataclass(frozen=True)
-class Opened:
+class Reopened:
     """A secret as it was revealed."""
 
     gaussians: Gaussians  # in the secret's own frame
@@ -20,7 +20,7 @@ class Opened:
 
 
 # Raises a KeyssError when the secret cannot be opened.
-Reopen = Callable[[Gaussians], Opened]
+Reopen = Callable[[Gaussians], Reopened]
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class Reopener:
     """`reopener(stego)` is what `keyss reveal` gives, with `--force` where the model asks for it."""
 
     key: str = field(repr=False)
-    sidecar: bytes | None = field(default=None, repr=False)
+    open: Callable[[Gaussians, str], Opened] = field(repr=False)  # stego model on the CPU, key
 
-    def __call__(self, stego: Gaussians) -> Opened:
-        """Raises WrongKeyError and InputError as `open_model` and `open_secret` do."""
+    def __call__(self, stego: Gaussians) -> Reopened:
+        """Raises WrongKeyError and InputError as `open` does."""
         stego = stego.to("cpu")
-        secret = open_model(stego, self.key, sidecar=self.sidecar)
+        secret = self.open(stego, self.key)
         try:
             revealed = secret.reveal(stego)
         except InputError:  # positions changed, so that it seems to be another model
             revealed = secret.reveal(stego, force=True)
-        return Opened(revealed, secret.frame or Similarity.identity())
+        return Reopened(revealed, secret.frame or Similarity.identity())

@@ -1,11 +1,11 @@
-"""What changes of a published model cost its cover and its secrets, and which of them dies first."""
+"""What changes of a published model cost its cover and its secrets, and which of them breaks down first."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
-from statistics import mean
-from typing import Any
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+from typing import Literal, TypeVar
 
 from keyss.core.errors import BackendError, KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
@@ -21,8 +21,68 @@ from keyss.measure.robustness.retraining import fine_tuning, purification
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
 DRAWS = 3  # of what is removed at random: which Gaussians they are makes a difference of a dB or two
-DEAD = 6.0  # dB: four times the squared error
+BROKEN_LOSS = 6.0  # dB: four times the squared error
 UNCHANGED = "none"
+
+First = Literal["cover", "secret", "both", "neither"]
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class ChangedQuality:
+    """A scene against its test photos after a change."""
+
+    psnr: float  # dB
+    ssim: float
+    loss: float  # dB of PSNR less than in the unchanged model
+    opens: bool = True  # always so for the cover
+    error: str | None = None  # why a secret does not open
+
+
+@dataclass(frozen=True)
+class ChangeResult:
+    """What a change of the published model costs.
+
+    Where a secret does not open, its quality is what a person has without it: the changed model itself, as
+    seen from the secret's cameras.
+    """
+
+    attack: str  # changes of one attack differ in strength only
+    strength: float
+    unit: str
+    sentence: str
+    seed: int | None
+    skipped: str | None = None  # which tool is missing; then nothing below is known
+    gaussians: int | None = None
+    cover: ChangedQuality | None = None
+    secrets: tuple[ChangedQuality, ...] = ()
+    draws: int = 1
+
+
+@dataclass(frozen=True)
+class StrengthLosses:
+    """Losses in dB at one strength of an attack."""
+
+    strength: float
+    cover: float
+    secret: float  # of several secrets the one that loses most
+
+
+@dataclass(frozen=True)
+class BreakdownPoint:
+    """From which strength of an attack on the cover and the secret are broken; None: at no strength tried.
+
+    A scene is broken that has lost 6 dB or more, and a secret also if it did not open.
+    """
+
+    attack: str
+    unit: str
+    losses: tuple[StrengthLosses, ...]  # means over draws, in the order of the attack's strengths
+    secret: float | None
+    cover: float | None
+    first: First  # which is broken at the first strength at which any is
+    excess: float | None  # dB: the most that the secret loses more than the cover while that is not broken
 
 
 def default_changes(
@@ -55,17 +115,13 @@ def robustness(
     views: int = 8,
     seed: int = 0,
     progress: Callable[[int, int, str], None] | None = None,
-) -> list[dict[str, Any]]:
-    """PSNR and SSIM of cover and secrets against test photos after each of the `changes`, and the losses.
+) -> list[ChangeResult]:
+    """Qualities of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
-    The first row is the unchanged model, from which losses are counted (dB of PSNR). In each row "secrets"
-    has for each secret whether it still "opens", and if not, the "error"; then its quality is the floor, what
-    a person has without it: the changed model itself, as seen from the secret's cameras. A row whose tool is
-    missing says so in "skipped" and has no qualities. `changes`: `default_changes` by default, about 50.
-    `views`: at most so many test views of each scene. `progress`: called with rows done, rows in all, and the
-    next row's name. Drawn on the device of `stego`. JSON-able; the same seed gives the same numbers.
-    Raises UsageError unless each secret can be reopened, and the KeyssError of one that does not open in the
-    unchanged model.
+    `changes`: `default_changes` by default, about 50. `views`: at most so many test views of each scene.
+    `progress`: called with changes done, changes in all, and the next one's name. Drawn on the device of
+    `stego`. The same seed gives the same numbers. Raises UsageError unless each secret can be reopened, and
+    the KeyssError of one that does not open in the unchanged model.
     """
     if len(reopen) != len(secrets):
         raise UsageError(
@@ -74,98 +130,109 @@ def robustness(
     changes = default_changes(cover, seed=seed) if changes is None else changes
     same = Change(UNCHANGED, 0, "", "Nothing is changed.", lambda model: model)
     frames = [each(stego).frame for each in reopen]
-    rows: list[dict[str, Any]] = []
+    results: list[ChangeResult] = []
+    before: list[float] | None = None
     for number, each in enumerate([same, *changes]):
         if progress is not None:
             progress(number, len(changes) + 1, f"{each.attack} {each.strength:g} {each.unit}".strip())
-        row: dict[str, Any] = {
-            "attack": each.attack,
-            "strength": each.strength,
-            "unit": each.unit,
-            "sentence": each.sentence,
-            "seed": each.seed,
-        }
-        rows.append(row)
+        result = ChangeResult(each.attack, each.strength, each.unit, each.sentence, each.seed)
         try:
             changed = each(stego)
         except BackendError as error:
-            row["skipped"] = f"{error}"
+            results.append(replace(result, skipped=f"{error}"))
             continue
-        row["gaussians"] = len(changed)
-        row["cover"] = _quality(changed, cover, views)
-        row["secrets"] = [
-            _secret(changed, *parts, views) for parts in zip(reopen, frames, secrets, strict=True)
-        ]
-        for now, before in zip(
-            [row["cover"], *row["secrets"]], [rows[0]["cover"], *rows[0]["secrets"]], strict=True
-        ):
-            now["loss"] = before["psnr"] - now["psnr"]
+        found = [_quality(changed, cover, views)]
+        found += [_secret(changed, *parts, views) for parts in zip(reopen, frames, secrets, strict=True)]
+        before = before or [now.psnr for now in found]
+        lost = [replace(now, loss=was - now.psnr) for now, was in zip(found, before, strict=True)]
+        results.append(replace(result, gaussians=len(changed), cover=lost[0], secrets=tuple(lost[1:])))
     if progress is not None:
-        progress(len(rows), len(rows), "")
-    return rows
+        progress(len(results), len(results), "")
+    return results
 
 
-def verdicts(rows: Sequence[dict[str, Any]], dead: float = DEAD) -> list[dict[str, Any]]:
-    """For each attack among `rows` its curve of losses, and whether the secret dies later than the cover.
+def mean_over_draws(results: Sequence[ChangeResult]) -> list[ChangeResult]:
+    """Results that differ in nothing but what was drawn, as one: means, and opened if all opened."""
+    groups = _grouped(results, lambda result: (result.attack, result.strength)).values()
+    return [
+        replace(
+            draws[0],
+            draws=len(draws),
+            cover=_mean([draw.cover for draw in draws if draw.cover is not None]),
+            secrets=tuple(
+                found
+                for each in zip(*(draw.secrets for draw in draws), strict=False)
+                if (found := _mean(each)) is not None
+            ),
+        )
+        for draws in groups
+    ]
 
-    "curve": [strength, loss of the cover, loss of the secret] in dB, for the attack's strengths in their
-    order; means over rows of one strength, and of several secrets the one that loses most counts. A scene is
-    dead at a strength if it has lost `dead` dB or more, and a secret also if it did not open in one of the
-    rows. "secret_dies_at", "cover_dies_at": the first strength at which that is so, None if never. "verdict"
-    tells who is dead at the first strength at which any is: "later" the cover alone, "sooner" the secret
-    alone, "together" both; "neither" if there is none. "excess": by how many dB more the secret loses than
-    the cover, at most, at strengths at which the cover lives; None if there is none.
-    """
-    attacks: dict[str, dict[float, list[dict[str, Any]]]] = {}
-    for row in rows:
-        if row["attack"] != UNCHANGED and "skipped" not in row:
-            attacks.setdefault(row["attack"], {}).setdefault(row["strength"], []).append(row)
-    return [_verdict(attack, own, dead) for attack, own in attacks.items()]
+
+def breakdown_points(
+    results: Sequence[ChangeResult], broken_loss: float = BROKEN_LOSS
+) -> list[BreakdownPoint]:
+    """For each attack among `results` its losses, and where cover and secret break down."""
+    known = [result for result in results if result.attack != UNCHANGED and result.cover is not None]
+    return [
+        _breakdown_point(attack, own, broken_loss)
+        for attack, own in _grouped(known, lambda result: result.attack).items()
+    ]
 
 
-def _verdict(attack: str, rows: Mapping[float, Sequence[dict[str, Any]]], dead: float) -> dict[str, Any]:
-    curve, cover_dead, secret_dead = [], [], []
-    for strength, same in rows.items():
-        cover = mean(row["cover"]["loss"] for row in same)
-        secret = mean(max(each["loss"] for each in row["secrets"]) for row in same)
-        opens = all(each["opens"] for row in same for each in row["secrets"])
-        curve.append([strength, cover, secret])
-        cover_dead.append(cover >= dead)
-        secret_dead.append(secret >= dead or not opens)
-    return {
-        "attack": attack,
-        "unit": next(iter(rows.values()))[0]["unit"],
-        "curve": curve,
-        "secret_dies_at": _first(curve, secret_dead),
-        "cover_dies_at": _first(curve, cover_dead),
-        "excess": max((secret - cover for _, cover, secret in curve if cover < dead), default=None),
-        "verdict": _who_first(secret_dead, cover_dead),
+def _breakdown_point(attack: str, results: Sequence[ChangeResult], broken_loss: float) -> BreakdownPoint:
+    losses, broken = [], []
+    for strength, draws in _grouped(results, lambda result: result.strength).items():
+        cover = fmean(draw.cover.loss for draw in draws if draw.cover is not None)
+        secret = fmean(max(each.loss for each in draw.secrets) for draw in draws)
+        opens = all(each.opens for draw in draws for each in draw.secrets)
+        losses.append(StrengthLosses(strength, cover, secret))
+        broken.append((strength, cover >= broken_loss, secret >= broken_loss or not opens))
+    names: dict[tuple[bool, bool], First] = {
+        (True, False): "cover",
+        (False, True): "secret",
+        (True, True): "both",
     }
+    return BreakdownPoint(
+        attack,
+        results[0].unit,
+        tuple(losses),
+        secret=next((strength for strength, _, secret in broken if secret), None),
+        cover=next((strength for strength, cover, _ in broken if cover), None),
+        first=next((names[cover, secret] for _, cover, secret in broken if cover or secret), "neither"),
+        excess=max((each.secret - each.cover for each in losses if each.cover < broken_loss), default=None),
+    )
 
 
-def _first(curve: Sequence[Sequence[float]], flags: Sequence[bool]) -> float | None:
-    return next((strength for (strength, _, _), flag in zip(curve, flags, strict=True) if flag), None)
+def _grouped(items: Sequence[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    groups: dict[K, list[T]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
 
 
-def _who_first(secret: Sequence[bool], cover: Sequence[bool]) -> str:
-    for secret_dead, cover_dead in zip(secret, cover, strict=True):
-        if secret_dead and cover_dead:
-            return "together"
-        if secret_dead or cover_dead:
-            return "sooner" if secret_dead else "later"
-    return "neither"
+def _mean(draws: Sequence[ChangedQuality]) -> ChangedQuality | None:
+    if not draws:
+        return None
+    return ChangedQuality(
+        fmean(draw.psnr for draw in draws),
+        fmean(draw.ssim for draw in draws),
+        fmean(draw.loss for draw in draws),
+        all(draw.opens for draw in draws),
+        next((draw.error for draw in draws if draw.error), None),
+    )
 
 
 def _secret(
     changed: Gaussians, reopen: Reopen, frame: Similarity, scene: Scene, views: int
-) -> dict[str, Any]:
+) -> ChangedQuality:
     try:
-        revealed = reopen(changed).gaussians.to(changed.device)
-        return {**_quality(revealed, scene, views), "opens": True}
+        return _quality(reopen(changed).gaussians.to(changed.device), scene, views)
     except KeyssError as error:
         shown = frame.inverse().apply_gaussians(changed.to("cpu")).to(changed.device)
-        return {**_quality(shown, scene, views), "opens": False, "error": f"{error}"}
+        return replace(_quality(shown, scene, views), opens=False, error=f"{error}")
 
 
-def _quality(model: Gaussians, scene: Scene, views: int) -> dict[str, Any]:
-    return asdict(quality(model, subsample_views(scene.test, views), scene.background.to(model.device)))
+def _quality(model: Gaussians, scene: Scene, views: int) -> ChangedQuality:
+    found = quality(model, subsample_views(scene.test, views), scene.background.to(model.device))
+    return ChangedQuality(found.psnr, found.ssim, loss=0.0)

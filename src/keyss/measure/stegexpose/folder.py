@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from keyss.core.errors import InputError, UsageError
-from keyss.fitting.loop import Reporter, Silent
+from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.measure.stegexpose.scores import DETECTORS, Scores, score_file
 
 THRESHOLD = 0.2  # the original's
@@ -36,7 +36,7 @@ class Steganalysis:
     @property
     def mean_fusion(self) -> float | None:
         """Over the images that have one."""
-        fusions = [row.scores.fusion for row in self.rows if not math.isnan(row.scores.fusion)]
+        fusions = [fusion for row in self.rows if not math.isnan(fusion := _fusion(row.scores))]
         return sum(fusions) / len(fusions) if fusions else None
 
 
@@ -58,7 +58,7 @@ def steganalyze(
     paths = _files(folder)
     rows: list[Row] = []
     skipped: list[str] = []
-    reporter = reporter or Silent()
+    reporter = reporter or SilentReporter()
     reporter.start(f"steganalyze {folder}", len(paths), 0)
     try:
         for done, path in enumerate(paths, start=1):
@@ -98,9 +98,13 @@ def _files(folder: Path) -> list[Path]:
 
 def _row(path: Path, threshold: float, fast: bool) -> Row:
     scores = score_file(path, stop_below=threshold if fast else None)
-    fusion = scores.fusion
+    fusion = _fusion(scores)
     guess = 0 if math.isnan(fusion) else math.floor(fusion * path.stat().st_size / 3 + 0.5)
     return Row(path.name, scores, fusion > threshold, guess)
+
+
+def _fusion(scores: Scores) -> float:
+    return math.nan if scores.fusion is None else scores.fusion
 
 
 def _spelled(score: float | None) -> str:

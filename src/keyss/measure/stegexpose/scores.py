@@ -34,7 +34,7 @@ class Scores:
     chi_square: float | None
     sample_pairs: float | None
     rs: float | None
-    fusion: float
+    fusion: float | None  # None in records of what is NaN
 
 
 def score_image(image: NDArray[np.uint8], *, stop_below: float | None = None) -> Scores:

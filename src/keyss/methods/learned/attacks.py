@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.start import DRAWN_LOGIT, opacity_curve
+from keyss.methods.learned.start import opacity_curve
 
-_OPAQUE_LOGIT = 3.0  # 95 %
+_OPAQUE_LOGIT = math.log(0.99 / 0.01)  # as much as one Gaussian covers in 3DGS
+_DRAWN_LOGIT = math.log(DRAWN_OPACITY / (1 - DRAWN_OPACITY))
 
 
 def known_remaps(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
@@ -21,7 +23,7 @@ def known_remaps(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
     decoder = Decoder(DecoderShape()).to(stego.device)
     decoder.prepare(stego, torch.ones_like(decoder.key))
     logits, shown = stego.opacity_logits, {}
-    stray = logits < DRAWN_LOGIT
+    stray = logits < _DRAWN_LOGIT
     for secret in range(secrets):
         knots, values = opacity_curve(secret)
         decoder.set_curve(knots, values)

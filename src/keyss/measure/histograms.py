@@ -1,9 +1,10 @@
-"""How often which values occur in a published model, and in plain ones."""
+"""How often which values occur in a published model, and in control models."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -13,20 +14,34 @@ from keyss.core.gaussians import SH_C0, Gaussians
 BINS = 48
 
 
-def histograms(stego: Gaussians, plains: Sequence[Gaussians]) -> dict[str, Any]:
-    """By quantity: BINS + 1 edges, and the shares of Gaussians between them in each of the models.
+@dataclass(frozen=True)
+class Histogram:
+    """Shares of Gaussians by the value of a quantity. Raises ValueError unless edges rise and lengths fit."""
+
+    edges: tuple[float, ...]  # one more than there are shares
+    stego: tuple[float, ...]
+    controls: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        fits = all(len(shares) == len(self.edges) - 1 for shares in (self.stego, *self.controls))
+        if not fits or any(a >= b for a, b in pairwise(self.edges)):
+            raise ValueError("expected rising edges, and one share fewer in each histogram")
+
+
+def histograms(stego: Gaussians, controls: Sequence[Gaussians]) -> dict[str, Histogram]:
+    """By quantity, histograms with BINS bins.
 
     The range is that of the middle 99.8 % of all models; what lies outside counts at its ends.
     """
     found = {}
-    quantities = [_quantities(model) for model in (stego, *plains)]
+    quantities = [_quantities(model) for model in (stego, *controls)]
     for name in quantities[0]:
         values = [each[name].detach().cpu().double().nan_to_num() for each in quantities]
         together = torch.cat(values).sort().values
         low, high = (float(together[rank]) for rank in _ranks(len(together)))
         edges = torch.linspace(low, max(high, low + 1e-9), BINS + 1, dtype=torch.float64)
         shares = [_shares(each, edges) for each in values]
-        found[name] = {"edges": edges.tolist(), "stego": shares[0], "plain": shares[1:]}
+        found[name] = Histogram(tuple(edges.tolist()), shares[0], tuple(shares[1:]))
     return found
 
 
@@ -50,7 +65,7 @@ def _ranks(count: int) -> tuple[int, int]:
     return int(0.001 * (count - 1)), int(0.999 * (count - 1))
 
 
-def _shares(values: Tensor, edges: Tensor) -> list[float]:
+def _shares(values: Tensor, edges: Tensor) -> tuple[float, ...]:
     inside = values.clamp(float(edges[0]), float(edges[-1]))
     counts = torch.histogram(inside, edges).hist
-    return [round(float(count), 6) for count in counts / max(len(values), 1)]
+    return tuple(round(float(count), 6) for count in counts / max(len(values), 1))

@@ -1,0 +1,157 @@
+"""What an audit found: the record in `audit/audit.json`, a field for each part of the audit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from keyss.core.errors import InputError
+from keyss.measure.distances import AttributeDistance
+from keyss.measure.hiding import WrongKeys
+from keyss.measure.histograms import Histogram
+from keyss.measure.images import ImageComparison
+from keyss.measure.leaks.looking import AttackResult
+from keyss.measure.robustness.survival import BreakdownPoint, ChangeResult
+from keyss.measure.roc import StegExposeRoc
+from keyss.measure.sealwatch_detectors import SealwatchRocs
+from keyss.measure.sinkhorn import Sinkhorn3D
+from keyss.measure.speed import SpeedResult
+from keyss.measure.two_sample import TwoSample
+from keyss.runs.records import read_record
+
+AUDIT_FOLDER, AUDIT_FILE = "audit", "audit.json"  # the folder is in that of the run
+PICTURES = "pictures"  # folder in that of the audit
+
+
+@dataclass(frozen=True)
+class AuditedRun:
+    """Which hiding was audited, and with what."""
+
+    path: str
+    method: str
+    cover: str  # a scene folder, or a model without photos; so are the secrets
+    secrets: tuple[str, ...]
+    width: int | None  # pixels to which photos were shrunk
+    gaussians: int
+    config: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
+
+
+@dataclass(frozen=True)
+class Controls:
+    """Plain models of the cover from other seeds, with which everything is compared."""
+
+    models: int
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class WrongKeyResult:
+    """What wrong keys show, as the run's `metrics.json` has it."""
+
+    shown: WrongKeys
+    chance_level: tuple[float, ...]  # dB, the stego cover itself against each secret's photos
+
+
+@dataclass(frozen=True)
+class LabelledPicture:
+    label: str
+    file: str  # in the audit's folder
+
+
+@dataclass(frozen=True)
+class PicturedView:
+    """Pictures of one view by several models."""
+
+    title: str
+    items: tuple[LabelledPicture, ...]
+
+
+@dataclass(frozen=True)
+class ImagesResult:
+    """Cover and secrets against the test photos, beside plain models where there are some."""
+
+    cover: ImageComparison
+    cover_baseline: ImageComparison | None
+    secrets: tuple[ImageComparison, ...]
+    secret_baselines: tuple[ImageComparison | None, ...]
+    pictures: tuple[PicturedView, ...]
+
+
+@dataclass(frozen=True)
+class SinkhornResult:
+    """3D-Sinkhorn as published, from the cover's plain model."""
+
+    stego: Sinkhorn3D
+    control: tuple[Sinkhorn3D, ...]
+    score: float  # composite score (KeySS, eq. 10)
+
+
+@dataclass(frozen=True)
+class ParametersResult:
+    """Distances of the published model's parameters from those of plain models."""
+
+    sinkhorn: SinkhornResult
+    distances: dict[str, AttributeDistance]
+    two_sample: TwoSample
+    histograms: dict[str, Histogram]
+
+
+@dataclass(frozen=True)
+class RenderDetection:
+    """Detectors of hidden bits on renders of the same views by two models."""
+
+    stegexpose: StegExposeRoc
+    sealwatch: SealwatchRocs | None
+
+
+@dataclass(frozen=True)
+class RendersResult:
+    """Detectors on renders of the published model and of controls."""
+
+    views: tuple[str, ...]
+    published: RenderDetection  # beside a control
+    control: RenderDetection  # two controls: some detectors learn any difference
+    sealwatch_missing: str | None = None  # how to get it
+
+
+@dataclass(frozen=True)
+class LeaksResult:
+    """What somebody without the key sees of each secret."""
+
+    secrets: tuple[tuple[AttackResult, ...], ...]
+
+
+@dataclass(frozen=True)
+class RobustnessResult:
+    """What changes of the published model cost."""
+
+    changes: tuple[ChangeResult, ...]
+    breakdown_points: tuple[BreakdownPoint, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Audit:
+    """What an audit found; parts that did not run are None."""
+
+    version: int = 2
+    keyss: str  # version of the program
+    seconds: float
+    run: AuditedRun
+    controls: Controls
+    wrong_key: WrongKeyResult | None = None
+    images: ImagesResult | None = None
+    parameters: ParametersResult | None = None
+    stegexpose: RendersResult | None = None
+    leaks: LeaksResult | None = None
+    robustness: RobustnessResult | None = None
+    speed: SpeedResult | None = None
+
+
+def read_audit(run: Path) -> Audit:
+    """RUN/audit/audit.json. Raises InputError when it is missing, broken, too large or of another version."""
+    path = run / AUDIT_FOLDER / AUDIT_FILE
+    if not path.exists():
+        raise InputError(f"{path}: expected an audit, found nothing there; `keyss audit {run}` makes one")
+    return read_record(path, Audit)
