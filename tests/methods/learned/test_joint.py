@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from keyss.methods.learned.config import PRESETS, HideConfig
+from keyss.methods.learned.config import PRESETS
 
 from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
