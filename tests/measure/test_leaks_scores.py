@@ -83,9 +83,9 @@ def test_scores_are_those_of_the_other_measures_and_at_their_best_for_the_photog
     scene, model = tiny_scene(0), random_gaussians(seed=0)
     found = scores(model, scene.test, scene.background)
     expected = quality(model, scene.test, scene.background)
-    assert (found["psnr"], found["ssim"]) == pytest.approx((expected.psnr, expected.ssim))
-    assert found["psnr"] > 50
-    assert min(found[name] for name in ("ssim", "gradient", "ssim_fitted")) > 0.99
+    assert (found.psnr, found.ssim) == pytest.approx((expected.psnr, expected.ssim))
+    assert found.psnr > 50
+    assert min(found.ssim, found.gradient, found.ssim_fitted) > 0.99
 
 
 def test_a_darker_copy_is_found_by_the_fitted_scores_alone() -> None:
@@ -93,5 +93,5 @@ def test_a_darker_copy_is_found_by_the_fitted_scores_alone() -> None:
     dark = tiny_scene(0)
     views = [type(view)(view.camera, view.image // 4) for view in dark.test]
     found = scores(model, views, scene.background)
-    assert found["psnr"] < 15
-    assert found["psnr_fitted"] > 35
+    assert found.psnr < 15
+    assert found.psnr_fitted > 35

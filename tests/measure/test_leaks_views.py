@@ -10,19 +10,18 @@ import torch
 from torch import Tensor
 
 from keyss.core import Gaussians
-from keyss.measure.leaks import file_attacks
+from keyss.measure.leaks import file_attacks, source_attack
 from keyss.measure.leaks.attributes import Attribute, clusters, measured, outliers
 from keyss.measure.leaks.opacities import (
     OPAQUE,
-    by_the_source,
     faint,
     inverted,
     least_contributing,
     matched,
     opaque,
-    outside_the_bands,
     rescaled,
 )
+from keyss.methods.learned.attacks import attacks, by_the_source, outside_the_bands
 from keyss.methods.learned.start import hidden_logits, opacity_curve
 from keyss.rendering.contributions import contributions
 from tiny_scenes import random_gaussians, ring_cameras
@@ -164,7 +163,7 @@ def test_clusters_part_the_model_and_tell_two_kinds_from_each_other() -> None:
 def test_attacks_show_the_same_labels_of_any_model_and_change_nothing(count: int, sh_degree: int) -> None:
     model, large = random_gaussians(count, sh_degree=sh_degree), random_gaussians(50)
     before = model.map(torch.clone)
-    for attack in file_attacks(ring_cameras(2)):
+    for attack in [*file_attacks(ring_cameras(2)), source_attack(lambda model: attacks(model, 3))]:
         shown = list(attack.show(model))
         assert [label for label, _ in shown] == [label for label, _ in attack.show(large)]
         assert len({label for label, _ in shown}) == len(shown)

@@ -1,27 +1,29 @@
-"""What is told of changes of published models: what they cost cover and secrets, and which dies first."""
+"""What changes of published models cost cover and secrets, and which of them breaks down first."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import pytest
 import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits.bits import is_random
+from keyss.channels.low_bits import LOW_BITS
 from keyss.core import Gaussians, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import mean_psnr, quality
 from keyss.measure.robustness import (
-    Opened,
+    BreakdownPoint,
+    ChangeResult,
+    Reopened,
     Reopener,
+    breakdown_points,
     default_changes,
+    mean_over_draws,
     robustness,
-    verdicts,
 )
 from keyss.measure.robustness.changes import (
     NOISY,
@@ -30,9 +32,11 @@ from keyss.measure.robustness.changes import (
     random_pruning,
 )
 from keyss.measure.robustness.retraining import purification
-from keyss.methods.carry import embed
-from keyss.methods.carry.plan import Size, plan
-from keyss.methods.learned.pipeline import hide_scenes
+from keyss.measure.robustness.survival import ChangedQuality, First, StrengthLosses
+from keyss.methods.carry.carrying import record_request
+from keyss.methods.registry import open_model
+from methods.carry.carried import embed
+from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _moved, _scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -50,100 +54,105 @@ def test_losses_are_differences_of_quality(scene: Scene) -> None:
     changes = [random_pruning(0.5, seed) for seed in (0, 1)]
     steps: list[tuple[int, int, str]] = []
     rows = robustness(
-        model, [Opened], scene, [scene], changes=changes, progress=lambda *step: steps.append(step)
+        model, [Reopened], scene, [scene], changes=changes, progress=lambda *step: steps.append(step)
     )
-    assert [row["attack"] for row in rows] == ["none", "random pruning", "random pruning"]
-    assert rows[0]["cover"]["loss"] == rows[0]["secrets"][0]["loss"] == 0
+    assert [row.attack for row in rows] == ["none", "random pruning", "random pruning"]
+    assert rows[0].cover is not None
+    assert rows[0].cover.loss == rows[0].secrets[0].loss == 0
     before = quality(model, scene.test, scene.background)
     for row, change in zip(rows[1:], changes, strict=True):
         now = quality(change(model), scene.test, scene.background)
-        assert row["cover"] == {"psnr": now.psnr, "ssim": now.ssim, "loss": before.psnr - now.psnr}
-        assert row["secrets"] == [row["cover"] | {"opens": True}]
-        assert row["gaussians"] == 100
+        assert row.cover == ChangedQuality(now.psnr, now.ssim, before.psnr - now.psnr)
+        assert row.secrets == (row.cover,)
+        assert row.gaussians == 100
     assert [step[:2] for step in steps] == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert json.loads(json.dumps(rows)) == rows
-    assert robustness(model, [Opened], scene, [scene], changes=changes) == rows
+    assert robustness(model, [Reopened], scene, [scene], changes=changes) == rows
 
 
 def test_views_are_bounded() -> None:
     scene, model = tiny_scene(0, views=16), random_gaussians(150, seed=0)
     (row,) = robustness(model, [], scene, [], changes=[], views=1)
-    assert row["cover"]["psnr"] == mean_psnr(model, scene.test[:1], scene.background)
+    assert row.cover is not None
+    assert row.cover.psnr == mean_psnr(model, scene.test[:1], scene.background)
 
 
 def test_what_is_lost_looks_like_the_cover_from_where_the_secret_is(scene: Scene) -> None:
-    """The secret's cameras are the cover's in another frame, so that the floor is the cover's own quality."""
+    """The secret's cameras are the cover's in another frame, so that chance level is the cover's quality."""
     model = random_gaussians(seed=0)
     frame = Similarity(2.0, translation=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
     elsewhere = _moved(scene, frame.inverse())
 
-    def reopen(changed: Gaussians) -> Opened:
+    def reopen(changed: Gaussians) -> Reopened:
         if len(changed) < len(model):
             raise WrongKeyError("this key opens nothing here")
-        return Opened(frame.inverse().apply_gaussians(changed), frame)
+        return Reopened(frame.inverse().apply_gaussians(changed), frame)
 
     rows = robustness(model, [reopen], scene, [elsewhere], changes=[random_pruning(0.2)])
-    (secret,) = rows[1]["secrets"]
-    assert not secret["opens"]
-    assert secret["error"] == "this key opens nothing here"
-    assert secret["psnr"] == pytest.approx(rows[1]["cover"]["psnr"], abs=0.01)
+    (secret,) = rows[1].secrets
+    assert not secret.opens
+    assert secret.error == "this key opens nothing here"
+    assert rows[1].cover is not None
+    assert secret.psnr == pytest.approx(rows[1].cover.psnr, abs=0.01)
     with pytest.raises(UsageError, match="each of 1 secret"):
         robustness(model, [], scene, [scene], changes=[])
     with pytest.raises(WrongKeyError):
         robustness(model[:5], [reopen], scene, [elsewhere], changes=[])
 
 
-def row(attack: str, strength: float, cover: float, *secrets: tuple[float, bool]) -> dict[str, Any]:
-    return {
-        "attack": attack,
-        "strength": strength,
-        "unit": "u",
-        "cover": {"loss": cover},
-        "secrets": [{"loss": loss, "opens": opens} for loss, opens in secrets],
-    }
+def row(attack: str, strength: float, cover: float, *secrets: tuple[float, bool]) -> ChangeResult:
+    shown = [ChangedQuality(30 - loss, 0.9, loss, opens) for loss, opens in ((cover, True), *secrets)]
+    return ChangeResult(attack, strength, "u", "", 0, cover=shown[0], secrets=tuple(shown[1:]))
 
 
 @pytest.mark.parametrize(
-    ("losses", "verdict", "secret_dies_at", "cover_dies_at", "excess"),
+    ("losses", "first", "secret_at", "cover_at", "excess"),
     [
-        ([(1, 2), (3, 6.5), (7, 9)], "sooner", 1, 2, 3.5),
-        ([(1, 0), (6, 5), (7, 9)], "later", 2, 1, -1),
-        ([(1, 2), (7, 6)], "together", 1, 1, 1),
+        ([(1, 2), (3, 6.5), (7, 9)], "secret", 1, 2, 3.5),
+        ([(1, 0), (6, 5), (7, 9)], "cover", 2, 1, -1),
+        ([(1, 2), (7, 6)], "both", 1, 1, 1),
         ([(1, 2), (3, 3.5)], "neither", None, None, 1),
-        ([(8, 9)], "together", 0, 0, None),
+        ([(8, 9)], "both", 0, 0, None),
     ],
 )
-def test_verdicts(
+def test_breakdown_points(
     losses: list[tuple[float, float]],
-    verdict: str,
-    secret_dies_at: int | None,
-    cover_dies_at: int | None,
+    first: First,
+    secret_at: int | None,
+    cover_at: int | None,
     excess: float | None,
 ) -> None:
     rows = [row("a", strength, cover, (secret, True)) for strength, (cover, secret) in enumerate(losses)]
-    (found,) = verdicts([row("none", 0, 0, (0, True)), *rows])
-    assert found == {
-        "attack": "a",
-        "unit": "u",
-        "curve": [[strength, cover, secret] for strength, (cover, secret) in enumerate(losses)],
-        "secret_dies_at": secret_dies_at,
-        "cover_dies_at": cover_dies_at,
-        "excess": excess,
-        "verdict": verdict,
-    }
+    (found,) = breakdown_points([row("none", 0, 0, (0, True)), *rows])
+    curve = tuple(StrengthLosses(strength, *pair) for strength, pair in enumerate(losses))
+    assert found == BreakdownPoint("a", "u", curve, secret_at, cover_at, first, excess)
 
 
-def test_verdicts_take_means_of_draws_the_worst_of_secrets_and_what_does_not_open_as_dead() -> None:
+def test_breakdown_takes_means_of_draws_the_worst_of_secrets_and_what_does_not_open_as_broken() -> None:
     rows = [
         row("a", 1, 1, (0, True), (4, True)),
         row("a", 1, 2, (2, True), (1, True)),
         row("b", 1, 0, (0.1, False), (0, True)),
     ]
-    first, second = verdicts(rows)
-    assert first["curve"] == [[1, 1.5, 3]]
-    assert (first["excess"], first["verdict"]) == (1.5, "neither")
-    assert (second["secret_dies_at"], second["verdict"]) == (1, "sooner")
-    assert [verdict["verdict"] for verdict in verdicts(rows, dead=3)] == ["sooner", "sooner"]
+    first, second = breakdown_points(rows)
+    assert first.losses == (StrengthLosses(1, 1.5, 3),)
+    assert (first.excess, first.first) == (1.5, "neither")
+    assert (second.secret, second.first) == (1, "secret")
+    assert [point.first for point in breakdown_points(rows, broken_loss=3)] == ["secret", "secret"]
+
+
+def test_draws_are_taken_together() -> None:
+    rows = [row("a", 1, 1, (0, True), (4, True)), row("a", 2, 9), row("a", 1, 2, (2, True), (1, False))]
+    first, second = mean_over_draws(rows)
+    assert (first.draws, second.draws) == (2, 1)
+    assert second == rows[1]
+    assert first.cover is not None
+    assert first.cover.loss == 1.5
+    assert [(each.loss, each.psnr, each.opens) for each in first.secrets] == [
+        (1, 29, True),
+        (2.5, 27.5, False),
+    ]
+    skipped = replace(rows[1], cover=None, skipped="no tool")
+    assert mean_over_draws([skipped]) == [skipped]
 
 
 def test_the_default_changes_are_those_of_the_papers_and_more(scene: Scene) -> None:
@@ -180,7 +189,7 @@ def test_a_learned_secret_without_low_bits(sidecar: bool, pair: tuple[list[Scene
     scenes, models = pair
     config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=5, max_gaussians=2000))
     hidden = hide_scenes(scenes, [KEY], config, plains=models, sidecar=sidecar)
-    reopen = Reopener(KEY, hidden.sidecar)
+    reopen = Reopener(KEY, partial(open_model, sidecar=hidden.sidecar))
     assert KEY not in repr(reopen)
     revealed = keyss.reveal(hidden.stego, KEY, decoder=hidden.sidecar)
     assert same(reopen(hidden.stego).gaussians, revealed)
@@ -188,29 +197,31 @@ def test_a_learned_secret_without_low_bits(sidecar: bool, pair: tuple[list[Scene
     changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
     _, pruned, rounded, purified = robustness(hidden.stego, [reopen], scenes[0], scenes[1:], changes=changes)
     again = keyss.reveal(changes[0](hidden.stego), KEY, decoder=hidden.sidecar)
-    assert pruned["secrets"][0]["opens"]
-    assert pruned["secrets"][0]["psnr"] == mean_psnr(again, scenes[1].test, scenes[1].background)
-    assert rounded["secrets"][0]["opens"] == sidecar
+    assert pruned.secrets[0].opens
+    assert pruned.secrets[0].psnr == mean_psnr(again, scenes[1].test, scenes[1].background)
+    assert rounded.secrets[0].opens == sidecar
     if sidecar:
-        assert rounded["secrets"][0]["loss"] < 0.5
+        assert rounded.secrets[0].loss < 0.5
     else:
-        assert rounded["secrets"][0]["error"] == "this key opens nothing here"
-        assert rounded["secrets"][0]["loss"] > 10
-    assert abs(purified["cover"]["loss"]) < 0.1
-    assert purified["secrets"][0]["loss"] > 10  # nothing of the secret is seen in the cover
+        assert rounded.secrets[0].error == "this key opens nothing here"
+        assert rounded.secrets[0].loss > 10
+    assert purified.cover is not None
+    assert abs(purified.cover.loss) < 0.1
+    assert purified.secrets[0].loss > 10  # nothing of the secret is seen in the cover
 
 
 def test_pruning_a_carried_model_costs_what_it_must() -> None:
     """A Gaussian of the secret is lost with its carrier, unless there is a copy on another."""
     cover, secret, share = trained_like(3000), trained_like(1200, seed=1), 0.25
     stego = embed(cover, [(KEY, secret)])
-    (layout,) = plan([Size(1200, 3)], int(is_random(cover).sum()), 3000, 3)
+    (layout,) = LOW_BITS.prepare(cover).plan_records([record_request(1200, 3)])
     expected = (1200 - layout.copies) * (1 - share) + layout.copies * (1 - share**2)
-    left = Reopener(KEY)(random_pruning(share)(stego)).gaussians
+    reopen = Reopener(KEY, open_model)
+    left = reopen(random_pruning(share)(stego)).gaussians
     assert abs(len(left) - expected) < 5 * (1200 * share * (1 - share)) ** 0.5
-    whole = Reopener(KEY)(stego).gaussians
+    whole = reopen(stego).gaussians
     assert len(whole) == 1200
     assert left.opacities.mean() > whole.opacities.mean() + 0.02  # makes up for those that are lost
     with pytest.raises(WrongKeyError):
-        Reopener(KEY)(noise("harmonics", 1e-4)(stego))
-    assert len(Reopener(KEY)(noise("colour", 0.1)(stego)).gaussians) == 1200  # carries nothing
+        reopen(noise("harmonics", 1e-4)(stego))
+    assert len(reopen(noise("colour", 0.1)(stego)).gaussians) == 1200  # carries nothing

@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 from keyss.core.errors import UsageError
 from keyss.measure.roc import roc, stegexpose_roc
+from keyss.runs.records import record_bytes
 from measure.test_stegexpose import smooth, with_payload
 
 SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e300]), min_size=1, max_size=9)
@@ -29,12 +30,11 @@ def test_the_auc_counts_pairs_in_order(negatives: list[float | None], positives:
     pairs = [(number(n), number(p)) for n in negatives for p in positives]
     counted = sum((n < p) + 0.5 * (n == p) for n, p in pairs) / len(pairs)
     found = roc(negatives, positives)
-    json.dumps(found, allow_nan=False)
-    assert found["auc"] == pytest.approx(counted, abs=1e-12)
-    assert 0 <= found["low"] <= found["auc"] + 1e-12
-    assert found["auc"] - 1e-12 <= found["high"] <= 1
-    assert (found["fpr"][0], found["tpr"][0], found["fpr"][-1], found["tpr"][-1]) == (0, 0, 1, 1)
-    assert np.trapezoid(found["tpr"], found["fpr"]) == pytest.approx(counted, abs=1e-12)
+    assert found.auc == pytest.approx(counted, abs=1e-12)
+    assert 0 <= found.low <= found.auc + 1e-12
+    assert found.auc - 1e-12 <= found.high <= 1
+    assert (found.fpr[0], found.tpr[0], found.fpr[-1], found.tpr[-1]) == (0, 0, 1, 1)
+    assert np.trapezoid(found.tpr, found.fpr) == pytest.approx(counted, abs=1e-12)
 
 
 def test_three_against_three_by_hand() -> None:
@@ -42,10 +42,10 @@ def test_three_against_three_by_hand() -> None:
     components = [1 / 2, 5 / 6, 1]  # of 2, 3, 4 against the others; those of 3, 2, 1 are the same
     variance = 2 * np.var(components, ddof=1) / 3
     spread = 1.959964 * math.sqrt(variance) / (7 / 9 * 2 / 9)
-    assert found["auc"] == pytest.approx(7 / 9)
-    assert found["low"] == pytest.approx(expit(logit(7 / 9) - spread), abs=1e-6)
-    assert found["high"] == pytest.approx(expit(logit(7 / 9) + spread), abs=1e-6)
-    assert "DeLong" in found["interval"]
+    assert found.auc == pytest.approx(7 / 9)
+    assert found.low == pytest.approx(expit(logit(7 / 9) - spread), abs=1e-6)
+    assert found.high == pytest.approx(expit(logit(7 / 9) + spread), abs=1e-6)
+    assert "DeLong" in found.interval
 
 
 def test_the_interval_holds_the_truth_19_times_in_20() -> None:
@@ -54,24 +54,24 @@ def test_the_interval_holds_the_truth_19_times_in_20() -> None:
     held = []
     for _ in range(300):
         found = roc(random.normal(0, 1, 25).tolist(), random.normal(1, 1, 15).tolist())
-        held.append(found["low"] <= truth <= found["high"])
+        held.append(found.low <= truth <= found.high)
     assert 0.92 < np.mean(held) < 0.985
 
 
 def test_classes_that_do_not_overlap_leave_some_doubt() -> None:
     """Were the true AUC 0.478, five disjoint pairs would all be in order once in 40 times."""
     found = roc([0.0] * 5, [1.0] * 9)
-    assert (found["auc"], found["high"]) == (1, 1)
-    assert found["low"] ** 5 == pytest.approx(1 / 40)
+    assert (found.auc, found.high) == (1, 1)
+    assert found.low**5 == pytest.approx(1 / 40)
     reverse = roc([1.0] * 9, [0.0] * 5)
-    assert (reverse["auc"], reverse["low"]) == (0, 0)
-    assert reverse["high"] == pytest.approx(1 - found["low"])
+    assert (reverse.auc, reverse.low) == (0, 0)
+    assert reverse.high == pytest.approx(1 - found.low)
 
 
 def test_what_has_no_score_is_below_all_others_and_counted() -> None:
     found = roc([math.nan, 0.0], [None, -5.0, math.nan])
-    assert found["auc"] == pytest.approx((0.5 + 1 + 0.5) / 6)
-    assert found["unanswered"] == [1, 2]
+    assert found.auc == pytest.approx((0.5 + 1 + 0.5) / 6)
+    assert found.unanswered == (1, 2)
 
 
 @pytest.mark.parametrize(("negatives", "positives"), [([], [1.0]), ([1.0], []), ([], [])])
@@ -90,11 +90,10 @@ class TestStegExpose:
     def test_last_bits_that_were_replaced_are_seen(self) -> None:
         plain = views((300, 300))
         found = stegexpose_roc(plain, [with_payload(image, 0.7) for image in plain])
-        json.dumps(found, allow_nan=False)
-        assert found["roc"]["auc"] == 1
-        plain, stego = ([row["fusion"] for row in found[key]] for key in ("plain", "stego"))
+        assert found.roc.auc == 1
+        plain, stego = ([row.fusion or 0 for row in each] for each in (found.plain, found.stego))
         assert max(plain) < min(stego)
-        assert found["detectors"] == {
+        assert found.detectors == {
             "primary_sets": 0.0,  # no solution for any of the stego images
             "chi_square": 1.0,
             "sample_pairs": 1.0,
@@ -107,24 +106,24 @@ class TestStegExpose:
         plain = views((60, 80), 24)
         stego = [np.rint(image + random.normal(0, 0.4, image.shape)).astype(np.uint8) for image in plain]
         plain = [np.rint(image + random.normal(0, 0.4, image.shape)).astype(np.uint8) for image in plain]
-        found = stegexpose_roc(plain, stego)["roc"]
-        assert found["low"] < 0.5 < found["high"]
+        found = stegexpose_roc(plain, stego).roc
+        assert found.low < 0.5 < found.high
 
     def test_detectors_that_take_no_image_have_no_auc(self) -> None:
         images = views((9, 12))
         found = stegexpose_roc(images, images)
-        assert found["detectors"] == {
+        assert found.detectors == {
             "primary_sets": 0.5,
             "chi_square": None,
             "sample_pairs": None,
             "rs": 0.5,
         }
-        assert found["roc"]["auc"] == 0.5
+        assert found.roc.auc == 0.5
 
     def test_images_without_any_score_are_none(self) -> None:
         found = stegexpose_roc([smooth((1, 1))], [smooth((1, 1))])
-        assert [row["fusion"] for row in found["plain"] + found["stego"]] == [None, None]
-        assert found["roc"]["unanswered"] == [1, 1]
+        assert json.loads(record_bytes(found))["plain"][0]["fusion"] is None
+        assert found.roc.unanswered == (1, 1)
 
     def test_other_views_are_refused(self) -> None:
         images = views((9, 12))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -16,7 +15,7 @@ import pytest
 
 from keyss.core.errors import BackendError, UsageError
 from keyss.measure import sealwatch_detectors
-from keyss.measure.sealwatch_detectors import sealwatch_roc
+from keyss.measure.sealwatch_detectors import DetectorRoc, SealwatchRocs, sealwatch_roc
 from measure.test_roc import views
 from measure.test_stegexpose import with_payload
 
@@ -52,24 +51,29 @@ def pairs(rate: float, count: int = 15) -> tuple[Images, Images]:
     return plain, [with_payload(image, rate) for image in plain]
 
 
+def detectors(found: SealwatchRocs) -> list[DetectorRoc]:
+    """All three."""
+    assert found.spam is not None
+    return [found.spa, found.ws, found.spam]
+
+
 @pytest.mark.usefixtures("sealwatch")
 class TestWithSealwatch:
     def test_a_payload_is_seen_by_all(self) -> None:
         found = sealwatch_roc(*pairs(0.4))
-        json.dumps(found, allow_nan=False)
-        assert {name: len(each["plain"]) for name, each in found.items()} == {"spa": 15, "ws": 15, "spam": 15}
-        assert min(each["roc"]["auc"] for each in found.values()) > 0.95
+        assert [len(each.plain) for each in detectors(found)] == [15, 15, 15]
+        assert min(each.roc.auc for each in detectors(found)) > 0.95
 
     def test_spa_finds_the_rate_and_ws_the_rate_of_changes(self) -> None:
         image = views((300, 300), 1)[0]
         found = sealwatch_roc([image], [with_payload(image, 0.4)])
-        assert found["spa"]["stego"][0] == pytest.approx(0.4, abs=0.05)
-        assert found["ws"]["stego"][0] == pytest.approx(0.2, abs=0.05)
-        assert found["ws"]["plain"][0] == pytest.approx(0, abs=0.05)
+        assert found.spa.stego[0] == pytest.approx(0.4, abs=0.05)
+        assert found.ws.stego[0] == pytest.approx(0.2, abs=0.05)
+        assert found.ws.plain[0] == pytest.approx(0, abs=0.05)
 
     def test_the_same_images_are_a_toss_up(self) -> None:
         plain, _ = pairs(0.0)
-        assert [each["roc"]["auc"] for each in sealwatch_roc(plain, plain).values()] == [0.5, 0.5, 0.5]
+        assert [each.roc.auc for each in detectors(sealwatch_roc(plain, plain))] == [0.5, 0.5, 0.5]
 
     def test_views_with_their_labels_drawn_by_lot_are_a_toss_up(self) -> None:
         """Both have a payload, of another key each: there is nothing to learn that holds for other views."""
@@ -83,21 +87,21 @@ class TestWithSealwatch:
             for _ in range(2)
         ]
         found = sealwatch_roc(*noisy)
-        for each in found.values():
-            assert each["roc"]["low"] < 0.5 < each["roc"]["high"]
+        for each in detectors(found):
+            assert each.roc.low < 0.5 < each.roc.high
 
     def test_two_runs_give_the_same_numbers(self) -> None:
         images = pairs(0.02, 12)
         first = sealwatch_roc(*images, seed=1)
         assert sealwatch_roc(*images, seed=1) == first
-        assert sealwatch_roc(*images, seed=2)["spam"] != first["spam"]
+        assert sealwatch_roc(*images, seed=2).spam != first.spam
 
     def test_few_views_teach_nothing(self) -> None:
-        assert sealwatch_roc(*pairs(0.4, 9))["spam"] is None
+        assert sealwatch_roc(*pairs(0.4, 9)).spam is None
 
     def test_images_of_one_colour_are_no_trouble(self) -> None:
         flat = [np.full((8, 8, 3), 7, dtype=np.uint8)] * 10
-        assert [each["roc"]["auc"] for each in sealwatch_roc(flat, flat).values()] == [0.5, 0.5, 0.5]
+        assert [each.roc.auc for each in detectors(sealwatch_roc(flat, flat))] == [0.5, 0.5, 0.5]
 
     def test_the_fast_spam_is_the_slow_one(self, sealwatch: Any) -> None:
         """We run the one in Rust, which is hundreds of times faster."""

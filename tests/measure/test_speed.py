@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +16,10 @@ from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
 from keyss.files.ply import write_ply
 from keyss.measure import speed as module
-from keyss.measure.robustness import Opened, Reopener
-from keyss.measure.speed import readers, render_ratio, reveal_seconds, speed
-from keyss.methods.carry import embed
+from keyss.measure.robustness import Reopened, Reopener
+from keyss.measure.speed import FileSize, ReaderResult, readers, render_time, reveal_seconds, speed
+from keyss.methods.registry import open_model
+from methods.carry.carried import embed
 from tiny_scenes import random_gaussians, tiny_scene
 
 __all__ = ["splat_transform"]  # a fixture
@@ -55,29 +55,29 @@ def test_the_ratio_is_that_of_the_times_whatever_else_the_machine_does(
         return torch.zeros(1)
 
     monkeypatch.setattr(module, "render", render)
-    found = render_ratio(random_gaussians(30), random_gaussians(20), tiny_scene(), views=2, rounds=6)
-    assert found["ratio"] == pytest.approx(1.5, rel=1e-6)
-    assert (found["gaussians"], found["plain_gaussians"]) == (30, 20)
+    found = render_time("m", random_gaussians(30), random_gaussians(20), tiny_scene(), views=2, rounds=6)
+    assert found.ratio == pytest.approx(1.5, rel=1e-6)
+    assert (found.gaussians, found.plain_gaussians) == (30, 20)
     assert len(drawn) == 2 * 2 * 7
-    assert found["milliseconds"] == pytest.approx(1.5 * found["plain_milliseconds"])
-    assert found["milliseconds"] < 30 * 6
+    assert found.seconds == pytest.approx(1.5 * found.plain_seconds)
+    assert found.seconds < 30 * 6 / 1000
     # Neither of both always comes first.
     assert {tuple(drawn[i : i + 2]) for i in range(0, len(drawn), 2)} == {(30, 20), (20, 30)}
 
 
 def test_a_model_takes_as_long_as_itself_and_longer_than_a_small_one() -> None:
     scene, model = tiny_scene(), random_gaussians(3000)
-    assert 0.5 < render_ratio(model, model, scene)["ratio"] < 2
-    assert render_ratio(model, model[:3], scene)["ratio"] > 1.5
+    assert 0.5 < render_time("m", model, model, scene).ratio < 2
+    assert render_time("m", model, model[:3], scene).ratio > 1.5
 
 
 def test_revealing_is_timed_from_file_to_file(clock: Clock, tmp_path: Path) -> None:
     write_ply(tmp_path / "in.ply", random_gaussians(10))
     waits = iter([5.0, 1.0, 2.0])
 
-    def reopen(model: Gaussians) -> Opened:
+    def reopen(model: Gaussians) -> Reopened:
         clock.pass_(next(waits))
-        return Opened(model[:4])
+        return Reopened(model[:4])
 
     assert reveal_seconds(tmp_path / "in.ply", reopen, tmp_path / "out.ply") == pytest.approx(2.0)
     assert plyfile.PlyData.read(tmp_path / "out.ply")["vertex"].count == 4
@@ -89,9 +89,9 @@ def test_revealing_is_timed_from_file_to_file(clock: Clock, tmp_path: Path) -> N
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_other_peoples_readers_find_our_values(degree: int, tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", random_gaussians(40, sh_degree=degree))
-    found = {each.pop("reader"): each for each in readers(tmp_path / "a.ply")}
+    found = {each.reader: each for each in readers(tmp_path / "a.ply")}
     for name in ("plyfile", "gsply"):
-        assert found[name] == {"gaussians": 40, "equal": True}
+        assert found[name] == ReaderResult(name, "a.ply", True, 40)
 
 
 def test_splat_transform_finds_our_values(
@@ -99,7 +99,7 @@ def test_splat_transform_finds_our_values(
 ) -> None:
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", splat_transform)
     write_ply(tmp_path / "a.ply", random_gaussians(40))
-    assert readers(tmp_path / "a.ply")[2] == {"reader": "splat-transform", "gaussians": 40, "equal": True}
+    assert readers(tmp_path / "a.ply")[2] == ReaderResult("splat-transform", "a.ply", True, 40)
 
 
 def test_other_values_fewer_values_and_failures_are_told(
@@ -118,9 +118,9 @@ def test_other_values_fewer_values_and_failures_are_told(
     monkeypatch.setattr(module, "_gsply", reading(lambda m: m.map(lambda values: values * (1 + 1e-6))))
     monkeypatch.setattr(module, "_splat_transform", failing)
     assert readers(tmp_path / "a.ply") == [
-        {"reader": "plyfile", "gaussians": 39, "equal": False},
-        {"reader": "gsply", "gaussians": 40, "equal": False},
-        {"reader": "splat-transform", "error": "no such format"},
+        ReaderResult("plyfile", "a.ply", False, 39),
+        ReaderResult("gsply", "a.ply", False, 40),
+        ReaderResult("splat-transform", "a.ply", False, note="no such format"),
     ]
 
 
@@ -133,8 +133,8 @@ def test_readers_that_are_absent_say_so(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
     write_ply(tmp_path / "a.ply", random_gaussians(4))
     found = readers(tmp_path / "a.ply")
-    assert ["not installed" in each["skipped"] for each in found] == [True] * 3
-    assert all("install" in each["skipped"] for each in found)
+    assert [each.loads for each in found] == [None] * 3
+    assert all("not installed (" in (each.note or "") for each in found)
 
 
 # --- all of it -------------------------------------------------------------------------------------------
@@ -148,25 +148,21 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     steps: list[tuple[int, int, str]] = []
     found = speed(
         tmp_path / "stego.ply",
-        [Reopener(KEY)],
+        [Reopener(KEY, open_model)],
         scenes,
         [cover, secret],
         rounds=2,
         progress=lambda *step: steps.append(step),
     )
-    assert json.loads(json.dumps(found)) == found
     write_ply(tmp_path / "secret.ply", secret)  # the same size as the revealed file
-    assert found["files"] == {
-        "stego": (tmp_path / "stego.ply").stat().st_size,
-        "secret 1": (tmp_path / "secret.ply").stat().st_size,
-    }
-    assert [(each["model"], each["gaussians"]) for each in found["render"]] == [
-        ("stego", 1000),
-        ("secret 1", 300),
-    ]
-    assert [each["model"] for each in found["reveal"]] == ["secret 1"]
-    assert 0.01 < found["reveal"][0]["seconds"] < 60
-    assert {(each["model"], each["reader"]) for each in found["readers"] if each.get("equal")} == {
+    assert found.files == (
+        FileSize("stego", (tmp_path / "stego.ply").stat().st_size),
+        FileSize("secret 1", (tmp_path / "secret.ply").stat().st_size),
+    )
+    assert [(each.model, each.gaussians) for each in found.render] == [("stego", 1000), ("secret 1", 300)]
+    assert len(found.reveal_seconds) == 1
+    assert 0.01 < found.reveal_seconds[0] < 60
+    assert {(each.file, each.reader) for each in found.readers if each.loads} == {
         (model, reader) for model in ("stego", "secret 1") for reader in ("plyfile", "gsply")
     }
     assert steps == [(0, 2, "stego"), (1, 2, "secret 1"), (2, 2, "")]

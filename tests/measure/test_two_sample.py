@@ -12,8 +12,9 @@ from sklearn.metrics import roc_auc_score
 
 from keyss.core import Gaussians
 from keyss.core.errors import UsageError
-from keyss.measure import two_sample_against_null, two_sample_auc
-from keyss.measure.two_sample import delong
+from keyss.measure import two_sample_against_controls, two_sample_auc
+from keyss.measure.roc import delong
+from keyss.measure.two_sample import AucInterval
 from measure.lifelike import (
     doubled_scales,
     lifelike,
@@ -29,20 +30,20 @@ OTHER = lifelike(800, seed=1).with_sh_degree(1)
 
 
 def test_a_model_cannot_be_told_from_itself() -> None:
-    assert two_sample_auc(MODEL, MODEL) == {"auc": 0.5, "low": 0.5, "high": 0.5}
+    assert two_sample_auc(MODEL, MODEL) == AucInterval(0.5, 0.5, 0.5)
 
 
 def test_nor_from_itself_shuffled_and_hardly_changed() -> None:
-    """The twin of each Gaussian has the other label; trees that learn from it would answer the wrong way."""
+    """The equal of each Gaussian has the other label; trees that learn from it answer the wrong way."""
     order = torch.randperm(800, generator=torch.Generator().manual_seed(0))
-    twin = MODEL.map(lambda values: values[order] * (1 + 1e-6))
-    assert two_sample_auc(MODEL, twin)["auc"] == pytest.approx(0.5, abs=0.02)
+    near_equal = MODEL.map(lambda values: values[order] * (1 + 1e-6))
+    assert two_sample_auc(MODEL, near_equal).auc == pytest.approx(0.5, abs=0.02)
 
 
 def test_nor_from_independent_samples_of_the_same_and_it_is_not_sure() -> None:
     found = two_sample_auc(MODEL, rescaled_quaternions(OTHER))
-    assert found["low"] < 0.5 < found["high"]
-    assert found["high"] - found["low"] == pytest.approx(2 * 1.96 * (2 / (12 * 800)) ** 0.5, rel=0.1)
+    assert found.low < 0.5 < found.high
+    assert found.high - found.low == pytest.approx(2 * 1.96 * (2 / (12 * 800)) ** 0.5, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -56,14 +57,14 @@ def test_nor_from_independent_samples_of_the_same_and_it_is_not_sure() -> None:
     ],
 )
 def test_what_differs_is_told_apart(change: Callable[[Gaussians], Gaussians], least: float) -> None:
-    assert two_sample_auc(MODEL, change(OTHER))["low"] > least
+    assert two_sample_auc(MODEL, change(OTHER)).low > least
 
 
 def test_nearly_as_well_as_can_be() -> None:
     """Normal numbers one standard deviation apart: no classifier gets beyond 0.760."""
     shifted = lifelike(2000, seed=1).with_sh_degree(0)
     shifted = replace(shifted, opacity_logits=shifted.opacity_logits + 1.5)
-    auc = two_sample_auc(lifelike(2000).with_sh_degree(0), shifted)["auc"]
+    auc = two_sample_auc(lifelike(2000).with_sh_degree(0), shifted).auc
     assert 0.72 < auc < 0.78
 
 
@@ -85,12 +86,13 @@ def test_delong_is_what_it_is_defined_as() -> None:
 def test_against_plain_models() -> None:
     plain = [lifelike(300, seed).with_sh_degree(0) for seed in (1, 2)]
     model = tripled_positions(lifelike(300).with_sh_degree(0))
-    found = two_sample_against_null(model, plain)
-    assert len(found["against_plain"]) == 2
-    assert found["against_plain"][1] == two_sample_auc(plain[1], model)
-    assert found["between_plain"] == [two_sample_auc(*plain)]
-    assert found["auc"] == np.mean([each["auc"] for each in found["against_plain"]])
-    assert found["auc"] > 0.85 > 0.6 > found["null"]
+    found = two_sample_against_controls(model, plain, original=plain[0])
+    assert len(found.stego) == 2
+    assert found.stego[1] == two_sample_auc(plain[1], model)
+    assert found.control == (two_sample_auc(*plain),)
+    assert found.original == (two_sample_auc(plain[0], plain[0]), two_sample_auc(plain[1], plain[0]))
+    assert min(each.auc for each in found.stego) > 0.85 > 0.6 > found.control[0].auc
+    assert two_sample_against_controls(model, plain).original == ()
 
 
 def test_too_little_is_refused() -> None:
@@ -98,5 +100,5 @@ def test_too_little_is_refused() -> None:
         two_sample_auc(MODEL, MODEL[:99])
     with pytest.raises(UsageError, match="too few places"):
         two_sample_auc(MODEL, replace(MODEL, means=0 * MODEL.means + torch.arange(800)[:, None] // 400))
-    with pytest.raises(UsageError, match="two plain models"):
-        two_sample_against_null(MODEL, [MODEL])
+    with pytest.raises(UsageError, match="two control models"):
+        two_sample_against_controls(MODEL, [MODEL])

@@ -1,14 +1,17 @@
-"""The attack by gradient opens what is not sealed, and one secret's decoder does not help towards another."""
+"""The attack by gradient opens what is not encrypted; one secret's decoder does not help towards another."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import pytest
 from torch import Tensor
 
 from keyss.core import Gaussians
 from keyss.measure.white_box import search_embeddings
-from keyss.methods.learned.pipeline import Hidden, hide_scenes
-from keyss.methods.learned.revealing import decode
+from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.revealing import OpenedSecret, decode
+from methods.learned.hiding import Hidden, hide_scenes
 from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
 
 RESTARTS = 4
@@ -21,10 +24,14 @@ def hidden() -> Hidden:
     return hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
 
 
+def _decoder(secret: HiddenSecret) -> Callable[[Gaussians, Tensor], Gaussians]:
+    return OpenedSecret(secret).decode
+
+
 @pytest.fixture(scope="module")
 def found(hidden: Hidden) -> list[Tensor]:
     """What the search finds on each secret's decoder."""
-    return [search_embeddings(secret.decoder, hidden.stego, restarts=RESTARTS) for secret in hidden.secrets]
+    return [search_embeddings(_decoder(secret), hidden.stego, restarts=RESTARTS) for secret in hidden.secrets]
 
 
 def _gain(hidden: Hidden, found: list[Tensor], decoder_of: int, shown: int) -> list[float]:

@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 
-def optional(metavar: str, help: str, otherwise: str) -> Any:
+def optional(metavar: str, help: str, otherwise: str, aliases: list[str] | None = None) -> Any:
     """An argument that may be left out; `otherwise` says what happens then."""
-    return arg(metavar=metavar, help=help, help_behavior_hint=f"(default: {otherwise})")
+    hint = f"(default: {otherwise})"
+    return arg(metavar=metavar, help=help, help_behavior_hint=hint, aliases=aliases)
 
 
 Device = Annotated[

@@ -166,7 +166,8 @@ def _with_options_of(method: Method) -> Callable[..., None]:
             continue
         choices = "{" + ",".join(get_args(kind)) + "}" if get_origin(kind) is Literal else None
         given = str if option.parse else kind
-        described = optional(option.metavar or choices or "TEXT", option.help, "the preset's")
+        metavar = option.metavar or choices or "TEXT"
+        described = optional(metavar, option.help, "the preset's", aliases)
         hints[name], defaults[name] = Annotated[given | None, described], None
     command.__name__, command.__doc__, command.__annotations__ = "hide", hide.__doc__, hints
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]

@@ -38,9 +38,8 @@ class Decoy:
         skew = torch.zeros(3, 3, dtype=torch.float64)
         skew[[2, 0, 1], [1, 2, 0]] = turn
         size = (stego.means - stego.means.mean(0)).norm(dim=1).median().double().clamp_min(1e-9).cpu()
-        return Decoy(
-            Similarity(1 + float(shift.mean()), torch.matrix_exp(skew - skew.T), shift * size), changes
-        )
+        scale = 1 + _MOVE + abs(float(shift.mean()))  # never so near to 1 that log scales stay the same
+        return Decoy(Similarity(scale, torch.matrix_exp(skew - skew.T), shift * size), changes)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The drawn Gaussians of the cover, all changed; see `Opened.reveal`."""

@@ -9,11 +9,14 @@ from pathlib import Path
 import torch
 
 from keyss.core import Gaussians, Scene
+from keyss.core.similarity import Similarity
 from keyss.fitting.loop import Reporter
+from keyss.keys import random_embeddings
 from keyss.methods import registry
 from keyss.methods.base import Context, KeyedSource, SceneInput, Source
+from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.options import LearnedOptions
-from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods.learned.payload import HiddenSecret, choose_anchors
 from keyss.methods.learned.revealing import OpenedSecret
 from keyss.methods.plain_models import plain_models
 
@@ -56,3 +59,13 @@ def open_secret(stego: Gaussians, key: str, sidecar: bytes | None = None) -> Hid
     opened = registry.open_model(stego, key, sidecar=sidecar)
     assert isinstance(opened, OpenedSecret)
     return opened.secret
+
+
+def some_secret(stego: Gaussians) -> HiddenSecret:
+    """A secret that `stego` belongs to, whose opacity remap changes a little."""
+    generator = torch.Generator().manual_seed(0)
+    decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))
+    decoder.prepare(stego, random_embeddings(1, generator)[0])
+    decoder.values.normal_(std=0.02, generator=generator)
+    frame = Similarity(1.001, translation=torch.full((3,), 0.01, dtype=torch.float64))
+    return HiddenSecret(decoder.requires_grad_(False), frame, choose_anchors(stego, generator))
