@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from keyss.files.layout import SceneLayout, Photo, PointCloud, hold_out, refuse_duplicates
+from keyss.files.layout import Photo, PointCloud, SceneLayout, hold_out, refuse_duplicates
 from keyss.files.transforms import read_transforms
 
 

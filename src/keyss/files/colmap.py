@@ -6,7 +6,7 @@ from pathlib import Path, PureWindowsPath
 
 from keyss.core.errors import InputError
 from keyss.files.colmap_model import find_model, read_sparse_model
-from keyss.files.layout import SceneLayout, Photo, hold_out, refuse_duplicates
+from keyss.files.layout import Photo, SceneLayout, hold_out, refuse_duplicates
 
 
 def is_colmap(folder: Path) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import InputError
-from keyss.files.layout import SceneLayout, Photo, PointCloud, hold_out
+from keyss.files.layout import Photo, PointCloud, SceneLayout, hold_out
 from keyss.files.point_cloud import read_point_cloud
 from keyss.files.transforms import find_image, inside, read_transforms
 

@@ -19,7 +19,7 @@ from keyss.core.scene import Camera, Scene, View
 from keyss.files.blender import is_blender, read_blender
 from keyss.files.colmap import is_colmap, read_colmap
 from keyss.files.images import probe_image, read_image, shrink
-from keyss.files.layout import SceneLayout, Photo
+from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
 from keyss.files.nerfstudio import is_nerfstudio, read_nerfstudio
 
