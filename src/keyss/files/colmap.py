@@ -54,11 +54,6 @@ class _Image(NamedTuple):
     viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
 
 
-def is_colmap(folder: Path) -> bool:
-    """Whether the folder holds `cameras.bin` or `cameras.txt` in `sparse/0/`, `sparse/` or itself."""
-    return _model_folder(folder) is not None
-
-
 def read_colmap(folder: Path) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
 
@@ -68,7 +63,7 @@ def read_colmap(folder: Path) -> SceneLayout:
     reconstruction has (NaN, zero quaternions, unknown cameras, absurd counts or sizes). Whether the photos
     exist is checked when they are read.
     """
-    model = _model_folder(folder)
+    model = colmap_model_folder(folder)
     if model is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
     if (model / "cameras.bin").is_file():
@@ -98,7 +93,7 @@ def _inside(model_folder: Path, name: str) -> str:
     return name
 
 
-def _model_folder(folder: Path) -> Path | None:
+def colmap_model_folder(folder: Path) -> Path | None:
     """Where the sparse model of a scene lies: `sparse/0`, `sparse` or the folder itself; None if nowhere."""
     for candidate in (folder / "sparse" / "0", folder / "sparse", folder):
         if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
