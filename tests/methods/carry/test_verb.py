@@ -12,11 +12,10 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import keys, trained_like
-from keyss import FitConfig, Gaussians, HideConfig, Secret
+from keyss import FitConfig, HideConfig, Secret
 from keyss.channels.low_bits.container import embed
 from keyss.cli import main
 from keyss.core import UsageError, WrongKeyError
-from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.ply import read_ply, write_ply
 from keyss.methods.carry.carrying import embed_derived
 from keyss.methods.carry.thinning import most_visible
@@ -151,16 +150,6 @@ def test_thinning_keeps_what_is_visible() -> None:
     kept = most_visible(model, 600)
     assert torch.equal(kept.means, model.means[400:])
     assert most_visible(model, 1000) is model
-
-
-def test_filling_makes_up_for_what_is_lost() -> None:
-    model = trained_like(1000)
-    assert compensate_pruning(model, 1000) is model
-    rest = compensate_pruning(model[:500], 1000)
-    assert (rest.opacities >= model[:500].opacities - 1e-6).all()
-    assert torch.allclose(rest.opacities, 1 - (1 - model[:500].opacities) ** 2, atol=1e-5)
-    sure = Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits * 0 + 40, model.sh)
-    assert torch.isfinite(compensate_pruning(sure[:1], 1000).opacity_logits).all()
 
 
 def test_a_model_that_carries_still_opens_the_learned_method_s_way() -> None:
