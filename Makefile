@@ -23,7 +23,7 @@ PACKAGE := .venv/.package
 DEV := .venv/.dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt $(PIP_EXTRA)
 PINS := pyproject.toml requirements/constraints.txt
-PYTHON_CODE := src tests benchmarks
+PYTHON_CODE := src tests benchmarks docs
 
 OLDEST := .venv-oldest
 OLDEST_DEV := $(OLDEST)/.dev
@@ -72,7 +72,7 @@ format: $(DEV)
 	$(BIN)/ruff format $(PYTHON_CODE)
 
 docs: $(DEV)
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet  # no advertisement of its successor
 
 benchmark-check: $(DEV)
 	$(BIN)/python benchmarks/quick.py --check $(ARGS)
