@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from keyss.methods.learned.config import PRESETS
 
 from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
