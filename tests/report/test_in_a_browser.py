@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from report.audits import BLUE, GREEN, RED
+from report.browser import Page
 
 from keyss.report import write_report
 from report import browser
-from report.audits import BLUE, GREEN, RED
-from report.browser import Page
 
 PROGRAM = browser.find()
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason=f"none of {', '.join(browser.NAMES)} on PATH")

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-
 from keyss.report.reading import Part
 from keyss.report.survival import survivals
-from keyss.report.verdicts import Verdict, headline, verdicts
 from report.audits import audit
+
+from keyss.report.verdicts import Verdict, headline, verdicts
 
 
 def judged(data: dict[str, Any]) -> dict[str, Verdict]:
