@@ -31,15 +31,15 @@ def audited_run(root: Path) -> Path:
         for seed, name in enumerate(("garden", "treasure", "map"))
     ]
     secrets = [
-        Secret(scene, key, random_gaussians(300, seed))
+        Secret(scene, key, random_gaussians(150, seed))
         for seed, (scene, key) in enumerate(zip(scenes[1:], KEYS, strict=True), start=1)
     ]
     keyss.hide(
         scenes[0],
         secrets,
-        config=CONFIG.with_fit(max_gaussians=2000, iterations=20),
+        config=CONFIG.with_fit(max_gaussians=1100, iterations=20),
         width=40,
-        cover_model=random_gaussians(1500, seed=0),  # with room for decoders
+        cover_model=random_gaussians(1000, seed=0),  # with room for decoders
         out=root / "run",
     )
     with pytest.MonkeyPatch.context() as patch:
