@@ -21,15 +21,15 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import torch
+from keyss.channels.low_bits.container import embed
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits.container import embed
-from keyss.channels.sidecar import seal_sidecar
+from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.files.ply import write_ply
+from keyss.files.models import write_model
 from keyss.keys import generate_key, random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
@@ -49,11 +49,11 @@ def main() -> None:
     anchors = choose_anchors(plain, generator)
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
     payload = [(right, pack_secret(secret))]
-    stego, sidecar = embed(plain, payload), seal_sidecar(payload)
+    stego, sidecar = embed(plain, payload), encrypt_sidecar(payload)
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"
-        write_ply(path, stego)
+        write_model(path, stego)
         beside.write_bytes(sidecar)
         _compare("open, one file", lambda key: _attempt(stego, key, None), right, wrong, asked.rounds)
         _compare("open, sidecar", lambda key: _attempt(stego, key, sidecar), right, wrong, asked.rounds)

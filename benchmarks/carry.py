@@ -23,16 +23,17 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from keyss.methods.carry.plan import Size, room
+
 from channels.low_bits.trained_like import trained_like
-from keyss import read_ply, write_ply
+from keyss import read_model, write_model
 from keyss.core import Gaussians, KeyssError, Scene
-from keyss.core.pruning_compensation import filled
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.methods.carry import embed, extract
 from keyss.methods.carry.carrying import usable_carriers
 from keyss.methods.carry.dither import cost
-from keyss.methods.carry.plan import Size, room
 from keyss.rendering import render
 
 KEY = "the key of the benchmark"
@@ -75,15 +76,15 @@ def _timed(count: int) -> None:
 def _step(step: str, folder: Path, count: int) -> None:
     if step == "make":
         for name, seed in (("cover", 0), ("secret", 1)):
-            write_ply(folder / f"{name}.ply", trained_like(count, seed))
+            write_model(folder / f"{name}.ply", trained_like(count, seed))
         return
     start = time.perf_counter()
     if step == "hide":
-        stego = embed(read_ply(folder / "cover.ply"), [(KEY, read_ply(folder / "secret.ply"))])
-        write_ply(folder / "stego.ply", stego)
+        stego = embed(read_model(folder / "cover.ply"), [(KEY, read_model(folder / "secret.ply"))])
+        write_model(folder / "stego.ply", stego)
     else:
-        carried = extract(read_ply(folder / "stego.ply"), KEY)
-        write_ply(folder / "revealed.ply", carried.gaussians)
+        carried = extract(read_model(folder / "stego.ply"), KEY)
+        write_model(folder / "revealed.ply", carried.gaussians)
         assert len(carried.gaussians) == count
     seconds = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2  # KiB on Linux
@@ -92,7 +93,7 @@ def _step(step: str, folder: Path, count: int) -> None:
 
 def _models(paths: list[Path]) -> None:
     """Renders from around each model, of the stego model and of what comes out again."""
-    models = {path: read_ply(path) for path in paths}
+    models = {path: read_model(path) for path in paths}
     for cover, secret in zip(paths, paths[1:] + paths[:1], strict=True):
         try:
             usable = usable_carriers(models[cover])
@@ -113,14 +114,13 @@ def _photos(pairs: list[list[str]], width: int) -> None:
     """Against the test photos, whole and with a quarter of the Gaussians removed."""
     scenes = {scene: load_scene(scene, width=width) for scene, _ in pairs}
     for (cover, cover_path), (secret, secret_path) in permutations(pairs, 2):
-        model, hidden = read_ply(cover_path), read_ply(secret_path)
+        model, hidden = read_model(cover_path), read_model(secret_path)
         stego = embed(model, [(KEY, hidden)])
         found = extract(stego, KEY).gaussians
         kept = stego[_kept(len(stego))]
         left = extract(kept, KEY)
-        raw, mended = (
-            _against(scenes[secret], each) for each in (left.gaussians, filled(left.gaussians, left.count))
-        )
+        compensated = compensate_pruning(left.gaussians, left.count)
+        raw, mended = (_against(scenes[secret], each) for each in (left.gaussians, compensated))
         whole, bare = _against(scenes[secret], found), _against(scenes[secret], hidden)
         before, after = _against(scenes[cover], model), _against(scenes[cover], kept)
         cover_change = _between(scenes[cover], model, stego)

@@ -17,7 +17,7 @@ from pathlib import Path
 import keyss
 from keyss.cli.keys import key_of_file
 from keyss.core import BackendError, Gaussians
-from keyss.files.ply import read_ply
+from keyss.files.models import read_model
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.measure.robustness import Reopener, converters
 from keyss.measure.robustness.changes import half_floats
@@ -34,7 +34,7 @@ def main() -> None:
         keyss.load_scene(path, width=settings["width"])
         for path in (settings["cover"], settings["secrets"][0])
     )
-    stego, source = read_ply(asked.run / "stego.ply"), asked.run / "stego.ply"
+    stego, source = read_model(asked.run / "stego.ply"), asked.run / "stego.ply"
     reopen = Reopener(key_of_file(asked.key_file), (asked.run / "decoder.sealed").read_bytes())
 
     def measured(model: Gaussians) -> tuple[float, float]:

@@ -20,20 +20,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from keyss.methods.learned.config import PRESETS, HideConfig
 
 import keyss
+from benchmark_record import make_record, write_record
 from keyss.core import Scene, WrongKeyError
 from keyss.core.alignment import align
 from keyss.core.similarity import Similarity
 from keyss.files.atomic import write_bytes
-from keyss.files.ply import read_ply
+from keyss.files.models import read_model
 from keyss.files.scenes import load_scene
 from keyss.fitting.loop import Interrupted
 from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.plain import PlainRun
 from keyss.keys import DerivedKey, KeyDerivation, random_embeddings
 from keyss.measure.hiding import what_wrong_keys_show
-from keyss.methods.learned.config import PRESETS, HideConfig
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.pipeline import training_salt
 from keyss.methods.learned.revealing import open_secret
@@ -141,7 +142,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
 
 def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed: int) -> dict[str, Any]:
     """What near and random keys show to somebody who holds the decoders, and how many the files refuse."""
-    stego = read_ply(out / "stego.ply")
+    stego = read_model(out / "stego.ply")
     beside = out / "decoder.sealed"
     sidecar = beside.read_bytes() if beside.exists() else None
     opened = [open_secret(stego, key, sidecar) for key in keys]
@@ -165,7 +166,7 @@ def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed
 
 def step_cost(scenes: Sequence[Scene], models: Sequence[Path], config: HideConfig) -> float:
     """Time of a hiding step over that of a plain step of the cover, with as many Gaussians, in one run."""
-    plains = [read_ply(path) for path in models]
+    plains = [read_model(path) for path in models]
     cameras = [view.camera for view in scenes[0].train]
     frames = [Similarity.identity()]
     frames += [align([view.camera for view in scene.train], cameras) for scene in scenes[1:]]
@@ -256,6 +257,20 @@ def sooner(results: Sequence[dict[str, Any]]) -> str:
     return "".join(lines)
 
 
+def numbers_and_ratios(results: Iterable[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
+    """What the record of the benchmark keeps: decibels, seconds, and the cost of a step."""
+    numbers, ratios = {}, {}
+    for result in results:
+        name = f"{', '.join(result['names'])}, {result['preset']}, seed {result['seed']}"
+        metrics = result["metrics"]
+        numbers[f"{name}: cover, dB"] = metrics["cover"]["psnr"]
+        for index, each in enumerate(metrics["secrets"], 1):
+            numbers[f"{name}: secret {index}, dB"] = each["psnr"]
+        numbers[f"{name}: hiding, s"] = metrics["seconds"]
+        ratios[f"{name}: step / plain step"] = result["cost"]
+    return numbers, ratios
+
+
 def write_between_marks(path: Path, text: str) -> None:
     """Replace what stands between the marks in a document."""
     document = path.read_text()
@@ -293,6 +308,7 @@ def main() -> None:
     if later := sooner(results):
         text += f"\n{later}"
     print(text)
+    print(write_record(make_record("fidelity", *numbers_and_ratios(results))))
     if settings.write is not None:
         write_between_marks(settings.write, text)
 

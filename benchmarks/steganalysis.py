@@ -20,10 +20,11 @@ from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.steganalysis import features, held_out_scores, parts, standard_error
 from keyss.channels.low_bits.byte_plan import SALTS
 from keyss.channels.low_bits.container import embed_derived
-from keyss.files.ply import read_ply
+
+from channels.low_bits.steganalysis import features, held_out_scores, parts, standard_error
+from keyss.files.models import read_model
 from keyss.keys import DerivedKey
 from keyss.methods.carry import carrying
 
@@ -34,10 +35,10 @@ def main(arguments: list[str]) -> None:
     carried = "--carry" in arguments
     arguments = [argument for argument in arguments if argument != "--carry"]
     plain, embedded, scenes, models = [], [], [], []
-    secret = read_ply(arguments[-1].split("=", 1)[1])
+    secret = read_model(arguments[-1].split("=", 1)[1])
     for model, argument in enumerate(arguments):
         scene, path = argument.split("=", 1)
-        whole = read_ply(path)
+        whole = read_model(path)
         for part in parts(whole, min(2, int(np.log2(len(whole) / 1000)))):
             keys = [DerivedKey.of_master(os.urandom(32)) for _ in range(SALTS)]
             plain.append(features(part))

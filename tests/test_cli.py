@@ -22,7 +22,7 @@ from keyss import api as verbs
 from keyss.cli import commands, main
 from keyss.files.ply import read_ply
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.learned.config import PRESETS as HIDE_PRESETS
+from keyss.methods.learned.options import PRESETS as HIDE_PRESETS
 
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
 COMMANDS = [command.__name__ for command in commands.ALL]

@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.channels.sidecar import seal_sidecar, unseal_sidecar
+from keyss.channels.base import Payload
+from keyss.channels.sidecar import decrypt_sidecar, encrypt_sidecar
 from keyss.cli import commands, main
 from keyss.core.errors import KeyssError
-from keyss.fitting.loop import Silent
+from keyss.fitting.loop import SilentReporter
 from keyss.keys import DerivedKey, KeyDerivation
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -28,7 +29,7 @@ SPELLINGS = [
 ]
 
 
-class _CtrlC(Silent):
+class _CtrlC(SilentReporter):
     """Presses it in the middle of hiding."""
 
     hiding = False
@@ -102,5 +103,5 @@ def test_errors_and_representations_do_not_show_the_key() -> None:
     assert KEY not in repr(derived)
     assert derived.expand("seal", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
-        unseal_sidecar(seal_sidecar([("another", b"x")]), KEY)
+        decrypt_sidecar(encrypt_sidecar([("another", Payload("test", b"x"))]), KEY)
     assert not _spelt(str(caught.value).encode())

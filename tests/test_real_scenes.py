@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 import keyss
-from keyss import FitConfig, HideConfig, Secret
+from keyss import FitConfig, LearnedOptions, Secret
 from keyss.audit import audit
 from keyss.cli import main
 from keyss.report.verdicts import verdicts
 from keyss.runs.audit_record import read_audit
 
 pytestmark = pytest.mark.slow
-CONFIG = HideConfig(fit=FitConfig(max_gaussians=20_000))
+CONFIG = LearnedOptions(fit=FitConfig(max_gaussians=20_000))
 
 
 @pytest.fixture(scope="module")

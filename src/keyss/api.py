@@ -6,34 +6,32 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+import torch
 from torch import Tensor
 
-from keyss._version import __version__
-from keyss.audit.methods import as_opened, metrics_of
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.files.atomic import write_bytes
-from keyss.files.output import OutputFolder, check_output_file
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.models import check_model_output, write_model
+from keyss.files.output import OutputFolder
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
+from keyss.keys import DerivedKey, KeyDerivation
 from keyss.measure.hiding import measure_hiding
 from keyss.measure.images import renders_of
-from keyss.methods.carry import verb as carrying
-from keyss.methods.carry.carrying import Carried
-from keyss.methods.learned.config import HideConfig
-from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.pipeline import hide_scenes
-from keyss.methods.learned.revealing import Frame
+from keyss.methods import registry
+from keyss.methods.base import Context, Frame, KeyedSource, Method, MethodOptions, SceneInput, Source, Stego
+from keyss.methods.plain_models import plain_models
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
+from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -41,25 +39,16 @@ from keyss.runs.files import (
     SIDECAR,
     STEGO,
     bytes_writer,
-    json_bytes,
-    json_writer,
     plain_names,
     ply_writer,
     png_writer,
+    record_writer,
 )
-from keyss.runs.opening import (
-    Background,
-    PathLike,
-    as_model,
-    as_scene,
-    fingerprint,
-    open_any,
-    open_run,
-    revealed,
-    sidecar_beside,
-)
+from keyss.runs.metrics import FitMetrics, HideMetrics
+from keyss.runs.opening import as_model, as_scene, open_file, open_run, sidecar_beside
+from keyss.runs.records import write_record
 
-Method = Literal["learned", "carry"]
+WRONG_KEYS = 32
 Split = Literal["test", "train", "all"]
 
 
@@ -68,11 +57,8 @@ class Secret:
     """A scene, a .ply file or a model to hide, and the key that is to open it."""
 
     scene: PathLike | Scene | Gaussians
-    key: str
+    key: str = field(repr=False)
     model: PathLike | Gaussians | None = None  # a plain 3DGS model of it, if there is one already
-
-    def __repr__(self) -> str:
-        return f"Secret(scene={self.scene!r}, key=<hidden>)"
 
 
 @dataclass(frozen=True)
@@ -80,8 +66,8 @@ class HideResult:
     """A hiding and how well it works."""
 
     stego: Gaussians  # to be published; with a key, all that revealing needs unless there is a sidecar
-    sidecar: bytes | None  # the sealed secrets, where they are not in the low bits of `stego`
-    metrics: dict[str, Any]
+    sidecar: bytes | None  # the encrypted secrets, where they are not in the low bits of `stego`
+    metrics: HideMetrics
 
 
 def fit(
@@ -117,21 +103,22 @@ def fit(
     )
     if folder is not None:
         test = quality(result.gaussians.to(target), loaded.test, loaded.background.to(target))
-        metrics = {
+        metrics = FitMetrics(
             **asdict(test),
-            "gaussians": len(result.gaussians),
-            "iterations": config.iterations,
-            "seconds": round(result.seconds, 1),
-            "width": _width(loaded),
-            "seed": config.seed,
-            "version": __version__,
-        }
-        settings = {"scene": _name(scene), "width": width, "config": asdict(config), "version": __version__}
+            gaussians=len(result.gaussians),
+            iterations=config.iterations,
+            seconds=round(result.seconds, 1),
+            width=_width(loaded),
+            seed=config.seed,
+        )
+        settings = FitRunConfig(
+            scene=path_of(scene), width=width, background=colour_of(background), config=config
+        )
         folder.fill(
             {
                 MODEL: ply_writer(result.gaussians),
-                CONFIG: json_writer(settings),
-                METRICS: json_writer(metrics),
+                CONFIG: record_writer(settings),
+                METRICS: record_writer(metrics),
             }
         )
     return result
@@ -141,15 +128,10 @@ def hide(
     cover: PathLike | Scene | Gaussians,
     secrets: Sequence[Secret],
     *,
-    method: Method = "learned",
-    config: HideConfig | None = None,
+    method: str | MethodOptions = "learned",
     width: int | None = None,
     background: Background = None,
     cover_model: PathLike | Gaussians | None = None,
-    sidecar: bool = False,
-    encoder: Callable[[str], Tensor] | None = None,
-    thin: bool = False,
-    dither: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -159,91 +141,58 @@ def hide(
     """Hide every secret in the cover, and measure the result on the test photos.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
-    come first unless they are given. What a key opens lies sealed in the low bits of `stego.ply`, or with
-    `sidecar` in a file `decoder.sealed`. `encoder`: from a key to the embedding [64] that conditions the
-    decoder, such as a `keyss.methods.learned.clip_keys.ClipKeys`; by default Argon2id's. `out` (a folder)
-    gets these, `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints
-    from which `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
-
-    With the `method` "carry" the models themselves go into the low bits of the cover's
-    (`keyss.methods.carry.verb`): nothing is trained but the models of scenes, cover and secrets may be .ply
-    files or `Gaussians`, and of `config` only `fit` counts. `thin` leaves out of secrets that are too large
-    what is least visible; `dither` gives new low bits to a cover whose are not random.
+    come first unless they are given. `method`: a name for default options, or a method's own options
+    (`LearnedOptions`, `CarryOptions`). What a key opens lies encrypted in the low bits of `stego.ply`; with
+    `LearnedOptions(sidecar=True)` it is in a file `decoder.sealed`. `out` (a folder) gets these,
+    `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which
+    `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
-    config = config or HideConfig()
-    if not secrets:
-        raise UsageError("expected at least one secret")
-    if sidecar if method == "carry" else (thin or dither):
-        raise UsageError("--thin and --dither are for --method carry, --sidecar is for the other")
+    chosen, options = _method(method)
+    if not 1 <= len(secrets) <= chosen.capabilities.most_secrets:
+        raise UsageError(
+            f"expected 1 to {chosen.capabilities.most_secrets} secrets for the method {chosen.name}, "
+            f"got {len(secrets)}"
+        )
+    keys = [secret.key for secret in secrets]
+    _check_keys(keys)
     target = resolve_device(device)
     folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
-    if method == "carry":
-        stego, metrics = carrying.hide(
-            [(cover, cover_model), *((secret.scene, secret.model) for secret in secrets)],
-            [secret.key for secret in secrets],
-            carrying.PlainModels(width, background, config.fit, target, folder, resume, reporter),
-            thin=thin,
-            dithered=dither,
-        )
-        return HideResult(stego, None, metrics)
+
     sources = [cover, *(secret.scene for secret in secrets)]
-    given = [
-        source if model is None and not isinstance(source, Scene) and is_model(source) else model
-        for source, model in zip(sources, [cover_model, *(secret.model for secret in secrets)], strict=True)
-    ]
-    plains = [None if model is None else as_model(model) for model in given]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    options = chosen.prepare(inputs, options)
     scenes = [as_scene(source, width, background) for source in sources]
-    keys = [secret.key for secret in secrets]
-    hidden = hide_scenes(
-        scenes,
-        keys,
-        config,
-        plains=plains,
-        sidecar=sidecar,
-        encoder=encoder,
-        device=target,
-        checkpoints=folder.checkpoints() if folder else None,
-        resume=resume,
-        reporter=reporter,
-    )
-    quality_found = measure_hiding(
-        hidden.stego.to(target),
-        [as_opened(each) for each in hidden.secrets],
-        scenes,
-        [plain.to(target) for plain in hidden.plains],
-        seed=config.fit.seed,
-    )
-    metrics = metrics_of(quality_found, len(hidden.stego))
-    metrics |= {
-        "iterations": config.fit.iterations,
-        "seconds": round(hidden.seconds, 1),
-        "width": _width(scenes[0]),
-        "seed": config.fit.seed,
-        "version": __version__,
-    }
+    trains = chosen.capabilities.trains or any(each.model is None for each in inputs)
+    context = Context(target, folder.checkpoints() if folder and trains else None, resume, reporter)
+    plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
+    own, *others = map(Source, scenes, plain)
+    stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
+
+    metrics = _measured(chosen, stego, scenes, plain, options, target)
     if folder is not None:
-        settings = {
-            "cover": _name(cover),
-            "secrets": [_name(secret.scene) for secret in secrets],
-            "models_given": [model is not None for model in given],
-            "width": width,
-            "background": None if background is None else [float(x) for x in background],
-            "key_encoder": "argon2" if encoder is None else type(encoder).__name__,
-            "payloads": [fingerprint(secret) for secret in hidden.secrets],
-            "config": asdict(config),
-            "version": __version__,
-        }
+        settings = RunConfig(
+            method=chosen.name,
+            cover=path_of(cover),
+            secrets=tuple(path_of(secret.scene) for secret in secrets),
+            models_given=tuple(each.model is not None for each in inputs),
+            width=width,
+            background=colour_of(background),
+            payloads=tuple(each.fingerprint() for each in stego.opened),
+            options=options,
+        )
         writers: dict[str, Callable[[Path], None]] = {
-            STEGO: ply_writer(hidden.stego),
-            CONFIG: json_writer(settings),
-            METRICS: json_writer(metrics),
+            STEGO: ply_writer(stego.gaussians),
+            CONFIG: record_writer(settings),
+            METRICS: record_writer(metrics),
         }
-        if hidden.sidecar is not None:
-            writers[SIDECAR] = bytes_writer(hidden.sidecar)
-        for name, plain in zip(plain_names(len(secrets)), hidden.plains, strict=True):
-            writers[name] = ply_writer(plain)
+        if stego.sidecar is not None:
+            writers[SIDECAR] = bytes_writer(stego.sidecar)
+        writers |= {
+            name: ply_writer(model) for name, model in zip(plain_names(len(secrets)), plain, strict=True)
+        }
         folder.fill(writers)
-    return HideResult(hidden.stego, hidden.sidecar, metrics)
+    return HideResult(stego.gaussians, stego.sidecar, metrics)
 
 
 def reveal(
@@ -258,25 +207,27 @@ def reveal(
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> Gaussians:
-    """The secret that `key` opens in a stego model, as an ordinary model; see `reveal_gaussians`.
+    """The secret that `key` opens in a stego model, as an ordinary model.
 
-    Which method hid it shows itself. A carried one was never in the cover's frame and comes in its own; if
-    Gaussians were lost, the others are enlarged to make up for them (`keyss.core.pruning_compensation`).
+    Which method hid it shows itself. `frame`: "secret" gives it in its own frame, so that its cameras fit it;
+    "cover" leaves it where it was hidden, which a carried one never was. If Gaussians were lost, the others
+    make up for them (`keyss.core.pruning_compensation`). `force` is for models that were quantised: it skips
+    the check that the secret belongs to this one.
 
     `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
     lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
-    opens nothing (with `decoy` the cover comes instead, see `decoy_secret`), InputError for files that are
-    not what they should be or do not belong together.
+    opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for files that
+    are not what they should be or do not belong together.
     """
     target = resolve_device(device)
-    path = None if out is None else check_output_file(out, overwrite)
+    path = None if out is None else check_model_output(out, overwrite)
     model = as_model(stego)
     if decoder is None and not isinstance(stego, Gaussians):
         decoder = sidecar_beside(Path(stego))
-    secret = open_any(model, key, decoder, decoy=decoy)
-    found = revealed(model.to(target), secret, frame=frame, force=force)
+    secret = open_file(model, key, decoder, decoy=decoy)
+    found = secret.reveal(model.to(target), frame=frame, force=force)
     if path is not None:
-        write_ply(path, found)
+        write_model(path, found)
     return found
 
 
@@ -310,48 +261,88 @@ def evaluate(
     run: PathLike,
     keys: Sequence[str],
     *,
-    wrong_keys: int = 32,
-    seed: int = 0,
+    wrong_keys: int | None = None,
+    seed: int | None = None,
     device: Backend = "auto",
-    reporter: Reporter | None = None,
-) -> dict[str, Any]:
+) -> HideMetrics:
     """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
 
-    `keys`: those of all its secrets, in any order. Raises WrongKeyError for a key that opens nothing,
-    UsageError for a secret without a key.
+    `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
+    by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
+    key that opens nothing, UsageError for a secret without a key.
     """
     target = resolve_device(device)
     opened = open_run(run, keys)
-    learned = [each for each in opened.opened if isinstance(each, HiddenSecret)]
-    carried = [each for each in opened.opened if isinstance(each, Carried)]
-    if carried:
-        metrics = carrying.evaluate(
-            opened.metrics,
-            opened.stego,
-            carried,
-            opened.sources,
-            opened.width,
-            opened.background,
-            target,
+    if (wrong_keys, seed) != (None, None) and all(each.decode is None for each in opened.opened):
+        raise UsageError(
+            f"wrong keys show nothing of what the method {opened.config.method} hid: there is no decoder; "
+            "leave out their number and seed"
         )
-    else:
-        bounds = [read_ply(opened.folder / name) for name in plain_names(len(learned))]
-        found = measure_hiding(
-            opened.stego.to(target),
-            [as_opened(each) for each in learned],
-            opened.scenes(),
-            [bound.to(target) for bound in bounds],
-            wrong_keys=wrong_keys,
-            seed=seed,
-        )
-        metrics = opened.metrics | metrics_of(found, len(opened.stego))
-    write_bytes(opened.folder / METRICS, json_bytes(metrics))
+    measured = measure_hiding(
+        opened.stego.to(target),
+        opened.opened,
+        opened.scenes(),
+        [None if model is None else model.to(target) for model in opened.plain_models()],
+        wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
+        seed=seed or 0,
+    )
+    metrics = replace(opened.metrics, **vars(measured))
+    write_record(opened.folder / METRICS, metrics)
     return metrics
 
 
-def _name(source: PathLike | Scene | Gaussians) -> str | None:
-    """Where a scene can be found again, None for one in memory."""
-    return None if isinstance(source, Scene | Gaussians) else str(Path(source).resolve())
+def _method(chosen: str | MethodOptions) -> tuple[Method, MethodOptions]:
+    """A method and its options."""
+    if isinstance(chosen, MethodOptions):
+        return registry.of_options(chosen), chosen
+    method = registry.get(chosen)
+    return method, next(iter(method.presets.values()))
+
+
+def _input(source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None) -> SceneInput:
+    """A scene and the plain model that is given with it, or that it is."""
+    photos = isinstance(source, Scene) or not is_model(source)
+    if not photos and model is None:
+        model = source  # type: ignore[assignment]
+    return SceneInput(None if model is None else as_model(model), photos)
+
+
+def _check_keys(keys: Sequence[str]) -> None:
+    """Raise UsageError for keys that cannot be, or are the same to key derivation, before any work."""
+    cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
+    derived = [DerivedKey(key, cheap) for key in keys]
+    if any(a.equals(b) for a, b in combinations(derived, 2)):
+        raise UsageError("two secrets have the same key: each needs its own")
+
+
+def _measured(
+    method: Method,
+    stego: Stego,
+    scenes: Sequence[Scene],
+    models: Sequence[Gaussians],  # plain ones of the scenes
+    options: MethodOptions,
+    device: torch.device,
+) -> HideMetrics:
+    """What `stego` comes to."""
+    measured = measure_hiding(
+        stego.gaussians.to(device),
+        stego.opened,
+        scenes,
+        [model.to(device) for model in models],
+        wrong_keys=WRONG_KEYS,
+        seed=options.fit.seed,
+    )
+    return HideMetrics(
+        **vars(measured),
+        method=method.name,
+        gaussians=len(stego.gaussians),
+        secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
+        iterations=stego.iterations,
+        seconds=round(stego.seconds, 1),
+        width=_width(scenes[0]),
+        seed=options.fit.seed,
+        details=stego.details,
+    )
 
 
 def _width(scene: Scene) -> int:

@@ -16,10 +16,10 @@ from keyss.core import OutputError
 from keyss.demo import run as demo
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Interrupted
-from keyss.methods.learned.config import HideConfig
+from keyss.methods.learned.options import LearnedOptions
 
 SMALL: dict[str, Any] = {
-    "config": HideConfig(fit=FitConfig(iterations=30, max_gaussians=300)),
+    "config": LearnedOptions(fit=FitConfig(iterations=30, max_gaussians=300)),
     "views": 16,
     "width": 32,
     "height": 24,

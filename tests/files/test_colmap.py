@@ -92,9 +92,9 @@ def test_points_land_on_their_observations(real_data: Path, width: int | None) -
 
 
 def test_a_large_model_is_read_quickly(real_data: Path) -> None:
-    start = time.perf_counter()
+    start = time.process_time()  # of this process alone: others may keep the machine busy
     layout = read_colmap(real_data / "bonsai")
-    assert time.perf_counter() - start < 2
+    assert time.process_time() - start < 2
     assert (len(layout.train), len(layout.test), len(layout.points.xyz)) == (255, 37, 72_074)
 
 

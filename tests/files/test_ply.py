@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from keyss.core import Gaussians, InputError, OutputError
-from keyss.files.ply import OPACITY_LOGIT_BOUND, describe_ply, read_ply, write_ply
+from keyss.files.ply import OPACITY_LOGIT_BOUND, read_ply, write_ply
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -196,14 +196,6 @@ def test_other_values_must_be_finite(tmp_path: Path, name: str, value: float, ki
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns, kinds={name: kind}))
     with pytest.raises(InputError, match=rf"among 4 Gaussians: {name} in 2$"):
         read_ply(tmp_path / "a.ply")
-
-
-def test_describes(model: Path) -> None:
-    info, gaussians = describe_ply(model), read_ply(model)
-    assert (info.count, info.sh_degree, info.bytes) == (5, 1, model.stat().st_size)
-    assert info.lower == tuple(gaussians.means.amin(0).tolist())
-    assert info.upper == tuple(gaussians.means.amax(0).tolist())
-    assert info.faint_share == pytest.approx(float((gaussians.opacities < 0.05).float().mean()))
 
 
 # --- what is refused -------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from keyss.core import Gaussians, InputError, UsageError
 from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.fitting.loop import Interrupted, Silent
+from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.fitting.plain import PlainRun, fit_scene
 from tiny_scenes import tiny_scene
 
@@ -24,7 +24,7 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
 
 
-class InterruptAt(Silent):
+class InterruptAt(SilentReporter):
     """Presses Ctrl-C at one iteration."""
 
     def __init__(self, iteration: int) -> None:

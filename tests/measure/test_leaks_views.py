@@ -23,7 +23,7 @@ from keyss.measure.leaks.opacities import (
 )
 from keyss.methods.learned.attacks import attacks, by_the_source, outside_the_bands
 from keyss.methods.learned.start import hidden_logits, opacity_curve
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 from tiny_scenes import random_gaussians, ring_cameras
 
 ATTRIBUTES: tuple[Attribute, ...] = ("quaternion length", "scale", "SH energy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import pytest
@@ -10,8 +11,7 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.audit.methods import opener
-from keyss.channels.low_bits.bits import is_random
+from keyss.channels.low_bits import LOW_BITS
 from keyss.core import Gaussians, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import mean_psnr, quality
@@ -33,9 +33,10 @@ from keyss.measure.robustness.changes import (
 )
 from keyss.measure.robustness.retraining import purification
 from keyss.measure.robustness.survival import ChangedQuality, First, StrengthLosses
-from keyss.methods.carry import embed
-from keyss.methods.carry.plan import Size, plan
-from keyss.methods.learned.pipeline import hide_scenes
+from keyss.methods.carry.carrying import record_request
+from keyss.methods.registry import open_model
+from methods.carry.carried import embed
+from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _moved, _scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -188,7 +189,7 @@ def test_a_learned_secret_without_low_bits(sidecar: bool, pair: tuple[list[Scene
     scenes, models = pair
     config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=5, max_gaussians=2000))
     hidden = hide_scenes(scenes, [KEY], config, plains=models, sidecar=sidecar)
-    reopen = Reopener(KEY, opener(hidden.sidecar))
+    reopen = Reopener(KEY, partial(open_model, sidecar=hidden.sidecar))
     assert KEY not in repr(reopen)
     revealed = keyss.reveal(hidden.stego, KEY, decoder=hidden.sidecar)
     assert same(reopen(hidden.stego).gaussians, revealed)
@@ -213,9 +214,9 @@ def test_pruning_a_carried_model_costs_what_it_must() -> None:
     """A Gaussian of the secret is lost with its carrier, unless there is a copy on another."""
     cover, secret, share = trained_like(3000), trained_like(1200, seed=1), 0.25
     stego = embed(cover, [(KEY, secret)])
-    (layout,) = plan([Size(1200, 3)], int(is_random(cover).sum()), 3000, 3)
+    (layout,) = LOW_BITS.prepare(cover).plan_records([record_request(1200, 3)])
     expected = (1200 - layout.copies) * (1 - share) + layout.copies * (1 - share**2)
-    reopen = Reopener(KEY, opener())
+    reopen = Reopener(KEY, open_model)
     left = reopen(random_pruning(share)(stego)).gaussians
     assert abs(len(left) - expected) < 5 * (1200 * share * (1 - share)) ** 0.5
     whole = reopen(stego).gaussians

@@ -13,13 +13,13 @@ import torch
 
 from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
-from keyss.audit.methods import opener
 from keyss.core import Gaussians, Scene
 from keyss.files.ply import write_ply
 from keyss.measure import speed as module
 from keyss.measure.robustness import Reopened, Reopener
 from keyss.measure.speed import FileSize, ReaderResult, readers, render_time, reveal_seconds, speed
-from keyss.methods.carry import embed
+from keyss.methods.registry import open_model
+from methods.carry.carried import embed
 from tiny_scenes import random_gaussians, tiny_scene
 
 __all__ = ["splat_transform"]  # a fixture
@@ -148,7 +148,7 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     steps: list[tuple[int, int, str]] = []
     found = speed(
         tmp_path / "stego.ply",
-        [Reopener(KEY, opener())],
+        [Reopener(KEY, open_model)],
         scenes,
         [cover, secret],
         rounds=2,

@@ -8,15 +8,15 @@ import pytest
 
 import keyss
 from keyss.core import Gaussians, Scene
-from keyss.methods.learned.attacks import attacks
-from keyss.methods.learned.pipeline import hide_scenes
+from keyss.methods.learned.attacks import known_remaps
+from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _psnr, _scenes
 from tiny_scenes import random_gaussians
 
 
 def _without_a_key(stego: Gaussians) -> Gaussians:
     """What the program's source alone tells of the first secret."""
-    return attacks(stego, 1)["secret 1"]
+    return known_remaps(stego, 1)["secret 1"]
 
 
 def _gain(scenes: list[Scene], models: list[Gaussians], sidecar: bool) -> float:

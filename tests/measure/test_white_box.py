@@ -7,12 +7,11 @@ from collections.abc import Callable
 import pytest
 from torch import Tensor
 
-from keyss.audit.methods import as_opened
 from keyss.core import Gaussians
 from keyss.measure.white_box import search_embeddings
 from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.pipeline import Hidden, hide_scenes
-from keyss.methods.learned.revealing import decode
+from keyss.methods.learned.revealing import OpenedSecret, decode
+from methods.learned.hiding import Hidden, hide_scenes
 from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
 
 RESTARTS = 4
@@ -26,9 +25,7 @@ def hidden() -> Hidden:
 
 
 def _decoder(secret: HiddenSecret) -> Callable[[Gaussians, Tensor], Gaussians]:
-    decode = as_opened(secret).decode
-    assert decode is not None
-    return decode
+    return OpenedSecret(secret).decode
 
 
 @pytest.fixture(scope="module")

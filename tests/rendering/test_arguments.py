@@ -1,17 +1,21 @@
-"""Wrong arguments are refused, each by name."""
+"""The arguments are those of gsplat; wrong and unsupported ones are refused, each by name."""
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 from types import SimpleNamespace
 from typing import Any
 
+import gsplat
 import pytest
 import torch
 
 from keyss.core import BackendError, UsageError
-from keyss.rendering import rasterization, resolve_device
+from keyss.rendering import cuda, rasterization, resolve_device
+from keyss.rendering.arguments import ONLY_VALUES
+from rendering.scenes import random_scene
 
 
 def good_arguments() -> dict[str, Any]:
@@ -32,13 +36,11 @@ def good_arguments() -> dict[str, Any]:
     ("name", "value"),
     [
         ("means", torch.zeros(2, 4)),
-        ("means", torch.zeros(1, 2, 3)),
         ("means", torch.zeros(2, 3, dtype=torch.int64)),
         ("quats", torch.ones(3, 4)),
         ("scales", torch.ones(2)),
         ("opacities", torch.ones(2, 1)),
         ("colors", torch.ones(3, 3)),
-        ("colors", torch.ones(1, 2, 3)),
         ("viewmats", torch.eye(4)),
         ("viewmats", torch.eye(3)[None]),
         ("Ks", torch.eye(3)),
@@ -51,7 +53,9 @@ def good_arguments() -> dict[str, Any]:
         ("far_plane", 0.001),
         ("eps2d", 0.1),
         ("eps2d", float("nan")),
-        ("sh_degree", 4),
+        ("sh_degree", 5),
+        ("tile_size", 0),
+        ("channel_chunk", 1.5),
         ("render_mode", "RGB+DEPTH"),
         ("rasterize_mode", "sharp"),
         ("backgrounds", torch.zeros(1, 4)),
@@ -87,11 +91,78 @@ def test_sh_degree_needs_its_coefficients() -> None:
     [
         ("colors", torch.ones(2, 33)),
         ("colors", torch.ones(2, 0)),
+        ("colors", torch.ones(1, 2, 3)),  # of each camera
+        ("means", torch.zeros(1, 2, 3)),
+        ("viewmats", torch.eye(4).expand(1, 1, 4, 4)),
+        ("sh_degree", 4),
+        ("sparse_grad", True),
+        ("distributed", True),
+        ("camera_model", "fisheye"),
+        ("covars", torch.eye(3).expand(2, 3, 3)),
+        ("with_ut", True),
+        ("with_eval3d", True),
+        ("radial_coeffs", torch.zeros(1, 6)),
+        ("tangential_coeffs", torch.zeros(1, 2)),
+        ("thin_prism_coeffs", torch.zeros(1, 4)),
+        ("ftheta_coeffs", object()),
+        ("rolling_shutter", gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM),
+        ("viewmats_rs", torch.eye(4)[None]),
     ],
 )
 def test_what_is_not_supported_is_named(name: str, value: object) -> None:
-    with pytest.raises(UsageError, match=name):
+    with pytest.raises(UsageError, match=f"^{name}:"):
         rasterization(**{**good_arguments(), name: value})
+
+
+def test_all_arguments_of_gsplat_are_there_in_its_order() -> None:
+    """Fails when a release of gsplat has an argument more: then it must be supported, or refused by name."""
+    theirs = inspect.signature(gsplat.rasterization).parameters
+    ours = inspect.signature(rasterization).parameters
+    assert list(ours) == list(theirs)
+    assert [parameter.kind for parameter in ours.values()] == [
+        parameter.kind for parameter in theirs.values()
+    ]
+    for name in ours.keys() - {"rolling_shutter"}:  # there a member of an enumeration of gsplat's
+        assert ours[name].default == theirs[name].default, name
+        assert name not in ONLY_VALUES or ONLY_VALUES[name] == theirs[name].default
+    assert ours.keys() >= ONLY_VALUES.keys()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"packed": False},
+        {"packed": True},
+        {"tile_size": 8},
+        {"channel_chunk": 4},
+        {"segmented": True},
+        {"rolling_shutter": gsplat.RollingShutterType.GLOBAL},
+        {"sparse_grad": False, "distributed": False, "camera_model": "pinhole", "covars": None},
+    ],
+)
+def test_options_of_gsplat_that_only_say_how_it_computes_change_nothing(options: dict[str, Any]) -> None:
+    scene = random_scene()
+    expected = scene.results()
+    for name, tensor in scene.results(**options).items():
+        assert torch.equal(tensor, expected[name]), name
+
+
+def test_on_a_gpu_gsplat_gets_what_it_supports_and_never_packs(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+
+    def drawn(**arguments: Any) -> tuple[None, None, dict[str, Any]]:
+        given.update(arguments)
+        return None, None, {}
+
+    monkeypatch.setattr(cuda, "require_gsplat_cuda", lambda: None)
+    monkeypatch.setattr(gsplat, "rasterization", drawn)
+    arguments = {
+        name: parameter.default for name, parameter in inspect.signature(rasterization).parameters.items()
+    }
+    cuda.rasterize({**arguments, **good_arguments(), "tile_size": 8})
+    assert given.keys() == arguments.keys() - ONLY_VALUES.keys()
+    assert given["packed"] is False
+    assert given["tile_size"] == 8
 
 
 def test_mixed_devices_and_unknown_devices() -> None:

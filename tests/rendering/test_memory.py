@@ -37,9 +37,11 @@ def test_a_buffer_is_used_again_only_after_its_last_array_is_gone() -> None:
 
 
 def test_free_memory_is_bounded() -> None:
-    for size in range(1, 200):
-        memory.empty((size * 100_000,), np.uint8)
-    assert len(memory._free) <= memory.MAX_FREE + 1
+    arrays = [memory.empty((100_000 + size,), np.uint8) for size in range(3 * memory.MAX_FREE)]
+    arrays.clear()
+    assert len(memory._free) == 3 * memory.MAX_FREE
+    memory.empty((10_000_000,), np.uint8)  # fits into none of them
+    assert len(memory._free) == memory.MAX_FREE + 1
 
 
 def test_arrays_may_be_empty() -> None:

@@ -1,4 +1,4 @@
-"""Scenes made of models: what they show, from where, and hiding one model in another."""
+"""Cameras around models, and the scenes made of what they show."""
 
 from __future__ import annotations
 
@@ -10,11 +10,7 @@ import torch
 from keyss.core import Gaussians
 from keyss.core.scene import camera_positions
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import mean_psnr
-from keyss.methods.learned.config import HideConfig
-from keyss.methods.learned.pipeline import hide_scenes
-from keyss.methods.learned.revealing import open_secret, reveal_gaussians
-from keyss.rendering.orbit import VIEWS, middle_and_radius, orbit, room_for_models, scene_of_model
+from keyss.rendering.orbit import VIEWS, middle_and_radius, orbit, scene_of_model
 from tiny_scenes import random_gaussians
 
 SIZE = 48
@@ -66,14 +62,3 @@ def test_models_move_with_their_cameras() -> None:
     here, there = (scene_of_model(each, "m", size=SIZE) for each in (model, frame.apply_gaussians(model)))
     difference = here.train[0].image.float() - there.train[0].image.float()
     assert difference.abs().mean() < 1
-
-
-def test_one_model_hides_in_another_without_photos() -> None:
-    models = [random_gaussians(1200, seed=0), random_gaussians(700, seed=1)]
-    scenes = [scene_of_model(model, "m", size=SIZE) for model in models]
-    config = room_for_models(HideConfig(), models)
-    assert config.fit.max_gaussians == 1900
-    hidden = hide_scenes(scenes, ["key"], config.with_fit(iterations=30, evaluate_every=0), plains=models)
-    revealed = reveal_gaussians(hidden.stego, open_secret(hidden.stego, "key"))
-    assert mean_psnr(hidden.stego, scenes[0].test, scenes[0].background) > 40
-    assert mean_psnr(revealed, scenes[1].test, scenes[1].background) > 40

@@ -16,6 +16,8 @@ from keyss.rendering.cpu import parallel
 from rendering.child_process import digest, digest_on_threads
 from rendering.scenes import Scene, random_scene
 
+PATIENCE = 120  # seconds until something hangs: far more than a busy machine needs
+
 
 @pytest.fixture(autouse=True)
 def _eight_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
@@ -70,7 +72,7 @@ def test_python_threads_may_render_at_once(threads: int) -> None:
     started = threading.Barrier(2)
 
     def draw_repeatedly(some: list[int]) -> list[list[str]]:
-        started.wait(10)
+        started.wait(PATIENCE)
         return [differing(scenes[i].results(), expected[i]) for _ in range(3) for i in some]
 
     with ThreadPoolExecutor(2) as pool:
@@ -89,7 +91,7 @@ def test_no_more_threads_than_torch_uses_and_the_machine_has(
 
     def kernel(counter: object) -> None:
         seen.append(threading.get_ident())
-        everyone.wait(10)  # breaks, with an error, where fewer come
+        everyone.wait(PATIENCE)  # breaks, with an error, where fewer come
 
     parallel.run(kernel)
     assert len(seen) == len(set(seen)) == expected
@@ -101,7 +103,7 @@ def test_an_error_on_a_helper_thread_is_raised() -> None:
     here, both = threading.get_ident(), threading.Barrier(2)
 
     def kernel(counter: object) -> None:
-        both.wait(10)
+        both.wait(PATIENCE)
         if threading.get_ident() != here:
             raise RuntimeError("the helper failed")
 
@@ -111,7 +113,7 @@ def test_an_error_on_a_helper_thread_is_raised() -> None:
 
 def test_spawned_processes_draw_the_same() -> None:
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        there = pool.submit(digest_on_threads, 2).result(timeout=60)
+        there = pool.submit(digest_on_threads, 2).result(timeout=PATIENCE)
     assert there == digest_on_threads(1)
 
 
@@ -128,8 +130,8 @@ def test_forked_processes_draw_the_same() -> None:
     child = context.Process(target=lambda: queue.put(digest(scene)))
     child.start()
     try:
-        assert queue.get(timeout=20) == expected
+        assert queue.get(timeout=PATIENCE) == expected
     finally:
-        child.join(10)
+        child.join(PATIENCE)
         child.kill()
     assert digest(scene) == expected

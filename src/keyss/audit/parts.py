@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from keyss.audit.methods import views_by_source
 from keyss.audit.progress import PartProgress, PartResult
 from keyss.audit.subject import AuditSubject
 from keyss.core.errors import BackendError
-from keyss.fitting.image_metrics import thin
+from keyss.core.gaussians import Gaussians
+from keyss.files.images import picture_name
+from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_controls
 from keyss.measure.histograms import histograms
 from keyss.measure.images import compare_images, renders_of
@@ -28,6 +29,7 @@ from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import SpeedResult
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.two_sample import two_sample_against_controls
+from keyss.methods import registry
 from keyss.runs.audit_record import (
     PICTURES,
     ImagesResult,
@@ -40,7 +42,7 @@ from keyss.runs.audit_record import (
     RobustnessResult,
     SinkhornResult,
 )
-from keyss.runs.files import STEGO, picture_name
+from keyss.runs.files import SIDECAR, STEGO
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64
@@ -107,7 +109,7 @@ def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
     """
     # In the order of the photos' names, which is that of the camera's path more often than not.
     ordered = sorted(subject.cover.views, key=lambda view: view.camera.name)
-    views = thin(ordered, STEGANALYSED_VIEWS)
+    views = subsample_views(ordered, STEGANALYSED_VIEWS)
     models = (subject.controls[0], subject.stego, subject.controls[1])
     plain, stego, control = (
         [image.numpy() for _, image in renders_of(model, subject.cover, views)] for model in models
@@ -130,7 +132,7 @@ def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
         zip(subject.secrets, subject.frames, subject.opened, strict=True), start=1
     ):
         progress(index - 1, len(subject.secrets))
-        more = [source_attack(lambda model: views_by_source(model, tried))]
+        more = [source_attack(lambda model: _views_by_source(model, tried))]
         if opened.decode is not None:
             more.append(decoder_attack(opened.decode, seed=seed))
             more.append(with_the_key(lambda model, own=opened: own.reveal(model, frame="cover", force=True)))  # type: ignore[misc]
@@ -161,7 +163,7 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
         subject.reopeners,
         subject.scenes,
         [plain if plain is not None else model for plain, model in zip(plains, subject.models, strict=True)],
-        sidecar=subject.run.sidecar,
+        sidecar=None if subject.run.sidecar is None else subject.run.folder / SIDECAR,
         device=subject.device,
         progress=progress,
     )
@@ -184,10 +186,16 @@ def _sealwatch(
         return None, str(error)
 
 
-def _composite_score(subject: AuditSubject, distance: float) -> float | None:
-    """The paper's composite score (eq. 10) of the cover and the mean secret, where there are photos."""
-    cover, secrets = subject.run.metrics.get("cover"), subject.run.metrics.get("secrets") or []
-    found = [each["psnr"] for each in secrets if "psnr" in each]
-    if not cover or not found:
-        return None
-    return composite_score(cover["psnr"], fmean(found), distance)
+def _composite_score(subject: AuditSubject, distance: float) -> float:
+    """The paper's composite score (eq. 10) of the cover and the mean secret."""
+    metrics = subject.run.metrics
+    return composite_score(metrics.cover.psnr, fmean(each.psnr for each in metrics.secrets), distance)
+
+
+def _views_by_source(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
+    """What somebody tries who has read the source of all methods."""
+    return {
+        name: model
+        for method in registry.METHODS.values()
+        for name, model in method.attacks(stego, secrets).items()
+    }

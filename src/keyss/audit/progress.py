@@ -12,10 +12,10 @@ from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
+from keyss.files.images import png_bytes
 from keyss.files.reading import read_file
 from keyss.fitting.loop import Reporter
 from keyss.runs.audit_record import Audit
-from keyss.runs.files import png_bytes
 from keyss.runs.records import read_record, write_record
 
 _MAX_PICTURE_BYTES = 1 << 26

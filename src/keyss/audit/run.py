@@ -7,19 +7,30 @@ import time
 from collections.abc import Sequence
 from importlib.metadata import version as version_of
 
+import msgspec
+
 from keyss._version import __version__
-from keyss.audit.methods import wrong_keys_of
 from keyss.audit.parts import PARTS
 from keyss.audit.progress import FinishedParts, PartProgress
 from keyss.audit.subject import AuditSubject, control_seeds, subject_of
 from keyss.core.errors import UsageError
 from keyss.files.output import OutputFolder
-from keyss.fitting.loop import Interrupted, Reporter, Silent
+from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.rendering import Backend, resolve_device
 from keyss.report import write_report
-from keyss.runs.audit_record import AUDIT_FILE, AUDIT_FOLDER, PICTURES, Audit, AuditedRun, Controls
+from keyss.runs.audit_record import (
+    AUDIT_FILE,
+    AUDIT_FOLDER,
+    PICTURES,
+    Audit,
+    AuditedRun,
+    Controls,
+    WrongKeyResult,
+)
+from keyss.runs.config import PathLike
 from keyss.runs.files import bytes_writer
-from keyss.runs.opening import HidingRun, PathLike, open_run
+from keyss.runs.metrics import HideMetrics
+from keyss.runs.opening import HidingRun, open_run
 from keyss.runs.records import record_bytes
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
@@ -51,7 +62,7 @@ def audit(
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
     if unknown := sorted(set(only) - set(PARTS)):
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
-    started, reporter = time.monotonic(), reporter or Silent()
+    started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
     output = OutputFolder(opened.folder / AUDIT_FOLDER, overwrite=overwrite, resume=resume)
     seeds = control_seeds(opened, controls, seed)
@@ -76,7 +87,7 @@ def audit(
         seconds=round(time.monotonic() - started, 1),
         run=_audited_run(opened),
         controls=Controls(controls, tuple(seeds)),
-        wrong_key=wrong_keys_of(opened.metrics),
+        wrong_key=_wrong_keys(opened.metrics),
         **sections,
     )
     writers = {f"{PICTURES}/{name}": bytes_writer(data) for name, data in pictures.items()}
@@ -101,11 +112,15 @@ def _audited_run(run: HidingRun) -> AuditedRun:
     cover, *secrets = run.sources
     return AuditedRun(
         path=str(run.folder),
-        method=run.method,
+        method=run.config.method,
         cover=cover,
         secrets=tuple(secrets),
-        width=run.width,
+        width=run.config.width,
         gaussians=len(run.stego),
-        config=run.settings.get("config") or {},
+        config=msgspec.to_builtins(run.config.options),
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )
+
+
+def _wrong_keys(metrics: HideMetrics) -> WrongKeyResult | None:
+    return None if metrics.wrong_key is None else WrongKeyResult(metrics.wrong_key, metrics.chance_level)

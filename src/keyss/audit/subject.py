@@ -5,24 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from keyss.audit.methods import as_opened, opener
-from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.errors import OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
-from keyss.files.ply import read_ply, write_ply
-from keyss.files.reading import read_file
+from keyss.files.models import read_model, write_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
 from keyss.measure.robustness import Reopener
+from keyss.methods import registry
 from keyss.methods.base import Opened
 from keyss.runs.opening import HidingRun
 
@@ -56,8 +55,8 @@ class AuditSubject:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model."""
-        sidecar = None if self.run.sidecar is None else read_file(self.run.sidecar)
-        return [Reopener(key, opener(sidecar)) for key in self.run.keys]
+        opener = partial(registry.open_model, sidecar=self.run.sidecar)
+        return [Reopener(key, opener) for key in self.run.keys]
 
     @property
     def secrets(self) -> tuple[Scene, ...]:
@@ -78,26 +77,25 @@ def subject_of(
     scenes = run.scenes()
     plain, *baselines = run.plain_models()
     if original is not None:
-        plain = read_ply(original)
+        plain = read_model(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
     stego, folder = run.stego.to(device), run.folder / CONTROLS
-    config = _fit_config(run)
-    if original is not None or run.settings["models_given"][0]:  # whose size is not that of this run
+    config = run.config.options.fit
+    if original is not None or run.config.models_given[0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
     controls = tuple(
         _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
         for seed in seeds
     )
-    opened = tuple(map(as_opened, run.opened))
     return AuditSubject(
         run=run,
         scenes=tuple(scenes),
         stego=stego,
-        opened=opened,
-        revealed=tuple(secret.reveal(stego).to(device) for secret in opened),
+        opened=run.opened,
+        revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
         frames=tuple(
-            frame_of(secret, scene, scenes[0]) for secret, scene in zip(opened, scenes[1:], strict=True)
+            frame_of(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
         ),
         original=plain.to(device),
         baselines=tuple(None if model is None else model.to(device) for model in baselines),
@@ -108,20 +106,8 @@ def subject_of(
 
 def control_seeds(run: HidingRun, controls: int, seed: int) -> list[int]:
     """From which the plain models are trained: those after the run's own."""
-    first = _fit_config(run).seed + seed
+    first = run.config.options.fit.seed + seed
     return [first + index for index in range(1, controls + 1)]
-
-
-def _fit_config(run: HidingRun) -> FitConfig:
-    """How the run trained its plain models. Raises InputError."""
-    known = {field.name for field in fields(FitConfig)}
-    try:
-        values: dict[str, Any] = run.settings["config"]["fit"]
-        return FitConfig(**{name: value for name, value in values.items() if name in known})
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{run.folder}: its configuration tells nothing of plain models ({error})"
-        ) from error
 
 
 def _plain_model(
@@ -132,7 +118,7 @@ def _plain_model(
     name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
     model, checkpoint = folder / f"{name}.ply", folder / f"{name}.safetensors"
     if model.exists():
-        return read_ply(model)
+        return read_model(model)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -146,6 +132,6 @@ def _plain_model(
         resume=True,
         reporter=reporter,
     )
-    write_ply(model, result.gaussians)
+    write_model(model, result.gaussians)
     checkpoint.unlink(missing_ok=True)
     return result.gaussians

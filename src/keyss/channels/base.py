@@ -19,6 +19,9 @@ from keyss.core.gaussians import Gaussians
 Bytes = npt.NDArray[np.uint8]
 
 
+METHOD_BYTES = 15  # of the name of a method in files
+
+
 @dataclass(frozen=True)
 class Payload:
     """Bytes that come out whole or not at all."""
@@ -28,22 +31,8 @@ class Payload:
 
 
 @dataclass(frozen=True)
-class Records:
-    """Pieces of one size that come out one by one, in any order."""
-
-    method: str  # who reads them: the name of a method, 1 to 15 ASCII characters
-    header: bytes  # how they are to be read; comes out whole or not at all
-    records: Bytes  # [R, size]
-    # [C] indices of records that are embedded a second time, because losing them costs most; empty when read.
-    copied: npt.NDArray[np.int64]
-
-
-Content = Payload | Records
-
-
-@dataclass(frozen=True)
 class RecordRequest:
-    """Records that somebody wants to embed, before they are encoded: their size is the channel's to choose."""
+    """Records that are to be embedded, before they are encoded: their size is the channel's to choose."""
 
     count: int
     least_bytes: int  # of a record
@@ -55,39 +44,82 @@ class RecordPlan:
     """What the channel offers for a `RecordRequest`."""
 
     record_bytes: int  # at most so many may be used
-    copies: int  # so many records may be embedded a second time
+    copies: int  # at most so many records may be embedded a second time
+    cells_per_carrier: int  # records that share one Gaussian
 
 
 @dataclass(frozen=True)
-class Capacity:
-    """Room in a model, known before anything runs."""
+class Records:
+    """Pieces of one size that come out one by one, in any order."""
 
-    carriers: int  # Gaussians that can carry something
-    gaussians: int  # Gaussians of the model
-    payload_bytes: int  # of one payload, after compression, for each of the secrets
+    method: str  # who reads them: the name of a method, 1 to 15 ASCII characters
+    header: bytes  # how they are to be read; comes out whole or not at all
+    records: Bytes  # [R, size]
+    plan: RecordPlan  # as the channel gave it
+    # [C] indices of records that are embedded a second time, because losing them costs most; empty when read.
+    copied: npt.NDArray[np.int64]
+
+
+Content = Payload | Records
+
+
+def pack_method(name: str) -> bytes:
+    """METHOD_BYTES of the name of a method."""
+    packed = name.encode("ascii")
+    if not 1 <= len(packed) <= METHOD_BYTES:
+        raise ValueError(f"expected the name of a method, 1 to {METHOD_BYTES} characters, got {name!r}")
+    return packed.ljust(METHOD_BYTES, b"\0")
+
+
+def unpack_method(packed: bytes) -> str:
+    """The name of `pack_method`. Raises ValueError for anything else."""
+    return packed[:METHOD_BYTES].rstrip(b"\0").decode("ascii")
+
+
+class PreparedCover(Protocol):
+    """A cover whose room in a channel is known: what fits is known before anything else runs."""
+
+    @property
+    def cover(self) -> Gaussians:
+        """The cover."""
+
+    @property
+    def carriers(self) -> int:
+        """Gaussians that can carry something."""
+
+    def payload_capacity(self, secrets: int = 1) -> int:
+        """Bytes of one compressed and encrypted payload, for each of so many secrets."""
+
+    def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
+        """Records that fit for all requests together, however many they ask for."""
+
+    def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
+        """How each request's records are to be encoded. Raises UsageError with the number that fits."""
+
+    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+        """The cover with one (key, content) for each secret in it; all contents are of one service.
+
+        `entropy`: at least 32 bytes that nobody else can know, from which all that is random is derived; by
+        default the system's. Raises UsageError for equal keys and for what does not fit.
+        """
 
 
 class Channel(Protocol):
     """A place for bits in a model."""
 
-    name: str
-    survives: tuple[str, ...]  # file formats from which `extract` still works
+    @property
+    def name(self) -> str:
+        """In files and on the command line."""
 
-    def capacity(self, cover: Gaussians, secrets: int = 1) -> Capacity:
-        """Room in `cover` for each of `secrets`. Raises InputError for a cover that has no such place."""
+    @property
+    def survives(self) -> tuple[str, ...]:
+        """File formats from which `extract` still works."""
 
-    def plan_records(self, cover: Gaussians, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
-        """How each request's records are to be encoded. Raises UsageError with the number that fits."""
+    def largest_record(self, sh_degree: int) -> int:
+        """Bytes of the largest record in a model of this SH degree; 0 where there is no room at all."""
 
-    def embed(
-        self, cover: Gaussians, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None
-    ) -> Gaussians:
-        """`cover` with one (key, content) for each secret in it.
-
-        `entropy`: at least 32 bytes that nobody else can know, from which all that is random is derived; by
-        default the system's. Raises UsageError for equal keys and for what does not fit, InputError for a
-        cover that cannot carry anything unseen.
-        """
+    def prepare(self, cover: Gaussians) -> PreparedCover:
+        """Find the carriers. Raises InputError for a cover that cannot carry anything unseen."""
 
     def extract(self, stego: Gaussians, key: str) -> Content:
         """What `key` opens. Raises WrongKeyError when it opens nothing, InputError for what is damaged."""

@@ -8,17 +8,16 @@ from typing import Annotated, Any, Literal
 from tyro.conf import UseAppendAction, arg
 
 
-def optional(metavar: str, help: str, otherwise: str) -> Any:
+def optional(metavar: str, help: str, otherwise: str, aliases: list[str] | None = None) -> Any:
     """An argument that may be left out; `otherwise` says what happens then."""
-    return arg(metavar=metavar, help=help, help_behavior_hint=f"(default: {otherwise})")
+    hint = f"(default: {otherwise})"
+    return arg(metavar=metavar, help=help, help_behavior_hint=hint, aliases=aliases)
 
 
-DeviceName = Literal["auto", "cpu", "cuda"]
-Device = Annotated[DeviceName, arg(help="Where to compute; auto takes a CUDA GPU where there is one.")]
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"], arg(help="Where to compute; auto takes a CUDA GPU where there is one.")
+]
 Seed = Annotated[int | None, optional("N", "Seed of everything random.", "the preset's")]
-# Every command takes --seed and --device, so that scripts can pass them to all alike.
-UnusedSeed = Annotated[int, arg(metavar="N", help="Changes nothing here: nothing is random.")]
-UnusedDevice = Annotated[DeviceName, arg(help="Changes nothing here: nothing is computed.")]
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "File with the key, once for each secret.", "KEYSS_KEY, or a hidden prompt"),
@@ -39,6 +38,16 @@ MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model."
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
+
+
+def schedule(iterations: int | None, max_gaussians: int | None, seed: int | None) -> dict[str, int]:
+    """What was asked for on the command line of the fields of `FitConfig`."""
+    asked = {
+        "iterations": iterations,
+        "max_gaussians": max_gaussians,
+        "seed": None if seed is None else checked_seed(seed),
+    }
+    return {name: value for name, value in asked.items() if value is not None}
 
 
 def checked_seed(seed: int) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import tyro
 
 from keyss.cli import commands
+from keyss.cli.hiding import hide, hide_with_options
 
 INTERRUPTED = 130  # 128 + SIGINT, as a shell counts
 BROKEN_PIPE = 141  # 128 + SIGPIPE
@@ -27,10 +28,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises SystemExit for --help and for arguments that cannot be parsed, as argument parsers do. With
     KEYSS_DEBUG=1 in the environment, errors that are not a person's come through as they are.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
     app = tyro.extras.SubcommandApp()
-    for command in commands.ALL:
-        app.command(command)
     try:
+        for command in commands.ALL:
+            hiding = command is hide and arguments[:1] == ["hide"]
+            app.command(hide_with_options(arguments) if hiding else command)
         app.cli(prog="keyss", description=_ABOUT, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
         sys.stdout.flush()
         return 0

@@ -12,18 +12,43 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import (
     Device,
-    DeviceName,
     KeyFiles,
     Overwrite,
     Resume,
-    UnusedDevice,
-    UnusedSeed,
     checked_seed,
     optional,
 )
 
 PartName = Literal["images", "parameters", "stegexpose", "leaks", "robustness", "speed"]
-CpuOnly = Annotated[DeviceName, arg(help="Changes nothing here: the CPU computes.")]
+
+
+def evaluate(
+    run: Annotated[Positional[Path], arg(metavar="RUN", help="Result folder of `keyss hide`.")],
+    *,
+    key_file: KeyFiles = (),
+    wrong_keys: Annotated[
+        int | None, optional("N", "Number of random wrong keys to try.", "32, where there is a decoder")
+    ] = None,
+    device: Device = "auto",
+    seed: Annotated[int | None, optional("N", "Seed of the wrong keys.", "0")] = None,
+) -> None:
+    """Measure a hiding run against the test photos, with the keys and with wrong ones.
+
+    example: keyss evaluate runs/hidden --key-file key.txt
+    """
+    from keyss import api
+    from keyss.cli.keys import keys
+    from keyss.cli.tables import print_files, print_hiding
+
+    metrics = api.evaluate(
+        run,
+        keys(key_file, len(key_file) or 1),
+        wrong_keys=wrong_keys,
+        seed=None if seed is None else checked_seed(seed),
+        device=device,
+    )
+    print_hiding(metrics)
+    print_files(run, {"metrics.json": "the numbers"})
 
 
 def steganalyze(
@@ -35,8 +60,6 @@ def steganalyze(
         bool, arg(help="Stop with an image as soon as it looks clean; such scores compare with no others.")
     ] = False,
     overwrite: Overwrite = False,
-    device: CpuOnly = "auto",
-    seed: UnusedSeed = 0,
 ) -> None:
     """Look for LSB replacement in images as StegExpose does, score for score.
 
@@ -117,9 +140,6 @@ def audit(
 
 def report(
     run: Annotated[Positional[Path], arg(metavar="RUN", help="Result folder that `keyss audit` has judged.")],
-    *,
-    device: UnusedDevice = "auto",
-    seed: UnusedSeed = 0,
 ) -> None:
     """Write what an audit found as one HTML file that needs no network.
 

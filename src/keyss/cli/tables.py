@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,74 +11,53 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
+    from keyss.runs.metrics import FitMetrics, HideMetrics
 
-Metrics = Mapping[str, Any]  # of metrics.json
 
-
-def print_metrics(metrics: Metrics, console: Console | None = None) -> None:
-    """The numbers of a hiding run: one row per image set, each beside its bound."""
+def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
+    """The numbers of a hiding: a row for each scene beside its baseline, wrong keys, the method's own."""
+    rows = [_QualityRow("cover", metrics.cover, metrics.baseline.cover, metrics.gaussians)]
+    count = len(metrics.secrets)
+    for i, (secret, plain) in enumerate(zip(metrics.secrets, metrics.baseline.secrets, strict=True)):
+        name = _numbered("secret", i, count)
+        rows.append(_QualityRow(name, secret, plain, metrics.secret_gaussians[i]))
+    wrong = metrics.wrong_key
+    if wrong is not None:
+        rows.append(_QualityRow(f"{wrong.keys} wrong keys, against the cover", wrong.vs_cover.mean))
+        rows.append(_QualityRow("  the worst of them", wrong.vs_cover.min))
+        for i, found in enumerate(wrong.vs_secrets):
+            rows.append(_QualityRow(f"  the one nearest to {_numbered('the secret', i, count)}", found.max))
+    for i, level in enumerate(metrics.chance_level):
+        rows.append(_QualityRow(f"the stego cover, against {_numbered('the secret', i, count)}", level))
+    cells = [row.cells() for row in rows]
     table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("against the test photos")
-    for name in ("PSNR", "SSIM", "bound", "loss"):
-        table.add_column(name, justify="right")
-    bound = metrics.get("bound") or {}
-    secrets = metrics.get("secrets") or []
-    bounds = bound.get("secrets") or [None] * len(secrets)
-    _quality_row(table, "cover", metrics["cover"], bound.get("cover"))
-    for i, (secret, limit) in enumerate(zip(secrets, bounds, strict=True)):
-        _quality_row(table, _numbered("secret", i, len(secrets)), secret, limit)
-    wrong = metrics.get("wrong_key")
-    if wrong:
-        _wrong_key_rows(table, wrong, len(secrets))
+    for index, name in enumerate(
+        ("against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians")
+    ):
+        if any(row[index] for row in cells):
+            table.add_column(name, justify="right" if index else "left")
+    for row in cells:
+        table.add_row(*(cell for cell, *column in zip(row, *cells, strict=True) if any(column)))
     console = console or Console()
     console.print(table)
-    console.print(
-        "Bound: plain 3DGS of the same scene, of the same size and training. PSNR, bound and loss in dB."
-    )
+    console.print("Baseline: plain 3DGS of the same scene. PSNR, baseline and loss in dB.")
+    for name, value in metrics.details.items():
+        console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False)
 
 
-def print_carry(metrics: Metrics, console: Console | None = None) -> None:
-    """The numbers of carrying: what is where, and against photos where there are any."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("")
-    for name in ("Gaussians", "carried", "bits each", "PSNR", "SSIM", "bound", "loss"):
-        table.add_column(name, justify="right")
-    secrets, bound = metrics["secrets"], metrics["bound"]
-    rows = [("cover", f"{metrics['gaussians']:,}", "", "", metrics["cover"], bound["cover"])]
-    for i, (secret, limit) in enumerate(zip(secrets, bound["secrets"], strict=True)):
-        counts = (f"{secret['gaussians']:,}", f"{secret['carried']:,}", str(secret["bits"]))
-        rows.append((_numbered("secret", i, len(secrets)), *counts, secret, limit))
-    for *cells, got, limit in rows:
-        if limit is None:
-            table.add_row(*cells)
-            continue
-        numbers = (got["psnr"], got["ssim"], limit["psnr"], limit["psnr"] - got["psnr"])
-        table.add_row(
-            *cells, *(f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 3, 2, 3), strict=True))
-        )
-    console = console or Console()
-    console.print(table)
-    console.print(
-        f"{metrics['carriers']:,} of the cover's {metrics['gaussians']:,} Gaussians can carry something; "
-        f"up to {metrics['room']:,} fit. {metrics['seconds']:.1f} s.",
-        soft_wrap=True,
-    )
-    if metrics["dither_psnr"] is not None:
-        console.print(f"Dithering costs the cover {metrics['dither_psnr']:.1f} dB (PSNR before and after).")
-
-
-def print_fit(metrics: Metrics, console: Console | None = None) -> None:
+def print_fit(metrics: FitMetrics, console: Console | None = None) -> None:
     """The numbers of a plain fit."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("PSNR", "SSIM", "Gaussians", "iterations", "seconds"):
         table.add_column(name, justify="right")
     table.add_row(
-        f"{metrics['psnr']:.2f}",
-        f"{metrics['ssim']:.3f}",
-        f"{metrics['gaussians']:,}",
-        f"{metrics['iterations']:,}",
-        f"{metrics['seconds']:.0f}",
+        f"{metrics.psnr:.2f}",
+        f"{metrics.ssim:.3f}",
+        f"{metrics.gaussians:,}",
+        f"{metrics.iterations:,}",
+        f"{metrics.seconds:.0f}",
     )
     (console or Console()).print(table)
 
@@ -95,8 +75,8 @@ def print_steganalysis(found: Steganalysis, console: Console | None = None) -> N
 
 def print_verdicts(run: Path, console: Console | None = None) -> None:
     """What an audit comes to: a line for each measure, beside its bound or null."""
-    from keyss.runs.audit_record import read_audit
     from keyss.report.verdicts import headline, verdicts
+    from keyss.runs.audit_record import read_audit
 
     lines = verdicts(read_audit(run))
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -126,19 +106,26 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {text}")
 
 
-def _quality_row(table: Table, name: str, got: Metrics, bound: Metrics | None) -> None:
-    limits = [f"{bound['psnr']:.2f}", f"{bound['psnr'] - got['psnr']:.2f}"] if bound else ["", ""]
-    table.add_row(name, f"{got['psnr']:.2f}", f"{got['ssim']:.3f}", *limits)
+@dataclass(frozen=True)
+class _QualityRow:
+    """A name, a quality or a PSNR alone, the baseline's quality, and a number of Gaussians."""
 
+    name: str
+    found: ImageQuality | float
+    baseline: ImageQuality | None = None
+    gaussians: int | None = None
 
-def _wrong_key_rows(table: Table, wrong: Metrics, secrets: int) -> None:
-    cover = wrong["vs_cover"]
-    table.add_row(f"{wrong['keys']} wrong keys, against the cover", f"{cover['mean']:.2f}")
-    table.add_row("  the worst of them", f"{cover['min']:.2f}")
-    for i, (secret, floor) in enumerate(zip(wrong["vs_secrets"], wrong["floor"], strict=True)):
-        name = _numbered("the secret", i, secrets)
-        table.add_row(f"  the one nearest to {name}", f"{secret['max']:.2f}")
-        table.add_row(f"  the stego cover itself, against {name}", f"{floor:.2f}")
+    def cells(self) -> list[str]:
+        """Six cells, empty ones included."""
+        psnr = self.found if isinstance(self.found, float) else self.found.psnr
+        return [
+            self.name,
+            f"{psnr:.2f}",
+            "" if isinstance(self.found, float) else f"{self.found.ssim:.3f}",
+            "" if self.baseline is None else f"{self.baseline.psnr:.2f}",
+            "" if self.baseline is None else f"{self.baseline.psnr - psnr:.2f}",
+            "" if self.gaussians is None else f"{self.gaussians:,}",
+        ]
 
 
 def _numbered(name: str, index: int, count: int) -> str:

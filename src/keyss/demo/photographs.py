@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from PIL import Image
+from scipy.ndimage import maximum_filter, minimum_filter
 
-from keyss.core.errors import OutputError, UsageError
-from keyss.demo.ray_tracer import Floats, Vector, World, trace
+from keyss.core.errors import UsageError
+from keyss.demo.ray_shapes import Floats, Vector
+from keyss.demo.ray_tracer import World, trace
 from keyss.demo.worlds import golden_knot, tea_table
 from keyss.files.atomic import write_bytes
+from keyss.files.images import png_bytes
+from keyss.files.output import OutputFolder
 
 _POINTS = 3000
 _POINT_NOISE = 0.002  # standard deviation over distance, about that of a good reconstruction
@@ -28,19 +31,16 @@ _FIELD_OF_VIEW = math.radians(44)  # across the image's width
 _DISTANCE = 4.2
 _ELEVATIONS = tuple(math.radians(angle) for angle in (17, 33, 50))
 _EDGE = 0.08  # of full brightness: pixels that differ more from a neighbour get four rays
-_SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+_SUBPIXELS = ((-0.25, 0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25))  # columns, rows
 _BATCH = 1 << 18  # pixels rendered at once
 
+Doubles: TypeAlias = NDArray[np.floating]
+Pose: TypeAlias = NDArray[np.float64]  # [4, 4] camera to world, OpenGL axes
 
-@dataclass(frozen=True)
-class _Demo:
-    world: Callable[[int], World]
-    target: Vector  # what the cameras look at
-
-
-_DEMOS = {
-    "tea-table": _Demo(tea_table, (0.0, 0.0, 0.15)),
-    "golden-knot": _Demo(golden_knot, (0.0, 0.0, 0.6)),
+# By name: the world of a seed, and what the cameras look at.
+_DEMOS: dict[str, tuple[Callable[[int], World], Vector]] = {
+    "tea-table": (tea_table, (0.0, 0.0, 0.15)),
+    "golden-knot": (golden_knot, (0.0, 0.0, 0.6)),
 }
 DEMO_SCENES = tuple(_DEMOS)
 
@@ -62,9 +62,9 @@ def write_demo_scene(
     varies the textures, the cameras and the points. One seed gives the same bytes every time. `progress`
     is called with (views rendered, views) now and then.
 
-    The folder appears only when it is complete. Raises UsageError for an unknown scene, fewer than 8
-    views or images smaller than 16 pixels, and OutputError when the folder exists and is not empty or
-    cannot be written.
+    Nothing is written before all is rendered. Raises UsageError for an unknown scene, fewer than 8 views or
+    images smaller than 16 pixels, and OutputError when the folder exists and is not empty or cannot be
+    written.
     """
     if which not in _DEMOS:
         raise UsageError(f"expected a demo scene of {', '.join(DEMO_SCENES)}, got {which!r}")
@@ -74,85 +74,28 @@ def write_demo_scene(
         )
     if seed < 0:
         raise UsageError(f"expected a seed of 0 or more, got {seed}")
-    folder = Path(folder)
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutputError(f"{folder} exists already; choose another folder or remove it first")
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        try:
-            _write(partial, _DEMOS[which], views, width, height, seed, progress)
-            partial.chmod(0o777 & ~_umask())
-            if folder.exists():
-                folder.rmdir()
-            partial.rename(folder)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
-    except OSError as error:
-        raise OutputError(f"cannot write {folder}: {error.strerror or error}") from error
-
-
-def _write(
-    folder: Path,
-    demo: _Demo,
-    views: int,
-    width: int,
-    height: int,
-    seed: int,
-    progress: Callable[[int, int], None] | None,
-) -> None:
+    output = OutputFolder(folder)
+    make_world, target = _DEMOS[which]
     rng = np.random.default_rng(seed)
-    world = demo.world(seed)
-    poses = _poses(demo.target, views, rng)
-    focal = 0.5 * width / math.tan(0.5 * _FIELD_OF_VIEW)
-    (folder / "images").mkdir()
-
-    images = np.empty((views, height, width, 3), dtype=np.uint8)
-    step = max(1, _BATCH // (width * height))
-    batches = [poses[start : start + step] for start in range(0, views, step)]
-    done = 0
-    # numpy lets go of the interpreter in its loops, so threads do help.
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for batch in pool.map(lambda batch: _photos(world, batch, focal, width, height), batches):
-            for image in batch:
-                write_bytes(folder / _image_name(done), _png(image))
-                images[done] = image
-                done += 1
-            if progress:
-                progress(done, views)
-    write_bytes(folder / "points.ply", _sparse_points(world, poses, focal, images, rng))
-    transforms = {
-        "camera_model": "PINHOLE",
-        "w": width,
-        "h": height,
-        "fl_x": focal,
-        "fl_y": focal,
-        "cx": width / 2,
-        "cy": height / 2,
-        "ply_file_path": "points.ply",
-        "frames": [
-            {"file_path": _image_name(index), "transform_matrix": pose.tolist()}
-            for index, pose in enumerate(poses)
-        ],
+    studio = _Studio(make_world(seed), _poses(target, views, rng), width, height)
+    images = studio.photos(progress)
+    names = [f"images/{index:04d}.png" for index in range(views)]
+    files = {name: png_bytes(torch.from_numpy(image)) for name, image in zip(names, images, strict=True)} | {
+        "points.ply": studio.points(images, rng),
+        "transforms.json": studio.transforms(names),
     }
-    write_bytes(folder / "transforms.json", (json.dumps(transforms, indent=1) + "\n").encode())
+    output.fill({name: partial(write_bytes, data=data) for name, data in files.items()})
 
 
-def _poses(target: Vector, views: int, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """Camera-to-world matrices [4, 4] in OpenGL axes: one turn, the three heights in alternation."""
+def _poses(target: Vector, views: int, rng: np.random.Generator) -> list[Pose]:
+    """One turn around `target`, the three heights in alternation."""
     poses = []
     for index in range(views):
         azimuth = 2 * math.pi * (index + rng.uniform(-0.3, 0.3)) / views
         elevation = _ELEVATIONS[index % len(_ELEVATIONS)] + rng.uniform(-0.04, 0.04)
-        outward = np.array(
-            [
-                math.cos(azimuth) * math.cos(elevation),
-                math.sin(azimuth) * math.cos(elevation),
-                math.sin(elevation),
-            ]
-        )
         right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        level = np.array([math.cos(azimuth), math.sin(azimuth), 1.0])
+        outward = level * [math.cos(elevation), math.cos(elevation), math.sin(elevation)]
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(outward, right), outward], axis=1)
         pose[:3, 3] = np.array(target) + _DISTANCE * rng.uniform(0.96, 1.04) * outward
@@ -160,111 +103,97 @@ def _poses(target: Vector, views: int, rng: np.random.Generator) -> list[NDArray
     return poses
 
 
-def _photos(
-    world: World, poses: list[NDArray[np.float64]], focal: float, width: int, height: int
-) -> NDArray[np.uint8]:
-    """[V, H, W, 3] sRGB: one ray per pixel, four where the neighbours differ.
+@dataclass(frozen=True)
+class _Studio:
+    """A world, and the cameras that take photos of it."""
 
-    Several views at once, because numpy takes longer to begin with a short array than to work through it.
-    """
-    rows, columns = (0.5 + index.astype(np.float64) for index in np.mgrid[0:height, 0:width])
-    rays = [_rays(pose, focal, width, height, columns, rows) for pose in poses]
-    colors = _traced(world, rays).reshape(3, len(poses), height, width)
-    images = np.ascontiguousarray(colors.transpose(1, 0, 2, 3))
-    edges = [_contrast(image) > _EDGE for image in images]
-    rays = []
-    for pose, edge in zip(poses, edges, strict=True):
-        finer_columns = np.concatenate([columns[edge] + dx for dx, _ in _SUBPIXELS])
-        finer_rows = np.concatenate([rows[edge] + dy for _, dy in _SUBPIXELS])
-        rays.append(_rays(pose, focal, width, height, finer_columns, finer_rows))
-    finer = np.split(_traced(world, rays), np.cumsum([origins.shape[1] for origins, _ in rays])[:-1], axis=1)
-    for image, edge, samples in zip(images, edges, finer, strict=True):
-        image[:, edge] = samples.reshape(3, len(_SUBPIXELS), -1).mean(axis=1)
-    return np.asarray(np.rint(255 * images.transpose(0, 2, 3, 1)), dtype=np.uint8)
+    world: World
+    poses: list[Pose]
+    width: int  # of each photo in pixels
+    height: int
 
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return 0.5 * self.width / math.tan(0.5 * _FIELD_OF_VIEW)
 
-def _traced(world: World, rays: list[tuple[Floats, Floats]]) -> Floats:
-    """[3, M] sRGB colours of rays of several cameras."""
-    origins, directions = (np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True))
-    return trace(world, origins, directions)[0]
+    def photos(self, progress: Callable[[int, int], None] | None) -> NDArray[np.uint8]:
+        """[V, H, W, 3] sRGB.
 
+        Several views at once, because numpy takes longer to begin with a short array than to work through it.
+        """
+        step, images = max(1, _BATCH // (self.width * self.height)), []
+        batches = (self.poses[start : start + step] for start in range(0, len(self.poses), step))
+        # numpy lets go of the interpreter in its loops, so threads do help.
+        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+            for batch in pool.map(self._batch, batches):
+                images += list(batch)
+                if progress:
+                    progress(len(images), len(self.poses))
+        return np.stack(images)
 
-def _contrast(image: Floats) -> Floats:
-    """[H, W] largest difference of any channel within each pixel's 3 x 3 neighbourhood."""
-    padded = np.pad(image, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))
-    contrast: Floats = (windows.max(axis=(3, 4)) - windows.min(axis=(3, 4))).max(axis=0)
-    return contrast
+    def _batch(self, poses: list[Pose]) -> NDArray[np.uint8]:
+        """[V, H, W, 3]: one ray per pixel, four where the neighbours differ."""
+        rows, columns = (
+            0.5 + index.astype(np.float64) for index in np.mgrid[0 : self.height, 0 : self.width]
+        )
+        colors = self._traced([self._rays(pose, columns, rows) for pose in poses])
+        images = np.stack(colors).reshape(-1, 3, self.height, self.width)
+        highest, lowest = (f(images, (1, 1, 3, 3), mode="nearest") for f in (maximum_filter, minimum_filter))
+        edges = (highest - lowest).max(axis=1) > _EDGE  # [V, H, W]
+        rays = []
+        for pose, edge in zip(poses, edges, strict=True):
+            finer = [
+                np.concatenate([axis[edge] + shift for shift in shifts])
+                for axis, shifts in zip((columns, rows), _SUBPIXELS, strict=True)
+            ]
+            rays.append(self._rays(pose, *finer))
+        for image, edge, samples in zip(images, edges, self._traced(rays), strict=True):
+            image[:, edge] = samples.reshape(3, len(_SUBPIXELS[0]), -1).mean(axis=1)
+        return np.asarray(np.rint(255 * images.transpose(0, 2, 3, 1)), dtype=np.uint8)
 
+    def _traced(self, rays: list[tuple[Floats, Floats]]) -> list[Floats]:
+        """[3, M] sRGB colours of the rays of each camera."""
+        colors, _ = trace(self.world, *(np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True)))
+        return np.split(colors, np.cumsum([origins.shape[1] for origins, _ in rays])[:-1], axis=1)
 
-def _rays(
-    pose: NDArray[np.float64],
-    focal: float,
-    width: int,
-    height: int,
-    columns: NDArray[np.floating],
-    rows: NDArray[np.floating],
-) -> tuple[Floats, Floats]:
-    """([3, M] origins, [3, M] unit directions) through image points in pixels."""
-    in_camera = np.stack(
-        [
-            (columns.ravel() - width / 2) / focal,
-            (height / 2 - rows.ravel()) / focal,
-            np.full(columns.size, -1.0),
+    def _rays(self, pose: Pose, columns: Doubles, rows: Doubles) -> tuple[Floats, Floats]:
+        """([3, M] origins, [3, M] unit directions) through image points in pixels."""
+        x, y = columns.ravel() - self.width / 2, self.height / 2 - rows.ravel()
+        in_camera = np.stack([x / self.focal, y / self.focal, np.full(x.size, -1.0)])
+        in_camera /= np.linalg.norm(in_camera, axis=0)
+        axes = pose[:3, :3]
+        # Spelled out because the last digits of a matrix product depend on the number of threads.
+        directions = axes[:, :1] * in_camera[0] + axes[:, 1:2] * in_camera[1] + axes[:, 2:] * in_camera[2]
+        origins = np.repeat(pose[:3, 3:], x.size, axis=1)
+        return origins.astype(np.float32), directions.astype(np.float32)
+
+    def points(self, images: NDArray[np.uint8], rng: np.random.Generator) -> bytes:
+        """A point cloud PLY of what random pixels show, a little off like a reconstruction."""
+        views = len(self.poses)
+        vertices = np.empty(_POINTS, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        for view, pose in enumerate(self.poses):
+            count = len(range(view, _POINTS, views))
+            rows, columns = rng.integers(0, self.height, count), rng.integers(0, self.width, count)
+            origins, directions = self._rays(pose, columns + 0.5, rows + 0.5)
+            _, points = trace(self.world, origins, directions)
+            distances = np.linalg.norm(points - origins, axis=0)
+            points = points + _POINT_NOISE * distances * rng.normal(size=points.shape)
+            vertices["xyz"][view::views] = points.T
+            vertices["rgb"][view::views] = images[view, rows, columns]
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        colors = "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {_POINTS}\n{axes}{colors}end_header\n"
+        return header.encode() + vertices.tobytes()
+
+    def transforms(self, names: list[str]) -> bytes:
+        """The cameras as JSON, each with the name of its photo."""
+        lens = {"camera_model": "PINHOLE", "w": self.width, "h": self.height}
+        lens |= {"fl_x": self.focal, "fl_y": self.focal, "cx": self.width / 2, "cy": self.height / 2}
+        frames = [
+            {"file_path": name, "transform_matrix": pose.tolist()}
+            for name, pose in zip(names, self.poses, strict=True)
         ]
-    )
-    in_camera /= np.linalg.norm(in_camera, axis=0)
-    axes = pose[:3, :3]
-    # Spelled out because the last digits of a matrix product depend on the number of threads.
-    directions = axes[:, :1] * in_camera[0] + axes[:, 1:2] * in_camera[1] + axes[:, 2:] * in_camera[2]
-    origins = np.repeat(pose[:3, 3:], columns.size, axis=1)
-    return origins.astype(np.float32), directions.astype(np.float32)
-
-
-def _sparse_points(
-    world: World,
-    poses: list[NDArray[np.float64]],
-    focal: float,
-    images: NDArray[np.uint8],
-    rng: np.random.Generator,
-) -> bytes:
-    """A point cloud PLY of what random pixels show, a little off like a reconstruction."""
-    views, height, width, _ = images.shape
-    vertices = np.empty(
-        _POINTS,
-        dtype=[(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")],
-    )
-    owners = np.arange(_POINTS) % views
-    for view, pose in enumerate(poses):
-        chosen = np.flatnonzero(owners == view)
-        rows, columns = rng.integers(0, height, chosen.size), rng.integers(0, width, chosen.size)
-        origins, directions = _rays(pose, focal, width, height, columns + 0.5, rows + 0.5)
-        _, points = trace(world, origins, directions)
-        distances = np.linalg.norm(points - origins, axis=0)
-        points = points + _POINT_NOISE * distances * rng.normal(size=points.shape)
-        for axis, values in zip("xyz", points, strict=True):
-            vertices[axis][chosen] = values
-        for channel, color in enumerate(("red", "green", "blue")):
-            vertices[color][chosen] = images[view, rows, columns, channel]
-    properties = [f"property float {axis}\n" for axis in "xyz"]
-    properties += [f"property uchar {color}\n" for color in ("red", "green", "blue")]
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {_POINTS}\n{''.join(properties)}end_header\n"
-    )
-    return header.encode() + vertices.tobytes()
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    return buffer.getvalue()
-
-
-def _image_name(index: int) -> str:
-    return f"images/{index:04d}.png"
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask
+        return (
+            json.dumps({**lens, "ply_file_path": "points.ply", "frames": frames}, indent=1) + "\n"
+        ).encode()

@@ -1,108 +1,162 @@
-"""Signed distances and patterns that the demo scenes are made of. Conventions as in `ray_tracer`."""
+"""Signed distances and patterns that the demo scenes are made of.
+
+Arrays are float32 and hold one column per ray or point, so [3, M] where a vector is meant. Lengths are in
+scene units with z up, colours are linear RGB. Sums over axes are spelled out: numpy is slow along a short
+first axis, and the last digits of its matrix products depend on the number of threads.
+"""
+
+# mypy: no-warn-return-any
+# because numpy's functions are typed to return Any.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from keyss.demo.ray_tracer import Floats, Vector, smoothstep
-
-
-def sphere(points: Floats, center: Vector, radius: float) -> Floats:
-    x, y, z = _from(points, center)
-    distance: Floats = np.sqrt(x * x + y * y + z * z) - np.float32(radius)
-    return distance
+Floats: TypeAlias = NDArray[np.float32]
+Vector: TypeAlias = tuple[float, float, float]
+Distance: TypeAlias = Callable[[Floats], Floats]  # [3, M] local points -> [M], never more than the true one
 
 
-def ellipsoid(points: Floats, center: Vector, radii: Vector) -> Floats:
+def column(vector: Vector | Floats) -> Floats:
+    """[3, 1]"""
+    return np.array(vector, dtype=np.float32)[:, None]
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def length(vectors: Floats) -> Floats:
+    return np.sqrt(dot(vectors, vectors))
+
+
+def turned(x: Floats, y: Floats, angle: float) -> tuple[Floats, Floats]:
+    """Coordinates in a plane, turned about its origin."""
+    c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    return c * x - s * y, s * x + c * y
+
+
+def smoothstep(low: float, high: float, value: Floats) -> Floats:
+    """0 below `low`, 1 above `high`, a smooth rise between them."""
+    t = np.clip((value - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+# --- shapes ----------------------------------------------------------------------------------------------
+
+
+def _shape(distance: Callable[..., Floats]) -> Callable[..., Distance]:
+    """Turns a distance of (points around the shape's centre, sizes) into a `Distance` of (centre, sizes)."""
+
+    def placed(center: Vector, *sizes: Any) -> Distance:
+        return lambda points: distance(points - column(center), *sizes)
+
+    return placed
+
+
+@_shape
+def sphere(points: Floats, radius: float) -> Floats:
+    return length(points) - radius
+
+
+@_shape
+def ellipsoid(points: Floats, radii: Vector) -> Floats:
     """Not exact, but never more than the distance near the surface of moderately flat ellipsoids."""
-    scaled = [value / np.float32(radius) for value, radius in zip(_from(points, center), radii, strict=True)]
-    length = np.sqrt(sum(value * value for value in scaled))
-    gradient = np.sqrt(
-        sum((value / np.float32(radius)) ** 2 for value, radius in zip(scaled, radii, strict=True))
-    )
-    distance: Floats = length * (length - 1) / np.maximum(gradient, 1e-6)
-    return distance
+    scaled = points / column(radii)
+    size = length(scaled)
+    return np.divide(size * (size - 1), np.maximum(length(scaled / column(radii)), 1e-6))
 
 
-def capsule(points: Floats, start: Vector, end: Vector, radii: tuple[float, float]) -> Floats:
-    """A rod from `start` to `end` with round ends, its radius going from the first to the second."""
-    x, y, z = _from(points, start)
-    ax, ay, az = (np.float32(b - a) for a, b in zip(start, end, strict=True))
-    along = np.clip((x * ax + y * ay + z * az) / (ax * ax + ay * ay + az * az), 0, 1)
-    away = np.sqrt((x - along * ax) ** 2 + (y - along * ay) ** 2 + (z - along * az) ** 2)
-    first, last = np.float32(radii[0]), np.float32(radii[1])
-    distance: Floats = (away - (first + along * (last - first))) * np.float32(0.95)
-    return distance
+@_shape
+def capsule(points: Floats, axis: Vector, radii: tuple[float, float]) -> Floats:
+    """A rod along `axis` with round ends, its radius going from the first to the second."""
+    along = np.clip(dot(points, column(axis)) / dot(column(axis), column(axis)), 0, 1)
+    first, last = (np.float32(radius) for radius in radii)
+    away = length(points - along * column(axis))
+    return (away - (first + along * (last - first))) * np.float32(0.95)
 
 
-def torus(points: Floats, center: Vector, ring: float, tube: float) -> Floats:
+@_shape
+def torus(points: Floats, ring: float, tube: float) -> Floats:
     """A ring that stands upright in the x-z plane."""
-    x, y, z = _from(points, center)
-    around = np.sqrt(x * x + z * z) - np.float32(ring)
-    distance: Floats = np.sqrt(around * around + y * y) - np.float32(tube)
-    return distance
+    x, y, z = points
+    around = np.sqrt(x * x + z * z) - ring
+    return np.sqrt(around * around + y * y) - tube
 
 
-def octahedron(points: Floats, center: Vector, radius: float, stretch: float) -> Floats:
+@_shape
+def octahedron(points: Floats, radius: float, stretch: float) -> Floats:
     """Corners at `radius` around the vertical axis and at `stretch` x `radius` on it; edges rounded."""
-    x, y, z = _from(points, center)
+    x, y, z = np.abs(points)
     rise = np.float32(1 / stretch)
-    shrink = np.float32(1 / np.sqrt(2 + rise * rise))
-    distance: Floats = (np.abs(x) + np.abs(y) + np.abs(z) * rise - np.float32(radius)) * shrink - 0.01
-    return distance
+    return (x + y + z * rise - radius) * (1 / np.sqrt(2 + rise * rise)) - 0.01
 
 
-def disc(points: Floats, center: Vector, tilt: float, radius: float, half_height: float) -> Floats:
-    """A coin, leaning by `tilt` radians about the y axis, with rounded edges."""
-    x, y, z = _from(points, center)
-    c, s = np.float32(np.cos(tilt)), np.float32(np.sin(tilt))
-    x, z = c * x + s * z, c * z - s * x
-    outside = np.maximum(np.sqrt(x * x + y * y) - np.float32(radius), 0)
-    above = np.maximum(np.abs(z) - np.float32(half_height), 0)
-    distance: Floats = np.sqrt(outside * outside + above * above) - np.float32(0.008)
-    return distance
+@_shape
+def coin(points: Floats, tilt: float) -> Floats:
+    """A disc of radius 0.1, leaning by `tilt` radians about the y axis, with rounded edges."""
+    z, x = turned(points[2], points[0], tilt)
+    outside = np.maximum(np.sqrt(x * x + points[1] * points[1]) - 0.1, 0)
+    above = np.maximum(np.abs(z) - 0.008, 0)
+    return np.sqrt(outside * outside + above * above) - 0.008
 
 
-def turned_profile(points: Floats, profile: list[tuple[float, float]], thickness: float) -> Floats:
-    """A vessel: the polyline `profile` of (radius, height), turned about the vertical axis."""
-    r, z = np.sqrt(points[0] ** 2 + points[1] ** 2), points[2]
-    nearest = np.full(r.shape, 1e9, dtype=np.float32)
-    for (r0, z0), (r1, z1) in itertools.pairwise(profile):
-        dr, dz = np.float32(r1 - r0), np.float32(z1 - z0)
-        along = np.clip(((r - np.float32(r0)) * dr + (z - np.float32(z0)) * dz) / (dr * dr + dz * dz), 0, 1)
-        nearest = np.minimum(
-            nearest, (r - np.float32(r0) - along * dr) ** 2 + (z - np.float32(z0) - along * dz) ** 2
-        )
-    distance: Floats = np.sqrt(nearest) - np.float32(thickness)
-    return distance
-
-
-def braid(points: Floats, center: Vector, ring: float, wind: float, tube: float) -> Floats:
+@_shape
+def braid(points: Floats, ring: float, wind: float, tube: float) -> Floats:
     """A trefoil knot standing upright: a strand that winds at `wind` around a ring in the x-z plane."""
-    x, y, z = _from(points, center)
-    half_twist = np.float32(1.5) * np.arctan2(z, x)
+    x, y, z = points
+    half_twist = 1.5 * np.arctan2(z, x)
     c, s = np.cos(half_twist), np.sin(half_twist)
     from_axis = np.sqrt(x * x + z * z)
-    out = from_axis - np.float32(ring)
+    out = from_axis - ring
     u, v = c * out - s * y, s * out + c * y
-    across = np.sqrt((np.abs(u) - np.float32(wind)) ** 2 + v * v) - np.float32(tube)
+    across = np.sqrt((np.abs(u) - wind) ** 2 + v * v) - tube
     # The twist stretches space, most near the axis; far away the ring that holds the strand bounds better.
     away2 = out * out + y * y
-    stretch = np.sqrt(1 + np.float32(2.25) * away2 / np.maximum(from_axis, 0.05) ** 2)
-    distance: Floats = np.maximum(across / stretch, np.sqrt(away2) - np.float32(wind + tube))
+    stretch = np.sqrt(1 + 2.25 * away2 / np.maximum(from_axis, 0.05) ** 2)
+    return np.maximum(across / stretch, np.sqrt(away2) - (wind + tube))
+
+
+def lathe(*profile: tuple[float, float], thickness: float) -> Distance:
+    """A vessel: the polyline `profile` of (radius, height), turned about the vertical axis."""
+
+    def distance(points: Floats) -> Floats:
+        r, z = np.sqrt(points[0] ** 2 + points[1] ** 2), points[2]
+        squares = []
+        for (r0, z0), (r1, z1) in itertools.pairwise(profile):
+            dr, dz = np.float32(r1 - r0), np.float32(z1 - z0)
+            along = np.clip(((r - r0) * dr + (z - z0) * dz) / (dr * dr + dz * dz), 0, 1)
+            squares.append((r - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2)
+        return np.sqrt(functools.reduce(np.minimum, squares)) - thickness
+
     return distance
 
 
-def blend(first: Floats, second: Floats, width: float) -> Floats:
+def blend(first: Distance, second: Distance, width: float) -> Distance:
     """The union of two shapes with a fillet of about `width`."""
-    gap = np.maximum(np.float32(width) - np.abs(first - second), 0)
-    joined: Floats = np.minimum(first, second) - gap * gap / np.float32(4 * width)
-    return joined
+
+    def distance(points: Floats) -> Floats:
+        a, b = first(points), second(points)
+        gap = np.maximum(width - np.abs(a - b), 0)
+        return np.minimum(a, b) - gap * gap / (4 * width)
+
+    return distance
 
 
+def union(*shapes: Distance) -> Distance:
+    return lambda points: functools.reduce(np.minimum, [shape(points) for shape in shapes])
+
+
+# --- patterns --------------------------------------------------------------------------------------------
+
+
+@functools.cache
 def ripples(frequency: float, seed: int, stretch: Vector = (1.0, 1.0, 1.0)) -> Callable[[Floats], Floats]:
     """A smooth random function of points in about [-1, 1].
 
@@ -117,9 +171,8 @@ def ripples(frequency: float, seed: int, stretch: Vector = (1.0, 1.0, 1.0)) -> C
 
     def value(points: Floats) -> Floats:
         summed = np.zeros(points.shape[1], dtype=np.float32)
-        # No matrix product: its last digits depend on the number of threads.
-        for (a, b, c), phase in zip(waves, phases, strict=True):
-            summed += np.sin(a * points[0] + b * points[1] + c * points[2] + phase)
+        for wave, phase in zip(waves, phases, strict=True):
+            summed += np.sin(dot(wave, points) + phase)
         return summed / np.float32(3)
 
     return value
@@ -127,17 +180,13 @@ def ripples(frequency: float, seed: int, stretch: Vector = (1.0, 1.0, 1.0)) -> C
 
 def mix(first: Vector | Floats, second: Vector | Floats, share: Floats) -> Floats:
     """[3, M] colours from `first` at share 0 to `second` at share 1; one colour or [3, M] of them each."""
-    a, b = (
-        np.array(color, dtype=np.float32)[:, None] if isinstance(color, tuple) else color
-        for color in (first, second)
-    )
-    mixed: Floats = a + share * (b - a)
-    return mixed
+    a, b = (column(color) if isinstance(color, tuple) else color for color in (first, second))
+    return a + share * (b - a)
 
 
 def joints(value: Floats, period: float, width: float) -> Floats:
     """[M] 1 on the lines at multiples of `period`, `width` wide with soft edges, 0 between them."""
-    nearest = np.abs(value - np.float32(period) * np.rint(value / np.float32(period)))
+    nearest = np.abs(value - np.float32(period) * np.rint(value / period))
     return 1 - smoothstep(0.3 * width, 0.8 * width, nearest)
 
 
@@ -145,8 +194,3 @@ def scattered(*cells: Floats) -> Floats:
     """[M] a number in [0, 1) for each combination of whole numbers, as good as random."""
     mixed = sum(np.float64(weight) * cell for weight, cell in zip((12.9898, 78.233), cells, strict=False))
     return (np.sin(mixed) * 43758.5453 % 1.0).astype(np.float32)
-
-
-def _from(points: Floats, center: Vector) -> tuple[Floats, Floats, Floats]:
-    x, y, z = points
-    return x - np.float32(center[0]), y - np.float32(center[1]), z - np.float32(center[2])

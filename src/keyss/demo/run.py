@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,15 +22,16 @@ from keyss.files.atomic import write_bytes
 from keyss.files.output import OutputFolder
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import Interrupted, Reporter, Silent
-from keyss.methods.learned.config import HideConfig
+from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
+from keyss.methods.learned.options import LearnedOptions
 from keyss.rendering import Backend
 from keyss.runs import files as results
 from keyss.runs.files import METRICS, PRIVATE, SIDECAR, STEGO
+from keyss.runs.metrics import HideMetrics
 
 COVER, SECRET = "tea-table", "golden-knot"
 VIEWS, WIDTH, HEIGHT = 48, 160, 120
-CONFIG = HideConfig(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
+OPTIONS = LearnedOptions(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
 _RESULTS = (
@@ -44,7 +44,7 @@ _RESULTS = (
 class DemoResult:
     """What the demo found."""
 
-    metrics: dict[str, Any]  # as in metrics.json
+    metrics: HideMetrics  # as in metrics.json
     refused: int  # wrong keys that were tried and opened nothing
 
 
@@ -54,8 +54,7 @@ def run_demo(
     seed: int = 0,
     device: Backend = "auto",
     overwrite: bool = False,
-    config: HideConfig = CONFIG,
-    sidecar: bool = False,
+    options: LearnedOptions = OPTIONS,
     views: int = VIEWS,
     width: int = WIDTH,
     height: int = HEIGHT,
@@ -73,15 +72,14 @@ def run_demo(
     _clear(out)
     try:
         cover, secret = (
-            _scene(out / SCENES / which, views, width, height, seed, reporter or Silent())
+            _scene(out / SCENES / which, views, width, height, seed, reporter or SilentReporter())
             for which in (COVER, SECRET)
         )
         key = f"demo-key-{seed}"
         verbs.hide(
             out / SCENES / COVER,
             [verbs.Secret(out / SCENES / SECRET, key)],
-            config=config.with_fit(seed=seed),
-            sidecar=sidecar,
+            method=options.with_fit(seed=seed),
             device=device,
             out=out,
             overwrite=True,
@@ -138,19 +136,22 @@ def _is_refused(stego: Path, key: str, device: Backend) -> bool:
     return False
 
 
-def _comparison(
-    out: Path, cover: Scene, secret: Scene, metrics: dict[str, Any], device: Backend
-) -> Image.Image:
+def _comparison(out: Path, cover: Scene, secret: Scene, metrics: HideMetrics, device: Backend) -> Image.Image:
     """Photos and renders of three test views side by side."""
     stego = out / STEGO
     decoy = verbs.reveal(stego, WRONG_KEYS[0], decoy=True, device=device)
-    hidden, wrong = metrics["secrets"][0], metrics["wrong_key"]["vs_cover"]
+    assert metrics.wrong_key is not None
+    hidden, wrong = metrics.secrets[0], metrics.wrong_key.vs_cover
     columns = [
         ("cover: photo", "", [view.image for view in cover.test]),
-        ("cover: published model", f"{metrics['cover']['psnr']:.1f} dB", _pictures(stego, cover, device)),
+        ("cover: published model", f"{metrics.cover.psnr:.1f} dB", _pictures(stego, cover, device)),
         ("secret: photo", "", [view.image for view in secret.test]),
-        ("opened with the key", f"{hidden['psnr']:.1f} dB", _pictures(out / SECRET_PLY, secret, device)),
-        ("with a wrong key", f"{wrong['mean']:.1f} dB against the cover", _pictures(decoy, cover, device)),
+        ("opened with the key", f"{hidden.psnr:.1f} dB", _pictures(out / SECRET_PLY, secret, device)),
+        (
+            "with a wrong key",
+            f"{wrong.mean:.1f} dB against the cover",
+            _pictures(decoy, cover, device),
+        ),
     ]
     count = len(cover.test)
     rows = sorted({count // 6, count // 2, count - 1 - count // 6})

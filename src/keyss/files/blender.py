@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from keyss.files.layout import Layout, Photo, Points, hold_out, refuse_duplicates
+from keyss.files.layout import Photo, PointCloud, SceneLayout, hold_out, refuse_duplicates
 from keyss.files.transforms import read_transforms
 
 
-def is_blender(folder: Path) -> bool:
-    """Whether the folder holds `transforms_train.json`."""
-    return (folder / "transforms_train.json").is_file()
-
-
-def read_blender(folder: Path) -> Layout:
+def read_blender(folder: Path) -> SceneLayout:
     """The photos of the training and the test file; there are no points.
 
     Without a test file the validation file takes its place, and without that every 8th training photo.
@@ -29,4 +24,4 @@ def read_blender(folder: Path) -> Layout:
             break
     else:
         train, test = hold_out(folder, train)
-    return Layout(train, test, Points.none())
+    return SceneLayout(train, test, PointCloud.none())

@@ -1,4 +1,4 @@
-"""Photos from disk to plain RGB bytes."""
+"""Photos from disk to plain RGB bytes, and pictures to PNG files."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from keyss.core.errors import InputError
+from keyss.core.scene import Camera
 
 # Only formats that photos of a scene come in: some of Pillow's others start external programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
@@ -67,6 +69,16 @@ def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint
     """[height, width, 3] by area averaging of a larger image."""
     # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def picture_name(camera: Camera) -> str:
+    """A flat file name for a picture from `camera`: folders in the camera's name become part of it."""
+    return Path(camera.name.replace("/", "_").replace("\\", "_")).stem + ".png"
+
+
+def png_bytes(image: Tensor) -> bytes:
+    """A PNG file of an image [H, W, 3] uint8."""
+    return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
 
 
 def _to_rgb(image: Image.Image, background: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,18 +26,18 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Points:
+class PointCloud:
     """A point cloud."""
 
     xyz: NDArray[np.float32]  # [P, 3]
     rgb: NDArray[np.uint8]  # [P, 3]
 
     @staticmethod
-    def none() -> Points:
-        return Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    def none() -> PointCloud:
+        return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
 
     @staticmethod
-    def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> Points:
+    def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> PointCloud:
         """The points as float32. Raises InputError when a coordinate is not finite or beyond 1e15."""
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():
@@ -46,16 +45,16 @@ class Points:
             raise InputError(
                 f"{where}: expected finite points, found {xyz[first].tolist()} as point {first + 1}"
             )
-        return Points(xyz.astype(np.float32), rgb)
+        return PointCloud(xyz.astype(np.float32), rgb)
 
 
 @dataclass(frozen=True)
-class Layout:
+class SceneLayout:
     """The photos of a scene, split into training and test, and its points."""
 
     train: tuple[Photo, ...]
     test: tuple[Photo, ...]
-    points: Points
+    points: PointCloud
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
@@ -69,26 +68,6 @@ def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], t
         )
     ordered = sorted(photos, key=lambda photo: photo.name)
     return tuple(p for i, p in enumerate(ordered) if i % 8), tuple(ordered[::8])
-
-
-def viewmat_from_quaternion(
-    where: str, quaternion: Sequence[float], translation: Sequence[float]
-) -> NDArray[np.float64]:
-    """[4, 4] from a rotation wxyz (normalised here) and a translation. Raises InputError."""
-    norm = math.hypot(*quaternion)
-    if not 1e-8 < norm < math.inf:
-        raise InputError(f"{where}: expected a rotation quaternion, found {list(quaternion)}")
-    w, x, y, z = (q / norm for q in quaternion)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    if not all(abs(t) <= MAX_COORDINATE for t in translation):
-        raise InputError(f"{where}: expected a finite translation, found {list(translation)}")
-    viewmat[:3, 3] = translation
-    return viewmat
 
 
 def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:

@@ -62,12 +62,8 @@ class Lens:
         if (width, height) == (self.width, self.height):
             return self
         factor = round(self.width / width)
-        fits = (
-            abs(width - self.width / factor) < 1 and abs(height - self.height / factor) < 1
-            if factor > 1
-            else False
-        )
-        return self.resized(width, height) if fits else None
+        near = abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
+        return self.resized(width, height) if factor > 1 and near else None
 
 
 def make_lens(

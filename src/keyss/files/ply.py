@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Set
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,32 +28,6 @@ _NORMALS = ["nx", "ny", "nz"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
-
-
-@dataclass(frozen=True)
-class PlyInfo:
-    """What a person asks first about a 3DGS model on disk."""
-
-    count: int
-    sh_degree: int  # 0 to 3
-    bytes: int  # size of the file
-    lower: tuple[float, float, float]  # smallest x, y, z of the means
-    upper: tuple[float, float, float]  # largest x, y, z of the means
-    faint_share: float  # share of the Gaussians with opacity below 0.05, in [0, 1]
-
-
-def describe_ply(path: Path | str) -> PlyInfo:
-    """Read the model at `path` and sum it up. Raises InputError as `read_ply` does."""
-    gaussians = read_ply(path)
-    lower, upper = gaussians.means.amin(0).tolist(), gaussians.means.amax(0).tolist()
-    return PlyInfo(
-        count=len(gaussians),
-        sh_degree=gaussians.sh_degree,
-        bytes=Path(path).stat().st_size,
-        lower=(lower[0], lower[1], lower[2]),
-        upper=(upper[0], upper[1], upper[2]),
-        faint_share=float((gaussians.opacities < 0.05).float().mean()),
-    )
 
 
 def write_ply(path: Path | str, gaussians: Gaussians) -> None:

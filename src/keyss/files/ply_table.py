@@ -158,19 +158,8 @@ def _read_rows(file: BinaryIO, header: _Header, names: list[str], path: Path) ->
 def _read_binary(
     file: BinaryIO, byte_order: str, vertex: _Element, names: list[str], path: Path
 ) -> npt.NDArray[np.float32]:
-    offsets: dict[str, int] = {}
-    stride = 0
-    for name, code in vertex.properties.items():
-        offsets[name] = stride
-        stride += int(code[1])
-    dtype = np.dtype(
-        {
-            "names": names,
-            "formats": [byte_order + vertex.properties[name] for name in names],
-            "offsets": [offsets[name] for name in names],
-            "itemsize": stride,
-        }
-    )
+    dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
+    stride = dtype.itemsize
     rows = np.empty((vertex.count, len(names)), dtype=np.float32)
     step = max(1, _CHUNK_BYTES // stride)
     for start in range(0, vertex.count, step):
@@ -197,6 +186,6 @@ def _read_ascii(
         values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=vertex.count * width)
     except (StopIteration, ValueError) as error:
         raise InputError(f"{path}: the ascii data are cut short or hold something not a number") from error
-    order = {name: column for column, name in enumerate(vertex.properties)}
+    columns = [list(vertex.properties).index(name) for name in names]
     with np.errstate(over="ignore"):
-        return values.reshape(vertex.count, width)[:, [order[name] for name in names]].astype(np.float32)
+        return values.reshape(vertex.count, width)[:, columns].astype(np.float32)

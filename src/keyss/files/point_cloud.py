@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from keyss.core.errors import InputError
-from keyss.files.layout import Points
+from keyss.files.layout import PointCloud
 from keyss.files.ply_table import read_vertices
 
 _POSITION = ["x", "y", "z"]
@@ -15,7 +15,7 @@ _COLOR = ["red", "green", "blue"]
 _GREY = 128  # for points without colours
 
 
-def read_point_cloud(path: Path) -> Points:
+def read_point_cloud(path: Path) -> PointCloud:
     """The `x y z` and, where there are any, `red green blue` (uchar) of a PLY's vertices.
 
     Raises InputError when the file is no such PLY, is truncated or holds coordinates that are not finite.
@@ -39,4 +39,4 @@ def read_point_cloud(path: Path) -> Points:
         if not ((values >= 0) & (values <= 255)).all():  # possible in ascii
             raise InputError(f"{path}: expected colours of 0 to 255, found others")
         rgb = values.astype(np.uint8)
-    return Points.checked(path, rows[:, :3].astype(np.float64), rgb)
+    return PointCloud.checked(path, rows[:, :3].astype(np.float64), rgb)

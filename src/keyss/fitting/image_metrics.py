@@ -15,7 +15,7 @@ from keyss.rendering import render
 
 
 @dataclass(frozen=True)
-class Quality:
+class ImageQuality:
     """Means over views."""
 
     psnr: float  # dB
@@ -29,7 +29,7 @@ def psnr(image: Tensor, reference: Tensor) -> float:
 
 
 @torch.no_grad()
-def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> Quality:
+def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> ImageQuality:
     """Mean PSNR and SSIM of the views' renders, rounded to no fewer than 32 bits, against their photos."""
     psnrs, ssims = [], []
     for view in views:
@@ -37,7 +37,7 @@ def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> 
         image = render(gaussians, view.camera, background).clamp(0, 1)
         psnrs.append(psnr(image, photo))
         ssims.append(float(ssim(image, Target.of(photo))))
-    return Quality(sum(psnrs) / len(psnrs), sum(ssims) / len(ssims))
+    return ImageQuality(sum(psnrs) / len(psnrs), sum(ssims) / len(ssims))
 
 
 @torch.no_grad()
@@ -48,6 +48,6 @@ def mean_psnr(gaussians: Gaussians, views: Sequence[View], background: Tensor) -
     return sum(values) / len(values)
 
 
-def thin(views: Sequence[View], count: int) -> tuple[View, ...]:
-    """At most `count` of the views, evenly spread."""
+def subsample_views(views: Sequence[View], count: int) -> tuple[View, ...]:
+    """At most `count` of the views: every n-th."""
     return tuple(views[:: max(1, -(-len(views) // count))])

@@ -25,7 +25,7 @@ class Interrupted(KeyboardInterrupt):
         self.iteration = iteration
 
 
-class Run(Protocol):
+class TrainingRun(Protocol):
     """A training run: everything that `state` returns decides its future completely."""
 
     iterations: int
@@ -48,6 +48,19 @@ class Run(Protocol):
 class Reporter(Protocol):
     """Where progress goes."""
 
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        """`iteration` steps of `iterations` are done already, which is more than 0 for a resumed run."""
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        """So many steps are done; `gaussians` is 0 and `numbers` empty where there are none to tell."""
+
+    def finish(self) -> None:
+        """The work is done, or was interrupted."""
+
+
+class SilentReporter:
+    """Says nothing."""
+
     def start(self, title: str, iterations: int, iteration: int) -> None: ...
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None: ...
@@ -55,21 +68,8 @@ class Reporter(Protocol):
     def finish(self) -> None: ...
 
 
-class Silent:
-    """A reporter that says nothing."""
-
-    def start(self, title: str, iterations: int, iteration: int) -> None:
-        pass
-
-    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
-        pass
-
-    def finish(self) -> None:
-        pass
-
-
 def train(
-    run: Run,
+    run: TrainingRun,
     title: str,
     *,
     fingerprint: dict[str, Any],
@@ -89,7 +89,7 @@ def train(
     state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given back
     to the caller.
     """
-    reporter = reporter or Silent()
+    reporter = reporter or SilentReporter()
     spent = 0.0
     with torch.random.fork_rng(), _deferred_interrupt() as interrupted:
         torch.manual_seed(seed)

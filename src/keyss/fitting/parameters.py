@@ -21,34 +21,32 @@ from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
 
+# Names of parameters -> fields of `Gaussians`.
+_FIELDS = {
+    "means": "means",
+    "quats": "quats",
+    "scales": "log_scales",
+    "opacities": "opacity_logits",
+    "sh": "sh",
+}
+
 Parameters = dict[str, torch.nn.Parameter]
 Optimizers = dict[str, RowAdam]
 
 
 def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
     """Leaf parameters holding a copy of the Gaussians on `device`."""
-    tensors = {
-        "means": gaussians.means,
-        "quats": gaussians.quats,
-        "scales": gaussians.log_scales,
-        "opacities": gaussians.opacity_logits,
-        "sh": gaussians.sh,
-    }
     return {
-        name: torch.nn.Parameter(t.detach().to(device).clone(memory_format=torch.contiguous_format))
-        for name, t in tensors.items()
+        name: torch.nn.Parameter(
+            getattr(gaussians, field).detach().to(device).clone(memory_format=torch.contiguous_format)
+        )
+        for name, field in _FIELDS.items()
     }
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:
     """The Gaussians that the parameters stand for, attached to their graph."""
-    return Gaussians(
-        parameters["means"],
-        parameters["quats"],
-        parameters["scales"],
-        parameters["opacities"],
-        parameters["sh"],
-    )
+    return Gaussians(**{field: parameters[name] for name, field in _FIELDS.items()})
 
 
 def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) -> Optimizers:

@@ -13,7 +13,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy
-from keyss.fitting.image_metrics import mean_psnr, thin
+from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import Reporter, train
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import (
@@ -43,7 +43,7 @@ class PlainRun:
         self.config = config
         self.device = device
         self.views = scene.train
-        self.watched = thin(scene.test, 8)
+        self.watched = subsample_views(scene.test, 8)
         self.background = scene.background.to(device)
         self.iterations = config.iterations
         self.iteration = 0

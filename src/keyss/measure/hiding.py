@@ -14,7 +14,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import Quality, mean_psnr, quality
+from keyss.fitting.image_metrics import ImageQuality, mean_psnr, quality
 from keyss.keys import random_embeddings
 from keyss.methods.base import Opened
 
@@ -23,8 +23,8 @@ from keyss.methods.base import Opened
 class BaselineQuality:
     """Plain 3DGS of the same scenes; None where there is no plain model of one."""
 
-    cover: Quality | None
-    secrets: tuple[Quality | None, ...]
+    cover: ImageQuality | None
+    secrets: tuple[ImageQuality | None, ...]
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class WrongKeys:
 class HidingQuality:
     """Cover and secrets on their test photos, and what they are to be compared with."""
 
-    cover: Quality
-    secrets: tuple[Quality, ...]
+    cover: ImageQuality
+    secrets: tuple[ImageQuality, ...]
     baseline: BaselineQuality
     wrong_key: WrongKeys | None  # None where keys condition no decoder
     chance_level: tuple[float, ...]  # dB, the stego cover itself against each secret's photos
@@ -125,7 +125,7 @@ def _range(values: Sequence[float]) -> PsnrRange:
     return PsnrRange(fmean(values), min(values), max(values))
 
 
-def _quality(scene: Scene, model: Gaussians) -> Quality:
+def _quality(scene: Scene, model: Gaussians) -> ImageQuality:
     return quality(model, scene.test, scene.background.to(model.device))
 
 

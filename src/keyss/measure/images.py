@@ -17,11 +17,10 @@ from torch import Tensor
 from keyss.core.errors import BackendError, InputError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.files.images import read_image
+from keyss.files.images import picture_name, read_image
 from keyss.fitting.image_metrics import psnr
 from keyss.measure.lpips import lpips_alex
 from keyss.rendering import render
-from keyss.runs.files import picture_name
 
 Pixels = npt.NDArray[np.uint8]
 Doubles = npt.NDArray[np.float64]

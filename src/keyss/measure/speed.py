@@ -18,7 +18,7 @@ from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.ply import read_ply, write_ply
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_gsply, transform
 from keyss.measure.robustness.reopening import Reopen
 from keyss.rendering import render
@@ -115,7 +115,7 @@ def render_time(
     Each round draws at most `views` views with both, one right after the other and the first in turns; the
     first round warms up and does not count.
     """
-    cameras = [view.camera for view in thin(scene.test, views)]
+    cameras = [view.camera for view in subsample_views(scene.test, views)]
     background = scene.background.to(model.device)
     times = np.zeros((rounds + 1, len(cameras), 2))
     for number in range(rounds + 1):

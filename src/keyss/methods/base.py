@@ -6,15 +6,17 @@ folder tests for its name: what it can do it declares, and what it finds it give
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
 
 from keyss.channels.base import Content
+from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -29,10 +31,19 @@ class Capabilities:
     """What a method can do; the command line, the audit and tables read it instead of its name."""
 
     trains: bool  # hiding is a training of its own, after the plain models
+    decoder: bool  # keys condition a decoder, so that a wrong key can be measured: `Opened.decode`
     standard_file: bool  # what is published is an ordinary 3DGS model for every viewer
     most_secrets: int
     sidecar: bool  # can write what keys open to a file beside the model
     recommended_for: str  # one line for tables and help
+
+
+@dataclass(frozen=True)
+class SceneInput:
+    """What is known of a scene before anything is rendered or trained."""
+
+    model: Gaussians | None  # a plain model on the CPU; None: one will be fitted to the photos
+    photos: bool  # False: the model is all there is, and pictures of it take the place of photos
 
 
 @dataclass(frozen=True)
@@ -41,7 +52,6 @@ class Source:
 
     scene: Scene  # photos, or pictures rendered of the model
     model: Gaussians  # in the scene's own frame, on the CPU
-    model_given: bool  # and not fitted here
 
 
 @dataclass(frozen=True)
@@ -77,9 +87,9 @@ class Opened(Protocol):
         """
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The secret as a model of its own; `force`: also from a model that was changed.
+        """The secret as a model of its own, on the CPU; `force`: also from a model that was changed.
 
-        Raises InputError for a model that it does not belong to.
+        Raises InputError for a model that it does not belong to, UsageError for a frame that it never was in.
         """
 
     def fingerprint(self) -> str:
@@ -94,7 +104,21 @@ class Stego:
     sidecar: bytes | None  # what keys open, where it is not in the model
     opened: tuple[Opened, ...]  # the secrets as they come out again with their keys
     seconds: float  # of hiding alone, without plain models
+    iterations: int = 0  # of the method's own training
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of its own, for metrics.json
+
+
+@dataclass(frozen=True)
+class CommandLineOption:
+    """Annotates a field of options that the command line has too, under the same name.
+
+    A truth value becomes a flag, everything else takes one value.
+    """
+
+    help: str
+    metavar: str | None = None  # stands for the value in the help
+    alias: str | None = None  # another name
+    parse: Callable[[str], Any] | None = None  # makes the value of text, where the type does not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,23 +127,46 @@ class MethodOptions:
 
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
 
+    def with_fit(self, **changes: Any) -> Self:
+        """The same with changed fields of `fit`."""
+        return replace(self, fit=replace(self.fit, **changes))
+
+    def adapted(self, **changes: Any) -> Self:
+        """The same with changed fields, and with what follows from them."""
+        return replace(self, **changes)
+
 
 class Method(Protocol):
     """One way to hide secrets."""
 
-    name: str  # in files and on the command line, 1 to 15 ASCII characters
-    summary: str  # one line
-    capabilities: Capabilities
-    options: type[MethodOptions]
-    presets: Mapping[str, Any]  # options by name; the first is the default
+    @property
+    def name(self) -> str:
+        """In files and on the command line, 1 to 15 ASCII characters."""
 
-    def check(self, models: Sequence[Gaussians | None], options: Any, sidecar: bool) -> None:
-        """Refuse before anything is trained what cannot work: `models` of the cover, then of the secrets,
-        None for those that will be fitted. Raises UsageError and InputError.
+    @property
+    def summary(self) -> str:
+        """One line that goes on from the name."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What it can do."""
+
+    @property
+    def options(self) -> type[MethodOptions]:
+        """The class of its options."""
+
+    @property
+    def presets(self) -> Mapping[str, MethodOptions]:
+        """Options by name; the first are the default."""
+
+    def prepare(self, inputs: Sequence[SceneInput], options: Any) -> Any:
+        """The options with all that depends on the scenes: `inputs` of the cover, then of the secrets.
+
+        Refuses what cannot work, before anything is trained. Raises UsageError and InputError.
         """
 
     def hide(self, cover: Source, secrets: Sequence[KeyedSource], options: Any, context: Context) -> Stego:
-        """Hide the secrets. Raises KeyssError and its children, Interrupted on Ctrl-C."""
+        """Hide the secrets; `options` are prepared. Raises KeyssError and its children, Interrupted."""
 
     def unpack(self, content: Content) -> Opened:
         """The secret that lies in what a channel gave. Raises InputError for damage."""
@@ -129,3 +176,12 @@ class Method(Protocol):
 
         Models to be rendered in the cover's frame, by the name of the attack; for `keyss audit`.
         """
+
+
+@contextmanager
+def advising(kind: type[KeyssError], advice: str) -> Iterator[None]:
+    """Adds to the message of an error from below, such as a channel's, what a user of the method can do."""
+    try:
+        yield
+    except kind as error:
+        raise type(error)(f"{error}; {advice}") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal, get_args
+
 from torch import Tensor
 
 from keyss.core import UsageError
@@ -11,8 +13,27 @@ MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32
 CAMERA_MAX = 1e12  # in viewmats and Ks: products of such numbers are still floats
 FOCAL_LENGTH_MIN = 1e-6  # pixels
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-RASTERIZE_MODES = ("classic", "antialiased")
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
+RENDER_MODES: tuple[RenderMode, ...] = get_args(RenderMode)
+RASTERIZE_MODES: tuple[RasterizeMode, ...] = get_args(RasterizeMode)
+
+# Arguments of gsplat's that have one value here: without distortion, a shutter that rolls, and so on.
+ONLY_VALUES: dict[str, Any] = {
+    "sparse_grad": False,
+    "distributed": False,
+    "camera_model": "pinhole",
+    "covars": None,
+    "with_ut": False,
+    "with_eval3d": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+}
 
 
 def check_arguments(
@@ -32,14 +53,16 @@ def check_arguments(
     backgrounds: Tensor | None,
     render_mode: str,
     rasterize_mode: str,
+    **others: Any,
 ) -> None:
-    """Raise ValueError for a wrong shape or value, UsageError for what is not supported."""
-    if render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode: expected one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
-    if rasterize_mode not in RASTERIZE_MODES:
-        raise ValueError(
-            f"rasterize_mode: expected one of {', '.join(RASTERIZE_MODES)}, got {rasterize_mode!r}"
-        )
+    """Raise ValueError for a wrong shape or value, UsageError for what gsplat supports and we do not."""
+    _check_others(**others)
+    for name, mode, modes in (
+        ("render_mode", render_mode, RENDER_MODES),
+        ("rasterize_mode", rasterize_mode, RASTERIZE_MODES),
+    ):
+        if mode not in modes:
+            raise ValueError(f"{name}: expected one of {', '.join(modes)}, got {mode!r}")
     tensors = {
         "means": means,
         "quats": quats,
@@ -54,10 +77,7 @@ def check_arguments(
         if not isinstance(tensor, Tensor) and (name, tensor) != ("backgrounds", None):
             raise ValueError(f"{name}: expected a torch tensor, got {type(tensor).__name__}")
     for name, tensor, shape in (("means", means, "[N, 3]"), ("viewmats", viewmats, "[C, 4, 4]")):
-        if tensor.dim() != shape.count(",") + 1:
-            raise ValueError(
-                f"{name}: expected shape {shape} without batch dimensions, got {list(tensor.shape)}"
-            )
+        _check_dimensions(name, tensor, shape, "batch dimensions are not supported")
     count, cameras = len(means), len(viewmats)
     _check_shape("means", means, count, 3)
     _check_shape("quats", quats, count, 4)
@@ -65,23 +85,7 @@ def check_arguments(
     _check_shape("opacities", opacities, count)
     _check_shape("viewmats", viewmats, cameras, 4, 4)
     _check_shape("Ks", Ks, cameras, 3, 3)
-    if sh_degree is None:
-        if colors.dim() != 2:
-            raise ValueError(f"colors: expected shape [{count}, D], got {list(colors.shape)}")
-        _check_shape("colors", colors, count, colors.shape[1])
-        if not 1 <= colors.shape[1] <= MAX_CHANNELS:
-            raise UsageError(f"colors: 1 to {MAX_CHANNELS} channels are supported, got {list(colors.shape)}")
-    else:
-        if sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"sh_degree: expected 0, 1, 2, 3 or None, got {sh_degree!r}")
-        if colors.dim() != 3:
-            raise ValueError(f"colors: expected shape [{count}, K, 3], got {list(colors.shape)}")
-        _check_shape("colors", colors, count, colors.shape[1], 3)
-        if colors.shape[1] < (sh_degree + 1) ** 2:
-            raise ValueError(
-                f"colors: sh_degree {sh_degree} needs at least {(sh_degree + 1) ** 2} coefficients, "
-                f"got {list(colors.shape)}"
-            )
+    _check_colors(colors, count, sh_degree)
     if backgrounds is not None:
         _check_shape("backgrounds", backgrounds, cameras, colors.shape[-1])
     for name, tensor in tensors.items():
@@ -103,6 +107,49 @@ def check_arguments(
             f"eps2d: expected {EPS2D_MIN} or more, got {eps2d}: narrower footprints would be "
             f"drawn wrongly by the CPU rasterizer"
         )
+
+
+def _check_others(tile_size: int, channel_chunk: int, **others: Any) -> None:
+    for name, number in (("tile_size", tile_size), ("channel_chunk", channel_chunk)):
+        if not (isinstance(number, int) and number > 0):
+            raise ValueError(f"{name}: expected a positive integer, got {number!r}")
+    for name, only in ONLY_VALUES.items():
+        given = others[name]
+        if name == "rolling_shutter" and getattr(given, "name", None) == "GLOBAL":
+            continue  # gsplat's word for none
+        if isinstance(given, Tensor) or given != only:
+            got = f"a tensor {list(given.shape)}" if isinstance(given, Tensor) else repr(given)
+            raise UsageError(f"{name}: only {only!r} is supported of what gsplat can do here, got {got}")
+
+
+def _check_colors(colors: Tensor, count: int, sh_degree: int | None) -> None:
+    reason = "colors are the same for every camera"
+    if sh_degree is None:
+        _check_dimensions("colors", colors, f"[{count}, D]", reason)
+        _check_shape("colors", colors, count, colors.shape[1])
+        if not 1 <= colors.shape[1] <= MAX_CHANNELS:
+            raise UsageError(f"colors: 1 to {MAX_CHANNELS} channels are supported, got {list(colors.shape)}")
+        return
+    if sh_degree == 4:
+        raise UsageError("sh_degree: spherical harmonics up to degree 3 are supported, got degree 4")
+    if sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"sh_degree: expected 0, 1, 2, 3 or None, got {sh_degree!r}")
+    _check_dimensions("colors", colors, f"[{count}, K, 3]", reason)
+    _check_shape("colors", colors, count, colors.shape[1], 3)
+    if colors.shape[1] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"colors: sh_degree {sh_degree} needs at least {(sh_degree + 1) ** 2} coefficients, "
+            f"got {list(colors.shape)}"
+        )
+
+
+def _check_dimensions(name: str, tensor: Tensor, shape: str, reason_for_more: str) -> None:
+    """Raise UsageError for more dimensions than in `shape`, which gsplat allows, ValueError for fewer."""
+    expected = f"{name}: expected shape {shape}, got {list(tensor.shape)}"
+    if tensor.dim() > shape.count(",") + 1:
+        raise UsageError(f"{expected}: {reason_for_more}")
+    if tensor.dim() < shape.count(",") + 1:
+        raise ValueError(expected)
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:

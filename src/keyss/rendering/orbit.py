@@ -1,10 +1,8 @@
-"""Scenes made of models: what a 3DGS model shows from all around takes the place of photos."""
+"""Cameras around a model, and the scene that pictures rendered from them make."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,7 +10,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera, Scene, View
-from keyss.methods.learned.config import HideConfig
+from keyss.files.models import is_model_path
 from keyss.rendering import render
 
 VIEWS = 96
@@ -26,18 +24,14 @@ TEST_EVERY = 8
 
 def is_model(source: str | Path | Gaussians) -> bool:
     """Whether a source is a model, or the name of one, and not a folder of photos."""
-    return isinstance(source, Gaussians) or Path(source).suffix.lower() == ".ply"
+    return isinstance(source, Gaussians) or is_model_path(source)
 
 
 @torch.no_grad()
 def scene_of_model(
     model: Gaussians, name: str, *, size: int | None = None, background: Tensor | None = None
 ) -> Scene:
-    """Pictures of `model`, size x size, from cameras around it; every eighth is kept for testing.
-
-    The cameras stand on a spiral over a sphere and look at the middle of what can be seen; up is -y, as
-    captures made with COLMAP have it and as viewers assume.
-    """
+    """Pictures of `model`, size x size, from the cameras of `orbit`; every eighth is kept for testing."""
     background = torch.zeros(3) if background is None else background
     views = []
     for camera in orbit(model, size or IMAGE_SIZE):
@@ -54,17 +48,21 @@ def scene_of_model(
     )
 
 
-def orbit(model: Gaussians, size: int) -> list[Camera]:
-    """VIEWS square cameras around a model."""
+def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
+    """Cameras on a spiral over a sphere around a model, with pictures of size x size pixels.
+
+    All look at the middle of what can be seen of the model. Up is -y, as captures made with COLMAP have it
+    and as viewers assume.
+    """
     middle, radius = middle_and_radius(model)
     focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     reach = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     limit = math.sin(math.radians(HIGHEST))
     cameras = []
-    for index in range(VIEWS):
+    for index in range(views):
         # Equal steps of the sine of the elevation, golden steps of the azimuth: evenly over the sphere.
-        height = limit * (1 - 2 * (index + 0.5) / VIEWS)
+        height = limit * (1 - 2 * (index + 0.5) / views)
         azimuth = index * math.pi * (3 - math.sqrt(5))
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
@@ -103,21 +101,3 @@ def _looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str)
     viewmat[:3, :3] = torch.stack([right, down, forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return Camera(viewmat, K, size, size, name)
-
-
-def room_for_models(config: HideConfig, models: Sequence[Gaussians]) -> HideConfig:
-    """`config` with a cap that holds all `models`, the SH degree they need, and a short, gentle schedule.
-
-    Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are. Where
-    nothing has to be left out the start is right already, and large steps would only do harm.
-    """
-    return replace(
-        config,
-        warm_rate=0.1,
-        fit=replace(
-            config.fit,
-            iterations=min(config.fit.iterations, 400),
-            max_gaussians=max(16, sum(len(model) for model in models)),
-            sh_degree=max(1, *(model.sh_degree for model in models)),
-        ),
-    )

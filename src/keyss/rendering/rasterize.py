@@ -9,7 +9,7 @@ from torch import Tensor
 
 from keyss.core import UsageError
 from keyss.rendering import cuda
-from keyss.rendering.arguments import check_arguments
+from keyss.rendering.arguments import RasterizeMode, RenderMode, check_arguments
 from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
 from keyss.rendering.cpu.rasterization import Settings
 from keyss.rendering.cpu.rasterization import rasterize as rasterize_on_cpu
@@ -25,20 +25,38 @@ def rasterization(
     Ks: Tensor,  # [C, 3, 3]
     width: int,
     height: int,
-    *,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
     eps2d: float = EPS2D_MIN,
     sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
     backgrounds: Tensor | None = None,  # [C, D]
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
     absgrad: bool = False,
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
+    rasterize_mode: RasterizeMode = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Draw N Gaussians into C images (3DGS, Kerbl et al. 2023, eq. 3 to 5): `gsplat.rasterization`, unpacked.
+    """Draw N Gaussians into C images (3DGS, Kerbl et al. 2023, eq. 3 to 5), as `gsplat.rasterization` does.
 
-    Gaussians on the CPU are drawn by the kernels in `keyss.rendering.cpu`, those on a GPU by gsplat.
+    Gaussians on the CPU are drawn by the kernels in `keyss.rendering.cpu`, those on a GPU by gsplat. All
+    arguments of gsplat 1.5 are there, in its order. `packed`, `tile_size`, `channel_chunk` and `segmented`
+    say how gsplat computes: they change nothing here, except that the last three are passed to gsplat on a
+    GPU. Those that are not described below have one value that is supported, their default.
 
     Args:
         means: centres in the world.
@@ -67,9 +85,9 @@ def rasterization(
 
     Returns:
         Images [C, H, W, D], with D as `render_mode` says, not clamped above; alphas [C, H, W, 1] in [0, 1];
-        and a dictionary with what gsplat's strategies read: means2d [C, N, 2] in pixels (after backward its
-        `.grad` holds dL/d(means2d)), radii [C, N, 2] int32 in pixels (0 where not drawn), depths [C, N],
-        width, height, n_cameras, gaussian_ids (None: nothing is packed).
+        and a dictionary with what gsplat's strategies read where they are told `packed=False`: means2d
+        [C, N, 2] in pixels (after backward its `.grad` holds dL/d(means2d)), radii [C, N, 2] int32 in pixels
+        (0 where not drawn), depths [C, N], width, height, n_cameras, gaussian_ids (None).
 
     On the CPU there are gradients to all tensors but Ks, everything is computed in float32 and is
     bit-identical from run to run and for any number of threads, Gaussians that are not finite or have a
@@ -77,34 +95,13 @@ def rasterization(
 
     Raises:
         ValueError: a shape, dtype or number is not as above.
-        UsageError: a number of channels or a device that is not supported.
+        UsageError: an option, shape or device that gsplat may support and this function does not, by name.
         BackendError: gsplat's CUDA kernels are missing, or memory for the lists of tiles is out of reach.
     """
-    check_arguments(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        near_plane, far_plane, eps2d, sh_degree, backgrounds, render_mode, rasterize_mode,
-    )  # fmt: skip
+    arguments = dict(locals())
+    check_arguments(**arguments)
     if means.device.type == "cuda":
-        return cuda.rasterize(
-            means=means,
-            quats=quats,
-            scales=scales,
-            opacities=opacities,
-            colors=colors,
-            viewmats=viewmats,
-            Ks=Ks,
-            width=width,
-            height=height,
-            near_plane=near_plane,
-            far_plane=far_plane,
-            radius_clip=radius_clip,
-            eps2d=eps2d,
-            sh_degree=sh_degree,
-            backgrounds=backgrounds,
-            absgrad=absgrad,
-            render_mode=render_mode,
-            rasterize_mode=rasterize_mode,
-        )
+        return cuda.rasterize(arguments)
     if means.device.type != "cpu":
         raise UsageError(f"means: only tensors on 'cpu' or 'cuda' can be drawn, got {means.device}")
     with_colors, with_depth = render_mode.startswith("RGB"), render_mode.endswith("D")

@@ -85,7 +85,7 @@ class SinkhornResult:
 
     stego: Sinkhorn3D
     control: tuple[Sinkhorn3D, ...]
-    score: float | None  # composite score (KeySS, eq. 10), where there are photos
+    score: float  # composite score (KeySS, eq. 10)
 
 
 @dataclass(frozen=True)

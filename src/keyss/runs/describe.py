@@ -2,66 +2,113 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from keyss.channels.sidecar import read_header
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene
-from keyss.files.ply import describe_ply
+from keyss.files.models import describe_model, is_model_path
 from keyss.files.scenes import load_scene
-from keyss.methods.learned.revealing import read_sidecar
-from keyss.runs.files import METRICS, MODEL, STEGO, read_json
+from keyss.runs.files import METRICS, MODEL, STEGO
+from keyss.runs.metrics import FitMetrics, HideMetrics
+from keyss.runs.opening import read_sidecar
+from keyss.runs.records import read_record
+
+Corner = tuple[float, ...]  # [3] world units
 
 
-def info(path: str | Path) -> dict[str, Any]:
-    """What is in a PLY, a sealed decoder, a scene folder or a folder of results, as JSON-able facts."""
+@dataclass(frozen=True)
+class RunInfo:
+    """A folder of `hide` or `fit`."""
+
+    kind: str
+    path: str
+    metrics: HideMetrics | FitMetrics
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A model's file; it does not tell whether something is hidden in it."""
+
+    kind: str
+    path: str
+    bytes: int
+    gaussians: int
+    sh_degree: int
+    bounding_box: tuple[Corner, Corner]
+    nearly_transparent: float  # share of the Gaussians with opacities below 0.05
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """A folder of posed photos."""
+
+    kind: str
+    name: str
+    train_views: int
+    test_views: int
+    image_size: tuple[int, int]  # width, height
+    points: int
+    extent: float  # world units
+    background: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class KeyDerivationInfo:
+    """What Argon2id costs."""
+
+    function: str
+    memory_kib: int
+    time_cost: int
+    parallelism: int
+
+
+@dataclass(frozen=True)
+class SidecarInfo:
+    """A sidecar; it does not tell how many secrets there are."""
+
+    kind: str
+    path: str
+    bytes: int
+    key_derivation: KeyDerivationInfo
+
+
+def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
+    """What is in a PLY, a sidecar, a scene folder or a folder of results. Raises InputError."""
     path = Path(path)
     if path.is_dir():
         if (path / STEGO).exists():
-            return {"kind": "hiding", "path": str(path), "metrics": read_json(path / METRICS)}
+            return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
         if (path / MODEL).exists():
-            return {"kind": "plain model", "path": str(path), "metrics": read_json(path / METRICS)}
-        return _describe_scene(load_scene(path))
+            return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
+        return _scene_info(load_scene(path))
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    if path.suffix.lower() == ".ply":
-        facts = describe_ply(path)
-        return {
-            "kind": "3DGS model",
-            "path": str(path),
-            "bytes": facts.bytes,
-            "gaussians": facts.count,
-            "sh_degree": facts.sh_degree,
-            "bounding_box": [[round(x, 4) for x in corner] for corner in (facts.lower, facts.upper)],
-            "opacity_below_0.05": round(facts.faint_share, 4),
-        }
+    if is_model_path(path):
+        facts = describe_model(path)
+        lower, upper = (tuple(round(x, 4) for x in corner) for corner in (facts.lower, facts.upper))
+        share = round(facts.faint_share, 4)
+        return ModelInfo(
+            "3DGS model", str(path), facts.bytes, facts.count, facts.sh_degree, (lower, upper), share
+        )
     try:
-        derivation, _, _ = read_header(read_sidecar(path))
+        costs, _, _ = read_header(read_sidecar(path))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return {
-        "kind": "sealed decoder",
-        "path": str(path),
-        "bytes": path.stat().st_size,
-        "key_derivation": {
-            "function": "Argon2id",
-            "memory_kib": derivation.memory_kib,
-            "time_cost": derivation.time_cost,
-            "parallelism": derivation.parallelism,
-        },
-    }
+    derivation = KeyDerivationInfo("Argon2id", costs.memory_kib, costs.time_cost, costs.parallelism)
+    return SidecarInfo("sidecar", str(path), path.stat().st_size, derivation)
 
 
-def _describe_scene(scene: Scene) -> dict[str, Any]:
+def _scene_info(scene: Scene) -> SceneInfo:
     camera = scene.train[0].camera
-    return {
-        "kind": "scene",
-        "name": scene.name,
-        "train_views": len(scene.train),
-        "test_views": len(scene.test),
-        "image_size": [camera.width, camera.height],
-        "points": len(scene.points),
-        "extent": round(scene.extent, 4),
-        "background": [round(float(x), 4) for x in scene.background],
-    }
+    return SceneInfo(
+        kind="scene",
+        name=scene.name,
+        train_views=len(scene.train),
+        test_views=len(scene.test),
+        image_size=(camera.width, camera.height),
+        points=len(scene.points),
+        extent=round(scene.extent, 4),
+        background=tuple(round(float(x), 4) for x in scene.background),
+    )

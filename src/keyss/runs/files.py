@@ -7,14 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera
 from keyss.files.atomic import write_bytes
-from keyss.files.ply import write_ply
+from keyss.files.images import png_bytes
+from keyss.files.models import write_model
+from keyss.runs.records import write_record
 
 STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
     "stego.ply",
@@ -31,14 +31,9 @@ def plain_names(secrets: int) -> list[str]:
     return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
 
 
-def picture_name(camera: Camera) -> str:
-    """A flat file name: folders in a camera's name become part of it."""
-    return Path(camera.name.replace("/", "_").replace("\\", "_")).stem + ".png"
-
-
 def ply_writer(gaussians: Gaussians) -> Callable[[Path], None]:
     """For `OutputFolder.fill`: writes a model."""
-    return lambda path: write_ply(path, gaussians)
+    return lambda path: write_model(path, gaussians)
 
 
 def bytes_writer(data: bytes) -> Callable[[Path], None]:
@@ -51,9 +46,9 @@ def png_writer(image: Tensor) -> Callable[[Path], None]:
     return bytes_writer(png_bytes(image))
 
 
-def png_bytes(image: Tensor) -> bytes:
-    """A PNG file of an image [H, W, 3] uint8."""
-    return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
+def record_writer(record: Any) -> Callable[[Path], None]:
+    """For `OutputFolder.fill`: writes a record."""
+    return lambda path: write_record(path, record)
 
 
 def json_writer(data: dict[str, Any]) -> Callable[[Path], None]:

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import filled
 from keyss.core.scene import Scene
-from keyss.files.ply import read_ply
+from keyss.files.models import read_model
+from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
-from keyss.methods.carry.carrying import Carried
-from keyss.methods.learned.opening import open_model
-from keyss.methods.learned.payload import HiddenSecret, pack_secret
-from keyss.methods.learned.revealing import Frame, open_secret, read_sidecar, reveal_gaussians
+from keyss.methods import registry
+from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
-from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, plain_names, read_json
+from keyss.runs.config import Background, PathLike, RunConfig, read_config
+from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, plain_names
+from keyss.runs.metrics import HideMetrics
+from keyss.runs.records import read_record
 
-PathLike = str | Path
-Background = Tensor | Sequence[float] | None
-Opened = HiddenSecret | Carried
+MOST_SIDECAR_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -34,34 +30,17 @@ class HidingRun:
     """What a run published, what its keys open in it, and from what it was made."""
 
     folder: Path
-    settings: dict[str, Any]  # config.json
-    metrics: dict[str, Any]  # metrics.json
+    config: RunConfig[MethodOptions]
+    metrics: HideMetrics
     stego: Gaussians
-    sidecar: Path | None
+    sidecar: bytes | None
     opened: tuple[Opened, ...]  # in the order of the secrets
     keys: tuple[str, ...] = field(repr=False)  # in the same order
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
 
-    @property
-    def method(self) -> str:
-        """ "learned" or "carry"."""
-        return str(self.settings.get("method", "learned"))
-
-    @property
-    def width(self) -> int | None:
-        """To which photos were shrunk."""
-        width: int | None = self.settings["width"]
-        return width
-
-    @property
-    def background(self) -> list[float] | None:
-        """Behind everything, where it was chosen."""
-        colour: list[float] | None = self.settings["background"]
-        return colour
-
     def scenes(self) -> list[Scene]:
         """The cover and the secrets with their photos, or with pictures of the models that they are."""
-        return [as_scene(source, self.width, self.background) for source in self.sources]
+        return [as_scene(source, self.config.width, self.config.background) for source in self.sources]
 
     def plain_models(self) -> list[Gaussians | None]:
         """Plain models of the cover and of the secrets, in their own frames; None where there is none."""
@@ -69,7 +48,7 @@ class HidingRun:
         for name, source in zip(plain_names(len(self.opened)), self.sources, strict=True):
             path = self.folder / name
             path = Path(source) if not path.exists() and is_model(source) else path
-            found.append(read_ply(path) if path.exists() else None)
+            found.append(read_model(path) if path.exists() else None)
         return found
 
 
@@ -80,42 +59,44 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     scenes that were in memory only, InputError for a folder that is not one of `hide`.
     """
     folder = Path(run)
-    settings, metrics = read_json(folder / CONFIG), read_json(folder / METRICS)
-    try:
-        sources = (settings["cover"], *settings["secrets"])
-        fingerprints = list(settings["payloads"])
-        settings["width"], settings["background"]
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder / CONFIG}: not the configuration of a hiding ({error} is missing)"
-        ) from error
-    if not all(isinstance(source, str) for source in sources):
+    config, metrics = read_config(folder / CONFIG), read_record(folder / METRICS, HideMetrics)
+    sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
+    if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    stego, sidecar = read_ply(folder / STEGO), sidecar_beside(folder / STEGO)
-    found = {fingerprint(secret): (secret, key) for key in keys for secret in [open_any(stego, key, sidecar)]}
-    if set(found) != set(fingerprints):
-        raise UsageError(f"expected the keys of all {len(fingerprints)} secret(s), got {len(found)} of them")
-    opened, own = zip(*(found[each] for each in fingerprints), strict=True)
-    return HidingRun(folder, settings, metrics, stego, sidecar, opened, own, sources)
+    stego, sidecar = read_model(folder / STEGO), sidecar_beside(folder / STEGO)
+    found = {}
+    for key in keys:
+        opened = open_file(stego, key, sidecar)
+        found[opened.fingerprint()] = (opened, key)
+    if set(found) != set(config.payloads):
+        raise UsageError(
+            f"expected the keys of all {len(config.payloads)} secret(s), got {len(found)} of them"
+        )
+    secrets, own = zip(*(found[each] for each in config.payloads), strict=True)
+    data = None if sidecar is None else read_sidecar(sidecar)
+    return HidingRun(folder, config, metrics, stego, data, secrets, own, sources)
 
 
-def open_any(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
-    """What the key opens, of either method; see `open_model`. Errors name the sidecar's file."""
-    if sidecar is None:
-        return open_model(stego, key, decoy=decoy)
-    if isinstance(sidecar, bytes):
-        return open_secret(stego, key, sidecar, decoy=decoy)
+def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
+    """What the key opens; see `registry.open_model`. Errors name the sidecar's file."""
+    if sidecar is None or isinstance(sidecar, bytes):
+        return registry.open_model(stego, key, sidecar=sidecar, decoy=decoy)
+    data = read_sidecar(Path(sidecar))
     try:
-        return open_secret(stego, key, read_sidecar(Path(sidecar)), decoy=decoy)
+        return registry.open_model(stego, key, sidecar=data, decoy=decoy)
     except InputError as error:
         raise InputError(f"{sidecar}: {error}") from error
 
 
-def revealed(stego: Gaussians, secret: Opened, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-    """The secret as a model of its own, on the CPU; a carried one makes up for what was lost."""
-    if isinstance(secret, Carried):
-        return filled(secret.gaussians, secret.count)
-    return reveal_gaussians(stego, secret, frame=frame, force=force).to("cpu")
+def read_sidecar(path: Path) -> bytes:
+    """The bytes of a sidecar's file. Raises InputError for one that is missing or beyond all measure."""
+    return read_file(path, MOST_SIDECAR_BYTES)
+
+
+def sidecar_beside(stego: Path) -> Path | None:
+    """The sidecar beside a model's file, if there is one."""
+    path = stego.with_name(SIDECAR)
+    return path if path.exists() else None
 
 
 def as_scene(source: PathLike | Scene | Gaussians, width: int | None, background: Background) -> Scene:
@@ -131,17 +112,4 @@ def as_scene(source: PathLike | Scene | Gaussians, width: int | None, background
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
     """A model, or the one in a `.ply`, on the CPU."""
-    return source.to("cpu") if isinstance(source, Gaussians) else read_ply(source)
-
-
-def sidecar_beside(stego: Path) -> Path | None:
-    """The sealed decoder beside a model's file, if there is one."""
-    path = stego.with_name(SIDECAR)
-    return path if path.exists() else None
-
-
-def fingerprint(secret: Opened) -> str:
-    """By which `open_run` knows whose key it was given; says nothing without the secret."""
-    if isinstance(secret, Carried):
-        return secret.fingerprint()
-    return hashlib.sha256(pack_secret(secret)).hexdigest()[:16]
+    return source.to("cpu") if isinstance(source, Gaussians) else read_model(source)

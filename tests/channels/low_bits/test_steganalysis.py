@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from channels.low_bits.payloads import embed_derived
 from channels.low_bits.steganalysis import features, held_out_auc
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels.low_bits.container import embed_derived
 from keyss.core import Gaussians
 
 MODELS = 24
@@ -30,10 +30,21 @@ def _auc(plain: list[Gaussians], changed: list[Gaussians]) -> dict[str, float]:
 
 
 def test_embedded_models_look_like_others(models: list[Gaussians]) -> None:
-    embedded = [embed_derived(model, [(keys(seed), bytes(2000))]) for seed, model in enumerate(models)]
-    for name, auc in _auc(models, embedded).items():
-        # 0.55 and two standard errors of an AUC of 24 against 24 under the null hypothesis
-        assert auc <= 0.55 + 2 * ((2 * MODELS + 1) / (12 * MODELS**2)) ** 0.5, name
+    """The mean over three embeddings: the classifiers learn from few models, and their AUC varies by 0.09."""
+    found = [
+        _auc(
+            models,
+            [
+                embed_derived(model, [(keys(seed), bytes(2000))], bytes([draw, seed] * 16))
+                for seed, model in enumerate(models)
+            ],
+        )
+        for draw in range(3)
+    ]
+    for name in found[0]:
+        # 0.55 and two standard errors of an AUC of 24 against 24 models that are alike
+        limit = 0.55 + 2 * ((2 * MODELS + 1) / (12 * MODELS**2)) ** 0.5
+        assert np.mean([auc[name] for auc in found]) <= limit, name
 
 
 def test_the_classifier_notices_what_it_is_made_for(models: list[Gaussians]) -> None:

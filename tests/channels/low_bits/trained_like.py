@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from keyss.channels.low_bits.byte_plan import SALTS
+from keyss.channels.low_bits.layout import SALTS
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 

@@ -14,15 +14,17 @@ import torch
 
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
-from keyss.channels.low_bits.bits import identities, is_random, read_low_bits
+from keyss.channels.low_bits import LOW_BITS, LowBitsReader
+from keyss.channels.low_bits.bits import identities, read_low_bits, usable_carriers
+from keyss.channels.low_bits.channel import _key_cipher, derivation_of, salts
+from keyss.channels.low_bits.layout import header_carriers, plan_records
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey
-from keyss.methods.carry import embed, extract
-from keyss.methods.carry.carrying import Carriers, _key_cipher, embed_derived, extract_derived
-from keyss.methods.carry.plan import Layout, Size, header_carriers, plan, room, thinned
+from keyss.methods.carry.carrying import check_degrees, encode_all, record_request, subsampled_counts
 from keyss.methods.carry.table import Table
 from keyss.rendering import render
+from methods.carry.carried import embed, embed_derived, extract, extract_derived
 from tiny_scenes import ring_cameras
 
 __all__ = ["splat_transform"]  # a fixture
@@ -54,8 +56,8 @@ def rows_of(model: Gaussians) -> set[bytes]:
 
 def salt_of(model: Gaussians, own: list[DerivedKey], before: Gaussians) -> DerivedKey:
     """The key under the salt that a reader of `model` tries first."""
-    names = Carriers.of(before).salts()
-    return own[names.index(Carriers.of(model).salts()[0])]
+    names = salts(identities(before))
+    return own[names.index(salts(identities(model))[0])]
 
 
 def test_round_trip(stego: Gaussians, secret: Gaussians) -> None:
@@ -76,18 +78,23 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
         with pytest.raises(
             UsageError, match=f"SH degree 1 cannot carry a secret of SH degree {secret_degree}"
         ):
+            check_degrees(LOW_BITS, model, [hidden])
+        with pytest.raises(UsageError, match="room for records of"):
             embed_derived(model, [(own, hidden)])
         return
-    carried = extract_derived(Carriers.of(embed_derived(model, [(own, hidden)])), own[0])
+    check_degrees(LOW_BITS, model, [hidden])
+    carried = extract_derived(LowBitsReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
     assert len(carried.gaussians) == 900
 
 
 def test_a_cover_without_spherical_harmonics_is_refused() -> None:
     with pytest.raises(UsageError, match="SH degree 0 cannot carry"):
+        check_degrees(LOW_BITS, trained_like(50, sh_degree=0), [trained_like(50, 1, 0)])
+    with pytest.raises(UsageError, match="room for records of 0 bytes"):
         embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
     with pytest.raises(WrongKeyError):
-        extract_derived(Carriers.of(trained_like(50, sh_degree=0)), keys()[0])
+        extract_derived(LowBitsReader.of(trained_like(50, sh_degree=0)), keys()[0])
 
 
 def test_only_low_bits_of_some_fields_change(cover: Gaussians, stego: Gaussians) -> None:
@@ -97,7 +104,7 @@ def test_only_low_bits_of_some_fields_change(cover: Gaussians, stego: Gaussians)
         before, after = (getattr(model, name).contiguous().view(torch.int32) for model in (cover, stego))
         assert torch.equal(before >> bits, after >> bits), name
         assert torch.equal(before & 1, after & 1), name
-    assert identities(cover) == identities(stego)
+    assert np.array_equal(identities(cover), identities(stego))
 
 
 def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gaussians) -> None:
@@ -109,12 +116,12 @@ def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gauss
     for secrets in ([(own, hidden[0])], [(own, hidden[0]), (other, hidden[1])]):
         stego = embed_derived(cover, secrets)
         changed = (read_low_bits(stego) != before).any(axis=1)
-        assert (changed == is_random(cover)).all()
+        assert (changed == usable_carriers(cover)).all()
         counts = np.bincount(read_low_bits(stego).ravel(), minlength=256)
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
-        carriers = Carriers.of(stego)
+        carriers = LowBitsReader.of(stego)
         carried = extract_derived(carriers, own[0])
-        cells, _ = _key_cipher(own[0]).open(carriers.names, carriers.low)
+        cells, _ = _key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
         seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])  # a third key hides nothing
@@ -125,19 +132,19 @@ def test_two_secrets_open_with_their_own_keys_only(cover: Gaussians) -> None:
     """Two fifths of the cover each, as 40,000 and 40,000 in 100,000."""
     hidden, own = [trained_like(1200, 5), trained_like(1200, 6)], [keys(1), keys(2)]
     stego = embed_derived(cover, list(zip(own, hidden, strict=True)))
-    found = [extract_derived(Carriers.of(stego), each[0]).gaussians for each in own]
+    found = [extract_derived(LowBitsReader.of(stego), each[0]).gaussians for each in own]
     for got, want in zip(found, hidden, strict=True):
         assert torch.allclose(got.means.sort(0).values, want.means.sort(0).values, atol=1e-3)
-    with pytest.raises(UsageError, match="another key for each"):
+    with pytest.raises(UsageError, match="same key"):
         embed_derived(cover, [(own[0], hidden[0]), (own[0], hidden[1])])
 
 
 def test_a_secret_as_large_as_the_cover_and_three_that_share(cover: Gaussians) -> None:
     large, own = trained_like(3000, 7), keys()
-    carried = extract_derived(Carriers.of(embed_derived(cover, [(own, large)])), own[0])
+    carried = extract_derived(LowBitsReader.of(embed_derived(cover, [(own, large)])), own[0])
     assert len(carried.gaussians) == 3000
     secrets = [(keys(seed), trained_like(1500, seed)) for seed in (1, 2, 3)]
-    stego = Carriers.of(embed_derived(cover, secrets))
+    stego = LowBitsReader.of(embed_derived(cover, secrets))
     for each, model in secrets:
         assert len(extract_derived(stego, each[0]).gaussians) == len(model)
 
@@ -147,14 +154,14 @@ def test_every_random_draw_depends_on_the_entropy_only(cover: Gaussians, secret:
     same = [embed_derived(cover, [(own, secret)], entropy=ENTROPY) for _ in range(2)]
     assert_same_bits(*same)
     other = embed_derived(cover, [(own, secret)])
-    written = is_random(cover)
+    written = usable_carriers(cover)
     equal = read_low_bits(other)[written] == read_low_bits(same[0])[written]
     assert equal.mean() == pytest.approx(1 / 256, abs=2e-3)
 
 
 def test_a_carrier_says_nothing_of_its_gaussian(cover: Gaussians, secret: Gaussians) -> None:
     own = keys()
-    stego = Carriers.of(embed_derived(cover, [(own, secret)]))
+    stego = LowBitsReader.of(embed_derived(cover, [(own, secret)]))
     found = extract_derived(stego, own[0]).gaussians
     # The order is that of the carriers in the file; nothing of the secret's own order is left in it.
     origin = secret.means[:, 0].argsort()[found.means[:, 0].argsort().argsort()].double()
@@ -168,14 +175,14 @@ def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
 ) -> None:
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
-    whole = rows_of(extract_derived(Carriers.of(stego), own[0]).gaussians)
+    whole = rows_of(extract_derived(LowBitsReader.of(stego), own[0]).gaussians)
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
-    assert rows_of(extract_derived(Carriers.of(stego[order]), own[0]).gaussians) == whole
+    assert rows_of(extract_derived(LowBitsReader.of(stego[order]), own[0]).gaussians) == whole
     pruned = stego[order[: len(stego) * 3 // 4]]
-    carried = extract_derived(Carriers.of(pruned), salt_of(pruned, own, stego))
+    carried = extract_derived(LowBitsReader.of(pruned), salt_of(pruned, own, stego))
     assert rows_of(carried.gaussians) <= whole
     assert carried.count == len(secret)
-    copies = plan([Size(1200, 3)], int(is_random(cover).sum()), 3000, 3)[0].copies
+    copies = LOW_BITS.prepare(cover).plan_records([record_request(1200, 3)])[0].copies
     assert 0 < copies < 300
     expected = 0.75 * (len(secret) - copies) + (1 - 0.25**2) * copies
     assert len(carried.gaussians) == pytest.approx(expected, abs=4 * (0.19 * 1200) ** 0.5)
@@ -188,7 +195,7 @@ def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     half = stego[stego.means[:, axis] > stego.means[:, axis].median()]
-    found = extract_derived(Carriers.of(half), salt_of(half, own, stego)).gaussians
+    found = extract_derived(LowBitsReader.of(half), salt_of(half, own, stego)).gaussians
     assert 0.45 * len(secret) < len(found) < 0.6 * len(secret)
     assert found.means[:, axis].median() == pytest.approx(float(secret.means[:, axis].median()), abs=0.4)
 
@@ -199,16 +206,16 @@ def test_a_single_bit_costs_one_gaussian_at_most(cover: Gaussians, secret: Gauss
     own = [_derived(stego, index) for index in range(3)]
     whole = rows_of(extract(stego, KEY).gaussians)
     random = np.random.default_rng(0)
-    names = Carriers.of(stego).salts()
-    first = [name.tobytes() for name in Carriers.of(stego).names].index(names[0])
+    names = salts(identities(stego))
+    first = [name.tobytes() for name in identities(stego)].index(names[0])
     for trial in range(60):
         row = first if trial < 5 else int(random.integers(len(stego)))
         changed = _with_flipped_bit(stego, row, int(random.integers(59)), int(random.integers(31)))
         if changed is None:
             continue
-        carriers = Carriers.of(changed)
+        carriers = LowBitsReader.of(changed)
         found: set[bytes] = set()
-        for name in carriers.salts()[:2]:
+        for name in salts(carriers.identities)[:2]:
             if name in names[:3]:
                 found = rows_of(extract_derived(carriers, own[names.index(name)]).gaussians)
                 break
@@ -217,9 +224,7 @@ def test_a_single_bit_costs_one_gaussian_at_most(cover: Gaussians, secret: Gauss
 
 
 def _derived(stego: Gaussians, index: int) -> DerivedKey:
-    from keyss.channels.low_bits.container import derivation_of
-
-    return DerivedKey(KEY, derivation_of(Carriers.of(stego).salts()[index]))
+    return DerivedKey(KEY, derivation_of(salts(identities(stego))[index]))
 
 
 def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaussians | None:
@@ -237,7 +242,7 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
 def test_1000_wrong_keys_and_ordinary_models_open_nothing(secret: Gaussians) -> None:
     """At the level below Argon2id, whose output is replaced: it is what keys differ in."""
     model, own = trained_like(800, seed=3), keys()
-    stego = Carriers.of(embed_derived(model, [(own, secret[:200])]))
+    stego = LowBitsReader.of(embed_derived(model, [(own, secret[:200])]))
     assert len(extract_derived(stego, own[0]).gaussians) == 200
     for number in range(1000):
         with pytest.raises(WrongKeyError):
@@ -286,52 +291,54 @@ def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_pa
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians, secret: Gaussians) -> None:
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
-    carriers = Carriers.of(stego)
-    cells, _ = _key_cipher(own[0]).open(carriers.names, carriers.low)
+    carriers = LowBitsReader.of(stego)
+    cells, _ = _key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
     keep = np.zeros(len(stego), bool)
     keep[np.flatnonzero(cells)[:2]] = True
     with pytest.raises(WrongKeyError):  # nothing but key cells: as good as nothing
-        extract_derived(Carriers(carriers.names[keep], carriers.low[keep]), own[0])
+        extract_derived(LowBitsReader.of(stego[torch.from_numpy(keep)]), own[0])
     keep[:40] = True
     try:
-        carried = extract_derived(Carriers(carriers.names[keep], carriers.low[keep]), own[0])
+        carried = extract_derived(LowBitsReader.of(stego[torch.from_numpy(keep)]), own[0])
         assert len(carried.gaussians) < 40
     except (InputError, WrongKeyError):
         pass
     with pytest.raises(WrongKeyError):
-        extract_derived(Carriers(carriers.names[keep], carriers.low[keep]), keys(1)[0])
+        extract_derived(LowBitsReader.of(stego[torch.from_numpy(keep)]), keys(1)[0])
 
 
 def test_layouts_follow_from_a_secret_s_own_size() -> None:
     """Whole carriers up to half of them, halves above; others do not change that while there is room."""
-    small, large = Size(40_000, 3), Size(85_000, 3)
-    alone = plan([small], 90_000, 100_000, 3)[0]
-    assert alone.cells == 1
-    assert alone.copies == 45_000 - 40_000 - header_carriers(3, 3)
-    assert plan([Size(10_000, 3)], 90_000, 100_000, 3)[0].copies == 2500
-    assert plan([small, small], 90_000, 100_000, 3) == [alone, alone]
-    assert plan([large], 90_000, 100_000, 3)[0].cells == 2
-    both = plan([small, large], 90_000, 100_000, 3)
-    assert both == [alone, replace(plan([large], 90_000, 100_000, 3)[0], copies=0)]
-    assert [each.cells for each in plan([small] * 3, 90_000, 100_000, 3)] == [2, 2, 2]
-    assert isinstance(alone, Layout)
-    assert alone.table.total > 560
+    small, large = record_request(40_000, 3), record_request(85_000, 3)
+    alone = plan_records([small], 90_000, 3)[0]
+    assert alone.cells_per_carrier == 1
+    assert alone.copies == 45_000 - 40_000 - header_carriers(3, small.header_bytes)
+    assert plan_records([record_request(10_000, 3)], 90_000, 3)[0].copies == 2500
+    assert plan_records([small, small], 90_000, 3) == [alone, alone]
+    halves = plan_records([large], 90_000, 3)[0]
+    assert halves.cells_per_carrier == 2
+    assert plan_records([small, large], 90_000, 3) == [alone, replace(halves, copies=0)]
+    assert [each.cells_per_carrier for each in plan_records([small] * 3, 90_000, 3)] == [2, 2, 2]
+    table = Table.of_size(8 * alone.record_bytes, 3)
+    assert table is not None
+    assert table.total > 560
 
 
-def test_too_large_a_secret_is_refused_with_the_number_that_fits() -> None:
-    sizes = [Size(250_000, 3)]
-    fits = room(sizes, 90_000, 3)
-    assert fits == 2 * (90_000 - header_carriers(3, 3))
-    with pytest.raises(UsageError, match=rf"250,000 Gaussians is too large.*{fits:,} would fit; --thin"):
-        plan(sizes, 90_000, 100_000, 3)
-    assert thinned(sizes, 90_000, 3) == [fits]
-    assert plan([Size(fits, 3)], 90_000, 100_000, 3)[0].cells == 2
-    two = [Size(20_000, 3), Size(300_000, 3)]
-    kept = thinned(two, 90_000, 3)
-    assert kept[0] == 20_000
-    assert plan([Size(count, 3) for count in kept], 90_000, 100_000, 3)
-    with pytest.raises(UsageError, match="would fit"):
-        thinned(sizes, 100, 3)
+def test_too_large_a_secret_is_refused_with_the_number_that_fits(cover: Gaussians) -> None:
+    prepared = LOW_BITS.prepare(cover)
+    header = header_carriers(3, record_request(1, 3).header_bytes)
+    fits = 2 * (prepared.carriers - header)
+    too_large, small = trained_like(8000, 5), trained_like(500, 6)
+    assert prepared.record_capacity([record_request(8000, 3)]) == fits
+    with pytest.raises(UsageError, match=rf"8,000 records are too many.*{fits:,} records would fit"):
+        encode_all(prepared, [too_large])
+    assert subsampled_counts(prepared, [too_large]) == [fits]
+    assert encode_all(prepared, [too_large[:fits]])[0].plan.cells_per_carrier == 2
+    kept = subsampled_counts(prepared, [small, too_large])
+    assert kept[0] == 500
+    assert encode_all(prepared, [small, too_large[: kept[1]]])
+    with pytest.raises(UsageError, match="nothing fits"):
+        subsampled_counts(LOW_BITS.prepare(cover[:200]), [too_large])
     assert Table.floor(3).total <= 264
 
 
@@ -339,7 +346,7 @@ def test_too_large_a_secret_is_refused_with_the_number_that_fits() -> None:
 def test_covers_without_random_low_bits_are_refused(
     change: Callable[[Gaussians], Gaussians], cover: Gaussians
 ) -> None:
-    with pytest.raises(InputError, match=r"low bits.*--dither"):
+    with pytest.raises(InputError, match="low bits"):
         embed_derived(change(cover), [(keys(), cover[:10])])
 
 
@@ -348,7 +355,7 @@ def test_values_that_are_not_random_stay_as_they_are(cover: Gaussians) -> None:
     model.quats[:100] = torch.tensor([1.0, 0, 0, 0])
     model.sh[100:200, 4:] = 0
     model.opacity_logits[200:230] = 0.1234567
-    usable = is_random(model)
+    usable = usable_carriers(model)
     stego = embed_derived(model, [(keys(), trained_like(500))])
     assert_same_bits(stego[torch.from_numpy(~usable)], model[torch.from_numpy(~usable)])
     assert not usable[:230].any()
@@ -367,13 +374,13 @@ def test_strangers_in_the_places_of_the_first_salts_do_not_lock_out_the_key(
     stego: Gaussians, secret: Gaussians
 ) -> None:
     """Three added Gaussians come before all of the model's own in the order of salts."""
-    first = Carriers.of(stego).salts()[0]
+    first = salts(identities(stego))[0]
     strangers = trained_like(40_000, seed=9)
-    names = [row.tobytes() for row in Carriers.of(strangers).names]
+    names = [row.tobytes() for row in identities(strangers)]
     before = sorted((name, index) for index, name in enumerate(names) if name < first)[:3]
     assert len(before) == 3
     added = strangers[torch.tensor([index for _, index in before])]
     crowded = Gaussians.cat([added, stego])
-    assert first not in Carriers.of(crowded).salts()[:3]
+    assert first not in salts(identities(crowded))[:3]
     assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
     assert len(extract(crowded, KEY).gaussians) == len(secret)

@@ -10,9 +10,10 @@ import torch
 
 from channels.low_bits.trained_like import keys, trained_like
 from files.test_ply import assert_same_bits
+from keyss.channels.low_bits import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians, InputError
-from keyss.methods.carry.carrying import Carriers, embed_derived, extract_derived, usable_carriers
 from keyss.methods.carry.dither import cost, dither
+from methods.carry.carried import embed_derived, extract_derived
 
 ENTROPY = bytes(32)
 
@@ -40,9 +41,9 @@ def test_quantised_models_can_carry_again_and_would_be_rounded_back(
 ) -> None:
     coarse = model.map(change)
     with pytest.raises(InputError, match="low bits"):
-        usable_carriers(coarse)
+        LOW_BITS.prepare(coarse)
     fine = dither(coarse, ENTROPY)
-    assert usable_carriers(fine).mean() > 0.9
+    assert LOW_BITS.prepare(fine).usable.mean() > 0.9
     assert torch.equal(fine.means, coarse.means)
     assert torch.equal(fine.sh[:, 0], coarse.sh[:, 0])
     for name in ("quats", "log_scales", "opacity_logits", "sh"):
@@ -50,16 +51,16 @@ def test_quantised_models_can_carry_again_and_would_be_rounded_back(
         assert (change(after) == before).float().mean() > 0.99, name
     own = keys()
     stego = embed_derived(fine, [(own, model[:1000])])
-    assert len(extract_derived(Carriers.of(stego), own[0]).gaussians) == 1000
+    assert len(extract_derived(LowBitsReader.of(stego), own[0]).gaussians) == 1000
 
 
 def test_an_added_offset_is_noticed_and_dithered(model: Gaussians) -> None:
     moved = Gaussians(model.means, model.quats, _added(model.log_scales), model.opacity_logits, model.sh)
-    with pytest.raises(InputError, match=r"scale_0 are not random.*--dither"):
-        usable_carriers(moved)
+    with pytest.raises(InputError, match=r"scale_0 are not random"):
+        LOW_BITS.prepare(moved)
     fine = dither(moved, ENTROPY)
     assert torch.equal(fine.quats, moved.quats)
-    assert usable_carriers(fine).mean() > 0.5
+    assert LOW_BITS.prepare(fine).usable.mean() > 0.5
     assert float((fine.log_scales - moved.log_scales).abs().max()) < 0.01
 
 

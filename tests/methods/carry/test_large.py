@@ -7,9 +7,9 @@ import time
 import pytest
 
 from channels.low_bits.trained_like import keys, trained_like
+from keyss.channels.low_bits import LowBitsReader
 from keyss.core import WrongKeyError
-from keyss.methods.carry import embed, extract
-from keyss.methods.carry.carrying import Carriers, embed_derived, extract_derived
+from methods.carry.carried import embed, embed_derived, extract, extract_derived
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +28,7 @@ def test_100000_in_100000_take_seconds() -> None:
 def test_two_secrets_of_40000_in_100000_and_a_third_key_that_hides_nothing() -> None:
     cover, own = trained_like(100_000), [keys(seed) for seed in (1, 2, 3)]
     stego = embed_derived(cover, [(each, trained_like(40_000, seed)) for seed, each in enumerate(own[:2])])
-    carriers = Carriers.of(stego)
+    carriers = LowBitsReader.of(stego)
     for each in own[:2]:
         carried = extract_derived(carriers, each[0])
         assert len(carried.gaussians) == 40_000

@@ -11,18 +11,13 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import keys, trained_like
-from keyss import FitConfig, Gaussians, HideConfig, Secret
-from keyss.channels.low_bits.container import embed
+from channels.low_bits.trained_like import trained_like
+from keyss import CarryOptions, FitConfig, Gaussians, Secret
 from keyss.cli import main
-from keyss.core import UsageError, WrongKeyError
-from keyss.core.pruning_compensation import filled
+from keyss.core import InputError, UsageError, WrongKeyError
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.ply import read_ply, write_ply
-from keyss.methods.carry.carrying import embed_derived
-from keyss.methods.carry.thinning import most_visible
-from keyss.methods.learned.opening import open_model
-from keyss.methods.learned.payload import HiddenSecret, pack_secret
-from keyss.methods.learned.revealing import decoy_secret
+from keyss.methods.carry.subsampling import most_visible
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -58,93 +53,124 @@ def run(
 
 
 def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
-    hide = ("hide", "--method", "carry", "--cover", "cover.ply", "--key-file", "key")
+    hide = ("hide", "--method", "carry", "--width", 48, "--cover", "cover.ply", "--key-file", "key")
     status, out, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "900" in out
-    assert "carry something" in out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "stego.ply", "metrics.json", "config.json"
-    }  # fmt: skip
+    assert "carriers: " in out
+    names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
+    assert names == {
+        *("stego.ply", "metrics.json", "config.json"),
+        *("private/cover.ply", "private/secret-1.ply"),
+    }
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
-    assert metrics["secrets"] == [{"gaussians": 900, "carried": 900, "bits": 568}]
+    assert metrics["secret_gaussians"] == [900]
+    assert metrics["details"]["bits_per_gaussian"] == [568]
+    assert metrics["cover"]["psnr"] == pytest.approx(metrics["baseline"]["cover"]["psnr"], abs=0.1)
+    assert metrics["secrets"][0]["psnr"] > 55
+    assert metrics["secrets"][0]["psnr"] > metrics["chance_level"][0] + 20
+    assert metrics["wrong_key"] is None
     stego = tmp_path / "out/stego.ply"
     assert run("reveal", stego, "--key-file", "key", "-o", tmp_path / "secret.ply")[0] == 0
     assert len(read_ply(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
     assert run("evaluate", tmp_path / "out", "--key-file", "key")[0] == 0
+    assert json.loads((tmp_path / "out/metrics.json").read_text()) == metrics
+    status, _, err = run("evaluate", tmp_path / "out", "--key-file", "key", "--wrong-keys", 3)
+    assert (status, "no decoder" in err) == (2, True)
+    assert run("reveal", stego, "--key-file", "key", "--frame", "cover", "-o", tmp_path / "n.ply")[0] == 2
     assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").glob("*.json"))
 
 
-def test_too_large_secrets_are_refused_or_thinned(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+@pytest.mark.parametrize("flag", ["--prune-to-fit", "--thin"])
+def test_too_large_secrets_are_refused_or_pruned(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path, flag: str
 ) -> None:
-    hide = ("hide", "--method", "carry", "--cover", "cover.ply", "--key-file", "key", "--secret", "large.ply")
+    hide = ("hide", "--method", "carry", "--width", 48, "--cover", "cover.ply", "--key-file", "key")
+    hide = (*hide, "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out")
     assert status == 2
-    assert "4,414 would fit; --thin" in err
+    assert "4,414 records would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
-    assert run(*hide, "-o", tmp_path / "out", "--thin")[0] == 0
-    assert json.loads((tmp_path / "out/metrics.json").read_text())["secrets"][0]["carried"] == 4414
+    assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["secret_gaussians"] == [4414]
+    assert metrics["details"]["gaussians_before_pruning"] == [6000]
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "having"),
     [
-        ("--sidecar", "--method", "carry"),
-        ("--mask", "op", "--method", "carry"),
-        ("--thin",),
-        ("--dither",),
+        (("--sidecar", "--method", "carry"), "learned"),
+        (("--mask", "op", "--method=carry"), "learned"),
+        (("--key_encoder=clip", "--method", "learned", "--method", "carry"), "learned"),
+        (("--thin",), "carry"),
+        (("--prune-to-fit",), "carry"),
+        (("--dither", "--method", "learned"), "carry"),
     ],
 )
 def test_options_of_the_other_method_are_refused(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path, arguments: tuple[str, ...]
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path, arguments: tuple[str, ...], having: str
 ) -> None:
     hide = ("hide", "--cover", "cover.ply", "--secret", "secret.ply", "--key-file", "key")
-    assert run(*hide, "-o", tmp_path / "out", *arguments)[0] == 2
+    status, _, err = run(*hide, "-o", tmp_path / "out", *arguments)
+    assert status == 2
+    assert f"an option of --method {having}; " in err
+    assert not (tmp_path / "out").exists()
 
 
 def test_dithering_says_what_it_costs(
     run: Callable[..., tuple[int, str, str]], files: Path, tmp_path: Path
 ) -> None:
     write_ply(tmp_path / "coarse.ply", read_ply(files / "cover.ply").map(lambda v: (v * 64).round() / 64))
-    hide = ("hide", "--method", "carry", "--cover", tmp_path / "coarse.ply", "--key-file", "key")
+    hide = (
+        "hide",
+        "--method",
+        "carry",
+        "--width",
+        48,
+        "--cover",
+        tmp_path / "coarse.ply",
+        "--key-file",
+        "key",
+    )
     status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out")
     assert status == 4
     assert "--dither gives it new low bits" in err
     status, out, _ = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", "--dither")
     assert status == 0
-    assert "Dithering costs the cover" in out
+    assert "dither psnr: " in out
 
 
 def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) -> None:
-    config = HideConfig(fit=FitConfig(iterations=30, max_gaussians=300, evaluate_every=0))
+    options = CarryOptions(fit=FitConfig(iterations=30, max_gaussians=300, evaluate_every=0))
     result = keyss.hide(
         trained_like(1500),
         [Secret(tiny_scene(1), KEY)],
-        method="carry",
-        config=config,
+        method=options,
+        width=48,
         out=tmp_path / "run",
     )
     assert (tmp_path / "run/private/secret-1.ply").exists()
-    (secret,) = result.metrics["secrets"]
-    assert secret["psnr"] == pytest.approx(result.metrics["bound"]["secrets"][0]["psnr"], abs=0.05)
+    (secret,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
+    assert plain is not None
+    assert secret.psnr == pytest.approx(plain.psnr, abs=0.05)
     revealed = keyss.reveal(tmp_path / "run/stego.ply", KEY)
-    assert len(revealed) == secret["carried"]
+    assert (len(revealed),) == result.metrics.secret_gaussians
     with pytest.raises(UsageError, match="scenes in memory"):
         keyss.evaluate(tmp_path / "run", [KEY])
 
 
 def test_a_given_model_of_a_scene_is_used() -> None:
     model = random_gaussians(400)
-    result = keyss.hide(trained_like(1500), [Secret(tiny_scene(1), KEY, model)], method="carry")
-    assert result.metrics["secrets"][0]["carried"] == 400
+    result = keyss.hide(trained_like(1500), [Secret(tiny_scene(1), KEY, model)], method="carry", width=48)
+    assert result.metrics.secret_gaussians == (400,)
     assert keyss.reveal(result.stego, "wrong", decoy=True) is not None
     with pytest.raises(WrongKeyError):
         keyss.reveal(result.stego, "wrong")
 
 
-def test_thinning_keeps_what_is_visible() -> None:
+def test_pruning_keeps_what_is_visible() -> None:
     model = trained_like(1000)
     model.opacity_logits[:] = 0
     model.opacity_logits[:400] = -30
@@ -153,23 +179,25 @@ def test_thinning_keeps_what_is_visible() -> None:
     assert most_visible(model, 1000) is model
 
 
-def test_filling_makes_up_for_what_is_lost() -> None:
+def test_compensation_makes_up_for_what_is_lost() -> None:
     model = trained_like(1000)
-    assert filled(model, 1000) is model
-    rest = filled(model[:500], 1000)
+    assert compensate_pruning(model, 1000) is model
+    rest = compensate_pruning(model[:500], 1000)
     assert (rest.opacities >= model[:500].opacities - 1e-6).all()
     assert torch.allclose(rest.opacities, 1 - (1 - model[:500].opacities) ** 2, atol=1e-5)
     sure = Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits * 0 + 40, model.sh)
-    assert torch.isfinite(filled(sure[:1], 1000).opacity_logits).all()
+    assert torch.isfinite(compensate_pruning(sure[:1], 1000).opacity_logits).all()
 
 
-def test_a_model_that_carries_still_opens_the_learned_method_s_way() -> None:
-    """`reveal` tries both methods under one derived key; neither stands in the other's way."""
-    plain = trained_like(1500)
-    secret = decoy_secret(plain, keys()[0])
-    opened = open_model(embed(plain, [(KEY, pack_secret(secret))]), KEY)
-    assert isinstance(opened, HiddenSecret)
-    assert torch.equal(opened.embedding, secret.embedding)
-    with pytest.raises(WrongKeyError):
-        open_model(embed_derived(plain, [(keys(), trained_like(100))]), KEY)
-    assert isinstance(open_model(plain, KEY, decoy=True), HiddenSecret)
+def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -> None:
+    """A scene without a model would be fitted for minutes, though the cover has no room."""
+    coarse = trained_like(1500).map(lambda v: (v * 64).round() / 64)
+    secret = Secret(tiny_scene(1), KEY)
+    with pytest.raises(InputError, match="--dither"):
+        keyss.hide(coarse, [secret], method="carry", out=tmp_path / "run")
+    flat = random_gaussians(1500, sh_degree=0)
+    model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))
+    other = Secret(tiny_scene(1), KEY + "2")
+    with pytest.raises(UsageError, match="SH degree 0 cannot carry"):
+        keyss.hide(flat, [other, model], method="carry", out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

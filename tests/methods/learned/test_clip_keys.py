@@ -14,10 +14,9 @@ import torch
 from keyss.core.errors import BackendError, UsageError, WrongKeyError
 from keyss.fitting.config import FitConfig
 from keyss.methods.learned.clip_keys import ClipKeys
-from keyss.methods.learned.config import HideConfig
+from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.payload import pack_secret
-from keyss.methods.learned.pipeline import hide_scenes
-from keyss.methods.learned.revealing import open_secret
+from methods.learned.hiding import hide_scenes, open_secret
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -106,15 +105,15 @@ def test_without_transformers_one_sentence_names_the_extra(monkeypatch: pytest.M
         ClipKeys("anywhere")
 
 
-def test_hiding_seals_what_clip_gives(encoder: ClipKeys) -> None:
+def test_hiding_encrypts_what_clip_gives(encoder: ClipKeys, folder: Path) -> None:
     """Two keys that are the same to CLIP have the same embedding and open different things."""
     fit = FitConfig(iterations=10, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0)
-    config = HideConfig(fit=fit)
+    config = LearnedOptions(fit=fit, key_encoder="clip", clip_model=str(folder))
     scenes, models = (
         [tiny_scene(seed) for seed in range(3)],
         [random_gaussians(seed=seed) for seed in range(3)],
     )
-    hidden = hide_scenes(scenes, ["Key", "key"], config, plains=models, sidecar=True, encoder=encoder)
+    hidden = hide_scenes(scenes, ["Key", "key"], config, plains=models, sidecar=True)
     first, second = (open_secret(hidden.stego, key, hidden.sidecar) for key in ("Key", "key"))
     assert torch.equal(first.embedding, encoder("key"))
     assert torch.equal(second.embedding, encoder("key"))

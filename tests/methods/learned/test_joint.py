@@ -15,17 +15,17 @@ from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.fitting.loop import Interrupted, Silent
+from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.keys import random_embeddings
-from keyss.methods.learned.config import PRESETS, HideConfig
 from keyss.methods.learned.joint import JointRun, combine_densification
-from keyss.methods.learned.pipeline import Hidden, hide_scenes
-from keyss.methods.learned.revealing import decode, open_secret, reveal_gaussians
+from keyss.methods.learned.options import PRESETS, LearnedOptions
+from keyss.methods.learned.revealing import decode, reveal_gaussians
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
 from keyss.rendering import render
+from methods.learned.hiding import Hidden, hide_scenes, open_secret
 from tiny_scenes import random_gaussians, tiny_scene
 
-CONFIG = HideConfig(
+CONFIG = LearnedOptions(
     fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0),
 )
 # What the paper has, small.
@@ -151,7 +151,7 @@ def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: 
     reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1], force=True)
 
 
-class _InterruptAt(Silent):
+class _InterruptAt(SilentReporter):
     """Presses Ctrl-C at one iteration of one stage."""
 
     def __init__(self, stage: str, iteration: int) -> None:
@@ -167,11 +167,11 @@ class _InterruptAt(Silent):
 
 
 @pytest.mark.parametrize("base", [CONFIG, replace(CONFIG, decoder="network"), PAPER])
-def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, base: HideConfig) -> None:
+def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, base: LearnedOptions) -> None:
     scenes = _scenes()[0][:2]
     config = replace(base, fit=replace(CONFIG.fit, iterations=40, grow_every=5))
 
-    def run(resume: bool, reporter: Silent | None = None) -> Hidden:
+    def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
         return hide_scenes(
             scenes, KEYS[:1], config, sidecar=True, checkpoints=tmp_path, resume=resume, reporter=reporter
         )
@@ -186,14 +186,6 @@ def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, 
     assert resumed.sidecar == whole.sidecar
     with pytest.raises(InputError, match="other settings"):
         hide_scenes(scenes, ["another key"], config, sidecar=True, checkpoints=tmp_path, resume=True)
-
-
-def test_keys_must_be_one_per_secret_and_different() -> None:
-    scenes, models = _scenes()
-    with pytest.raises(UsageError, match="same key"):
-        hide_scenes(scenes, ["key", "key"], CONFIG, plains=models)
-    with pytest.raises(UsageError, match="one key for each"):
-        hide_scenes(scenes, ["key"], CONFIG, plains=models)
 
 
 def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
@@ -232,14 +224,14 @@ def test_combined_densification_scatters_and_unweights() -> None:
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match="--start points"):
-        HideConfig(mask=("xyz",), decoder="network")
-    assert HideConfig(mask=("xyz",), start="points", decoder="network").mask == ("xyz",)
+        LearnedOptions(mask=("xyz",), decoder="network")
+    assert LearnedOptions(mask=("xyz",), start="points", decoder="network").mask == ("xyz",)
     with pytest.raises(UsageError, match="network"):
-        HideConfig(start="points")
+        LearnedOptions(start="points")
     with pytest.raises(UsageError, match="network"):
-        HideConfig(mask=("op", "sh"))
+        LearnedOptions(mask=("op", "sh"))
     with pytest.raises(UsageError, match="gate"):
-        HideConfig(conditioning="bias")
+        LearnedOptions(conditioning="bias")
 
 
 @pytest.mark.parametrize("preset", ["paper", "released"])

@@ -31,7 +31,12 @@ def _secret() -> HiddenSecret:
 
 
 PACKED = pack_secret(_secret())
-SHAPE = asdict(_secret().decoder.shape) | {"mask": "op,ro,sc,xyz"}
+FRAME_JSON = {
+    "scale": FRAME.scale,
+    "rotation": FRAME.rotation.tolist(),
+    "translation": FRAME.translation.tolist(),
+}
+SHAPE = asdict(_secret().decoder.shape)
 
 
 def _with_header(**changes: object) -> bytes:
@@ -50,6 +55,8 @@ def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
     secret, opened = _secret(), unpack_secret(PACKED)
     assert opened.decoder.shape == secret.decoder.shape
     assert torch.equal(opened.embedding, secret.embedding)
+    assert opened.frame.scale == FRAME.scale
+    assert torch.equal(opened.frame.rotation, FRAME.rotation)
     assert torch.equal(opened.frame.translation, FRAME.translation)
     assert torch.equal(opened.anchors, secret.anchors)
     for name, value in secret.decoder.state_dict().items():
@@ -60,7 +67,7 @@ def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
 
 
 def test_another_version_is_refused_by_number() -> None:
-    with pytest.raises(InputError, match=r"version 1.*version 3"):
+    with pytest.raises(InputError, match=r"version 1.*version 4"):
         unpack_secret(_with_header(version=1))
 
 
@@ -69,15 +76,33 @@ def test_another_version_is_refused_by_number() -> None:
     [
         {"format": "other"},
         {"shape": None},
-        {"shape": {"mask": "op"}},
+        {"shape": {"mask": ["op"]}},
         {"shape": SHAPE | {"hidden": [10**9, 16]}},
         {"shape": SHAPE | {"hidden": [16]}},
         {"shape": SHAPE | {"branch": 8.0}},
         {"shape": SHAPE | {"kind": "eval"}},
-        {"shape": SHAPE | {"mask": "op"}},  # fewer branches than there are weights for
+        {"shape": SHAPE | {"mask": ["op"]}},  # fewer branches than there are weights for
         {"shape": SHAPE | {"extra": 1}},
-        {"frame": {"scale": -1}},
+        {"shape": SHAPE | {"mask": ["xyz", "op"]}},
+        {"count": -1},
+        {"count": 2**40},
+        {"unknown": 1},
         {"frame": 3},
+        {"frame": {"scale": 1.0}},
+        *(
+            {"frame": FRAME_JSON | change}
+            for change in (
+                {"scale": -1.0},
+                {"scale": True},
+                {"scale": "1"},
+                {"scale": 10**400},
+                {"translation": [0.0, 0.0]},
+                {"translation": [0.0, None, 0.0]},
+                {"rotation": [[1, 0, 0], [0, 1, 0]]},
+                {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
+                {"unknown": 1},
+            )
+        ),
     ],
 )
 def test_hostile_headers_are_input_errors(changes: dict[str, object]) -> None:

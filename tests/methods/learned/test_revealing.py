@@ -1,4 +1,4 @@
-"""Decoys, and what becomes of models that came through a format with few bits."""
+"""What becomes of models that came through a format with few bits."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from channels.low_bits.trained_like import keys, trained_like
+from channels.low_bits.trained_like import trained_like
 from keyss.core import InputError
 from keyss.methods.learned.payload import pack_secret, unpack_secret
-from keyss.methods.learned.revealing import decoy_secret, reveal_gaussians
+from keyss.methods.learned.revealing import reveal_gaussians
+from methods.learned.hiding import some_secret
 
 
 def test_opacities_that_were_rounded_to_zero_are_taken_for_faint_ones() -> None:
     stego = trained_like(200)
-    secret = decoy_secret(stego, keys()[0])
+    secret = some_secret(stego)
     chosen = torch.arange(200) % 3 == 0
     rounded, faint = (
         replace(stego, opacity_logits=stego.opacity_logits.masked_fill(chosen, logit))
@@ -33,7 +34,7 @@ def test_a_sidecar_knows_what_was_rounded_whatever_the_order(logit: float) -> No
     hidden = torch.arange(200) % 2 == 0
     faint = stego.opacity_logits.clamp(-3, 3) - 9
     stego = replace(stego, opacity_logits=torch.where(hidden, faint, stego.opacity_logits.abs()))
-    secret = decoy_secret(stego, keys()[0])
+    secret = some_secret(stego)
     kept = torch.cat([stego.means[hidden], stego.opacity_logits[hidden, None], stego.sh[hidden, 0]], dim=1)
     secret = unpack_secret(pack_secret(replace(secret, faint=kept)))
     rounded = replace(
@@ -52,7 +53,7 @@ def test_a_sidecar_knows_what_was_rounded_whatever_the_order(logit: float) -> No
 
 def test_positions_that_were_rounded_need_force() -> None:
     stego = trained_like(200)
-    secret = decoy_secret(stego, keys()[0])
+    secret = some_secret(stego)
     rounded = replace(stego, means=(stego.means * 500).round() / 500)
     with pytest.raises(InputError, match="--force"):
         reveal_gaussians(rounded, secret)
@@ -61,7 +62,7 @@ def test_positions_that_were_rounded_need_force() -> None:
 
 def test_what_is_left_makes_up_for_what_was_lost() -> None:
     stego = trained_like(200)
-    secret = decoy_secret(stego, keys()[0])
+    secret = some_secret(stego)
     secret = unpack_secret(pack_secret(replace(secret, count=200)))
     left = reveal_gaussians(stego[:150], secret)
     alone = reveal_gaussians(stego[:150], replace(secret, count=0))
@@ -74,6 +75,6 @@ def test_what_is_left_makes_up_for_what_was_lost() -> None:
 
 @pytest.mark.parametrize("count", [-1, 2**40, 1.5, True, None])
 def test_a_count_out_of_bounds_is_refused(count: object) -> None:
-    secret = decoy_secret(trained_like(100), keys()[0])
+    secret = some_secret(trained_like(100))
     with pytest.raises(InputError, match="number of Gaussians"):
         unpack_secret(pack_secret(replace(secret, count=count)))  # type: ignore[arg-type]

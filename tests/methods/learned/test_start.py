@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
-from keyss.methods.learned.config import HideConfig
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.start import DRAWN_LOGIT, _shares, hidden_logits, make_start, opacity_curve
 from keyss.methods.learned.targets import PlacedScene
 from tiny_scenes import random_gaussians, tiny_scene
@@ -39,7 +39,7 @@ def _placed(count: int) -> list[PlacedScene]:
 
 
 def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
-    config = HideConfig(fit=FitConfig(max_gaussians=330))
+    config = LearnedOptions(fit=FitConfig(max_gaussians=330))
     start = make_start(_placed(3), config, torch.Generator())
     assert len(start.gaussians) == 330
     assert start.curves is not None
@@ -59,7 +59,7 @@ def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
 
 
 def test_the_key_brings_back_the_opacities_that_a_warm_start_hides() -> None:
-    config = HideConfig(fit=FitConfig(max_gaussians=10_000))
+    config = LearnedOptions(fit=FitConfig(max_gaussians=10_000))
     placed = _placed(3)
     start = make_start(placed, config, torch.Generator())
     assert start.curves is not None
@@ -92,13 +92,13 @@ def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
     useless = replace(wall, means=wall.means + 1000)
     faint = replace(wall, opacity_logits=torch.full((200,), -9.0))
     both = PlacedScene.of(placed.scene, Gaussians.cat([useless, wall, faint]), Similarity.identity())
-    start = make_start([both], HideConfig(fit=FitConfig(max_gaussians=150)), torch.Generator())
+    start = make_start([both], LearnedOptions(fit=FitConfig(max_gaussians=150)), torch.Generator())
     assert (start.gaussians.means.abs() < 100).all()
     assert (start.gaussians.opacity_logits == 5).all()
 
 
 def test_start_from_points_divides_the_cap_between_the_scenes() -> None:
-    config = HideConfig(fit=FitConfig(max_gaussians=100), start="points", decoder="network")
+    config = LearnedOptions(fit=FitConfig(max_gaussians=100), start="points", decoder="network")
     start = make_start(_placed(2), config, torch.Generator().manual_seed(0))
     assert len(start.gaussians) == 100
     assert start.curves is None

@@ -1,1 +1,5 @@
-"""The low mantissa bits of a float model."""
+"""The low mantissa bits of a float model: exact, and lost in every format that rounds."""
+
+from keyss.channels.low_bits.channel import LOW_BITS, LowBits, LowBitsCover, LowBitsReader
+
+__all__ = ["LOW_BITS", "LowBits", "LowBitsCover", "LowBitsReader"]

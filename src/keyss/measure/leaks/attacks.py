@@ -23,7 +23,7 @@ from keyss.measure.leaks.opacities import (
     rescaled,
 )
 from keyss.measure.white_box import search_embeddings
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 
 THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing

@@ -13,7 +13,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.leaks.attacks import Attack, Parameter, file_attacks
 from keyss.measure.leaks.scores import LeakScores, scores
 from keyss.rendering import render
@@ -61,7 +61,7 @@ def look_for_secret(
     and of the cover's training views `cover_views`, evenly spread. See `attack` for what comes back. Raises
     UsageError for no control and for a secret without test views.
     """
-    attacks = file_attacks([view.camera for view in thin(cover.train, cover_views)], seed)
+    attacks = file_attacks([view.camera for view in subsample_views(cover.train, cover_views)], seed)
     return attack(stego, controls, secret, frame, [*attacks, *more], test_views=test_views)
 
 
@@ -84,7 +84,9 @@ def attack(
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
     if not secret.test:
         raise UsageError(f"leaks: the scene {secret.name} has no test views")
-    views = [View(frame.apply_camera(view.camera), view.image) for view in thin(secret.test, test_views)]
+    views = [
+        View(frame.apply_camera(view.camera), view.image) for view in subsample_views(secret.test, test_views)
+    ]
     results, pictures = [], {}
     for each in attacks:
         found = _look(each, stego, views, secret.background)

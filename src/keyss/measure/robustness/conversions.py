@@ -22,7 +22,7 @@ import torch
 
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.models import read_model, write_model
 from keyss.measure.robustness.changes import Change
 
 SECONDS = 600.0  # that a program may take for one way
@@ -49,10 +49,10 @@ class Converter:
         """Raises BackendError where the tool is missing or cannot do it."""
         with tempfile.TemporaryDirectory() as folder:
             source = Path(folder) / "source.ply"
-            write_ply(source, model)
+            write_model(source, model)
             try:
                 other, back = self.there_and_back(source, Path(folder))
-                return Converted(read_ply(back), other.stat().st_size)
+                return Converted(read_model(back), other.stat().st_size)
             except BackendError:
                 raise
             except (KeyssError, OSError, ValueError) as error:
@@ -148,7 +148,7 @@ def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
 
 def _splat(source: Path, folder: Path) -> tuple[Path, Path]:
     """antimatter15's format: positions and scales as floats, colour, opacity and rotation as bytes."""
-    model, there = read_ply(source), folder / "there.splat"
+    model, there = read_model(source), folder / "there.splat"
     rows = np.zeros(len(model), dtype=[("p", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
     rows["p"], rows["s"] = model.means.numpy(), model.scales.numpy()
     rows["c"][:, :3] = _bytes((0.5 + SH_C0 * model.sh[:, 0]) * 255)

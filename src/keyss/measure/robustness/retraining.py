@@ -8,13 +8,13 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
 from keyss.measure.robustness.changes import Change
 from keyss.rendering import render
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 
 VIEWS = 64  # in which purification looks for what is used
 
@@ -50,7 +50,7 @@ def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
     Of all weights with which Gaussians are blended, summed over pixels and views, no more than the share
     `given_up` is theirs. Never all of them.
     """
-    weights = contributions(model, [view.camera for view in thin(cover.train, VIEWS)]).double()
+    weights = contributions(model, [view.camera for view in subsample_views(cover.train, VIEWS)]).double()
     ascending, order = weights.sort(stable=True)
     least = ascending.cumsum(0) <= given_up * ascending.sum()
     least[-1] = False

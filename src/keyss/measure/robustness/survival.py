@@ -11,7 +11,7 @@ from keyss.core.errors import BackendError, KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import quality, thin
+from keyss.fitting.image_metrics import quality, subsample_views
 from keyss.measure.robustness import changes as change
 from keyss.measure.robustness.changes import Change
 from keyss.measure.robustness.conversions import converters
@@ -234,5 +234,5 @@ def _secret(
 
 
 def _quality(model: Gaussians, scene: Scene, views: int) -> ChangedQuality:
-    found = quality(model, thin(scene.test, views), scene.background.to(model.device))
+    found = quality(model, subsample_views(scene.test, views), scene.background.to(model.device))
     return ChangedQuality(found.psnr, found.ssim, loss=0.0)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from keyss.core.errors import InputError, UsageError
-from keyss.fitting.loop import Reporter, Silent
+from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.measure.stegexpose.scores import DETECTORS, Scores, score_file
 
 THRESHOLD = 0.2  # the original's
@@ -58,7 +58,7 @@ def steganalyze(
     paths = _files(folder)
     rows: list[Row] = []
     skipped: list[str] = []
-    reporter = reporter or Silent()
+    reporter = reporter or SilentReporter()
     reporter.start(f"steganalyze {folder}", len(paths), 0)
     try:
         for done, path in enumerate(paths, start=1):

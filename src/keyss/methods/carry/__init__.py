@@ -1,5 +1,1 @@
-"""Carrying: a model inside the low bits of another, without training and nearly without loss."""
-
-from keyss.methods.carry.carrying import Carried, embed, extract
-
-__all__ = ["Carried", "embed", "extract"]
+"""The carry method: a secret as quantised Gaussians in the low bits of the cover, nearly without loss."""

@@ -9,17 +9,15 @@ seen is whether anything is in the low bits.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from keyss.channels.low_bits.bits import is_uniform
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera
 from keyss.keys.derivation import stream
 from keyss.rendering import render
+from keyss.rendering.orbit import orbit
 
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
 _SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
@@ -48,8 +46,9 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
 
 def cost(before: Gaussians, after: Gaussians) -> float:
     """PSNR in dB of views around a model, before and after; at most 120."""
+    cameras = orbit(before, _SIZE, _VIEWS)
     error = torch.stack(
-        [(render(before, view) - render(after, view)).square().mean() for view in _around(before)]
+        [(render(before, camera) - render(after, camera)).square().mean() for camera in cameras]
     )
     return float(-10 * torch.log10(error.mean().clamp_min(1e-12)))
 
@@ -77,21 +76,3 @@ def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:
 def _uniform(entropy: bytes, label: str, count: int) -> npt.NDArray[np.float64]:
     words = np.frombuffer(stream(entropy, label, 8 * count), "<u8")
     return words.astype(np.float64) / 2.0**63 - 1
-
-
-def _around(model: Gaussians) -> list[Camera]:
-    """Cameras that look at the middle of a model from all sides."""
-    middle = model.means.median(0).values
-    distance = 2.5 * float((model.means - middle).norm(dim=1).median())
-    cameras = []
-    for index in range(_VIEWS):
-        angle = 2 * math.pi * index / _VIEWS
-        forward = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-        right = torch.tensor([-math.sin(angle), math.cos(angle), 0.0])
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = rotation
-        viewmat[:3, 3] = -rotation @ (middle - distance * forward)
-        K = torch.tensor([[_SIZE, 0, _SIZE / 2], [0, _SIZE, _SIZE / 2], [0, 0, 1.0]])
-        cameras.append(Camera(viewmat, K, _SIZE, _SIZE, f"around-{index}"))
-    return cameras

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.carry.table import BANDS, CHROMA_FEWER, Table
@@ -32,8 +33,6 @@ Bytes = npt.NDArray[np.uint8]
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _LARGEST_QUAT = 0.5**0.5
 _FURTHEST = 1e30  # no value that a line may give is larger
-# Brightness, red against green, and both against blue: rows of unit length at right angles.
-_COLOURS = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3], [2], [6]])
 _CHUNK = 1 << 14  # Gaussians at a time when packing: every bit takes a byte meanwhile
 _LEAST_SPREAD = 1e-30
 _SAMPLE = 20_000  # values that a line is fitted to
@@ -169,7 +168,7 @@ class Codec:
             brightness = next(lines).decode(read(count, bits), bits)[:, :, None]
             bits -= CHROMA_FEWER
             differences = next(lines).decode(read(2 * count, bits), bits).reshape(-1, count, 2)
-            harmonics.append(np.concatenate([brightness, differences], axis=2) @ _COLOURS)
+            harmonics.append(np.concatenate([brightness, differences], axis=2) @ OPPONENT)
         sh = np.concatenate(harmonics, axis=1)
         return Gaussians(*(torch.from_numpy(v).float() for v in (means, quats, log_scales, logits, sh)))
 
@@ -268,7 +267,7 @@ def _line(centre: float, spread: float, reach: float) -> Line:
 def _colours(gaussians: Gaussians, table: Table, band: int) -> Iterator[tuple[Floats, int]]:
     """A band's brightness [N, count] and differences [N, count, 2], with the bits of each."""
     bits = (table.dc, *table.bands)[band]
-    rotated = _doubles(gaussians.sh[:, band**2 : (band + 1) ** 2]) @ _COLOURS.T
+    rotated = _doubles(gaussians.sh[:, band**2 : (band + 1) ** 2]) @ OPPONENT.T
     yield rotated[:, :, 0], bits
     yield rotated[:, :, 1:], bits - CHROMA_FEWER
 

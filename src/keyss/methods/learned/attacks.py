@@ -1,4 +1,4 @@
-"""What somebody tries without a key who has read how this method hides: models to be rendered."""
+"""What somebody makes of a stego model who has no key, and has read the source of this method."""
 
 from __future__ import annotations
 
@@ -15,31 +15,20 @@ _OPAQUE_LOGIT = math.log(0.99 / 0.01)  # as much as one Gaussian covers in 3DGS
 _DRAWN_LOGIT = math.log(DRAWN_OPACITY / (1 - DRAWN_OPACITY))
 
 
-def attacks(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
-    """By name, what a stego model shows for each of so many secrets, and what lies in none of their bands."""
-    stray = outside_the_bands(stego, secrets)
-    opaque = replace(stray, opacity_logits=torch.full_like(stray.opacity_logits, _OPAQUE_LOGIT))
-    shown = {f"secret {index + 1}": by_the_source(stego, index) for index in range(secrets)}
-    return {**shown, "outside the bands": opaque}
+def known_remaps(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
+    """`stego` with the opacity remap of each of so many secrets, and what is transparent for all of them.
 
-
-def by_the_source(model: Gaussians, secret: int) -> Gaussians:
-    """With the opacities that this method's source tells of a warm start's secret (0, 1, ...)."""
-    decoder = Decoder(DecoderShape()).to(model.device)
-    decoder.prepare(model, torch.ones_like(decoder.key))
-    decoder.set_curve(*opacity_curve(secret))
-    shown: Gaussians = decoder(model, decoder.key)
-    return shown
-
-
-def outside_the_bands(model: Gaussians, secrets: int) -> Gaussians:
-    """The Gaussians alone that are never drawn but lie in no band of the first so many secrets.
-
-    A Gaussian of a secret that left its band while training would be one of them.
+    A Gaussian of a secret that left its opacity band while training would be among the last.
     """
-    logits = model.opacity_logits
+    decoder = Decoder(DecoderShape()).to(stego.device)
+    decoder.prepare(stego, torch.ones_like(decoder.key))
+    logits, shown = stego.opacity_logits, {}
     stray = logits < _DRAWN_LOGIT
     for secret in range(secrets):
-        knots, _ = opacity_curve(secret)
+        knots, values = opacity_curve(secret)
+        decoder.set_curve(knots, values)
+        shown[f"secret {secret + 1}"] = decoder(stego, decoder.key)
         stray = stray & ~((logits > knots[1]) & (logits < knots[4]))
-    return model[stray]
+    outside = stego[stray]
+    opaque = torch.full_like(outside.opacity_logits, _OPAQUE_LOGIT)
+    return {**shown, "outside the bands": replace(outside, opacity_logits=opaque)}

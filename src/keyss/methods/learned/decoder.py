@@ -15,10 +15,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
+from msgspec import Meta
 from torch import Tensor, nn
 
 from keyss.core.gaussians import Gaussians
@@ -35,6 +36,8 @@ KEY_GAIN = 3.0  # lets a unit vector move the first layer as much as the attribu
 GATE_SHUT, GATE_OPEN = 0.7, 0.9
 KNOTS = 6
 
+Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
+
 
 @dataclass(frozen=True, kw_only=True)
 class DecoderShape:
@@ -44,10 +47,10 @@ class DecoderShape:
     kind: Literal["curve", "network"] = "curve"  # a network adds to the curve
     conditioning: Literal["gate", "bias"] = "gate"  # how the key enters; bias: the paper's
     # What follows is for networks.
-    hidden: tuple[int, int] = (64, 64)  # widths of the two layers of the common branch
-    branch: int = 32  # width of each attribute's branch
-    frequencies: int = 6  # octaves of sines and cosines of the position
-    sh_degree: int = 3
+    hidden: tuple[Width, Width] = (64, 64)  # widths of the two layers of the common branch
+    branch: Width = 32  # width of each attribute's branch
+    frequencies: Annotated[int, Meta(ge=0, le=16)] = 6  # octaves of sines and cosines of the position
+    sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3
     design: Literal["standardised", "published"] = "standardised"  # published: see `Network`
     residuals: Literal["signed", "one-sided"] = "signed"  # one-sided: ReLU on all but the opacity's
 

@@ -11,18 +11,18 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.density import CappedStrategy
-from keyss.fitting.image_metrics import mean_psnr, thin
+from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
-from keyss.methods.learned.config import HideConfig, chosen_scenes
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.scramble import LEAST_OPACITY
 from keyss.methods.learned.start import HIDDEN_SLOPE, logit_limits, make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
+from keyss.methods.learned.visibility import possibly_seen
 from keyss.rendering import render_with_meta
-from keyss.rendering.visibility import possibly_seen
 
 LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
 
@@ -37,7 +37,7 @@ class JointRun:
         self,
         scenes: Sequence[PlacedScene],  # the cover, then the secrets
         embeddings: Sequence[Tensor],  # [64] of each secret's key
-        config: HideConfig,
+        config: LearnedOptions,
         device: torch.device,
     ) -> None:
         self.config = config
@@ -48,7 +48,7 @@ class JointRun:
         self.iteration = 0
         self.generator = torch.Generator().manual_seed(config.fit.seed)
         self.poses = CombinedPoses(scenes, device)
-        self.watched = [thin(placed.scene.test, 8) for placed in scenes]
+        self.watched = [subsample_views(placed.scene.test, 8) for placed in scenes]
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
         self.owners = chosen_scenes(config.poses, len(scenes))
         self.owner_order = Shuffle(len(self.owners), self.generator)
@@ -228,7 +228,7 @@ class JointRun:
         self.iteration = int(meta["iteration"])
 
 
-def decoder_shape(config: HideConfig) -> DecoderShape:
+def decoder_shape(config: LearnedOptions) -> DecoderShape:
     """The sizes of the decoder that `config` asks for."""
     return DecoderShape(
         mask=config.mask,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 from keyss.core.errors import UsageError
 
-ATTRIBUTES = ("op", "ro", "sc", "xyz", "sh")  # opacity, rotation, scale, position, colour
-
-Mask = tuple[str, ...]
+Attribute = Literal["op", "ro", "sc", "xyz", "sh"]  # opacity, rotation, scale, position, colour
+Mask = tuple[Attribute, ...]
+ATTRIBUTES: Mask = get_args(Attribute)
 
 
 def parse_mask(text: str) -> Mask:

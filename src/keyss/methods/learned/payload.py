@@ -1,34 +1,34 @@
-"""A secret as bytes: what is sealed under its key. safetensors with a JSON header, nothing executable.
+"""A secret as bytes: the payload that is encrypted under its key. safetensors, nothing executable.
 
 It holds the decoder (a network's weights in half precision, all constants whole) with the embedding that
 it belongs to, the similarity that leads back to the secret's own frame, and *anchors*: positions of some
-Gaussians of the stego model, which are there in any order and, mostly, after pruning, and tell whether a
-sidecar belongs to a model. A secret's bytes say nothing of other secrets.
+Gaussians of the stego model. They are there in any order and, mostly, after pruning, and tell whether a
+sidecar belongs to a model. A secret's bytes say nothing of other secrets. docs/format.md lists them.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, get_args, get_type_hints
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+from msgspec import Meta
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.mask import parse_mask
-from keyss.methods.learned.scramble import CHANNELS, KEY_BYTES, KNOTS, LEAST_OPACITY, Scramble
+from keyss.methods.learned.scramble import CHANNELS, KEY_BYTES, KNOTS, Scramble
 
-FORMAT = "keyss-secret"
-VERSION = 3
-MOST_GAUSSIANS = 2**31
+FORMAT: Literal["keyss-secret"] = "keyss-secret"
+VERSION: Literal[4] = 4
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
@@ -36,14 +36,44 @@ _WEIGHTS = "decoder."
 # What reading a damaged header or damaged weights can raise.
 _DAMAGE = (
     safetensors.SafetensorError,
+    msgspec.MsgspecError,
     KeyError,
     TypeError,
     ValueError,
     RuntimeError,
-    AttributeError,
     RecursionError,
     UsageError,
 )
+
+_Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _Version:
+    """What is read of a header before anything else."""
+
+    format: str
+    version: int
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A similarity."""
+
+    scale: float
+    rotation: tuple[_Three, _Three, _Three]
+    translation: _Three
+
+
+@dataclass(frozen=True)
+class _Header:
+    """The JSON beside the tensors; msgspec holds it to these types and bounds."""
+
+    format: Literal["keyss-secret"]
+    version: Literal[4]
+    shape: DecoderShape
+    frame: _Frame
+    count: Annotated[int, Meta(ge=0, le=2**31)]
 
 
 @dataclass(frozen=True)
@@ -61,7 +91,7 @@ class HiddenSecret:
 
     def with_faint(self, stego: Gaussians) -> Gaussians:
         """`stego` with transparent Gaussians as the nearest in `faint` are, or all nearly opaque."""
-        transparent = stego.opacities < LEAST_OPACITY
+        transparent = stego.opacities < DRAWN_OPACITY
         opacity_logits, sh = stego.opacity_logits.clone(), stego.sh.clone()
         if self.faint is None:
             opacity_logits[transparent] = self.decoder.faint_logit
@@ -98,14 +128,18 @@ def choose_anchors(stego: Gaussians, generator: torch.Generator) -> Tensor:
 
 def pack_secret(secret: HiddenSecret) -> bytes:
     """The bytes of a secret; the same secret gives the same bytes."""
-    decoder = secret.decoder
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "shape": {**asdict(decoder.shape), "mask": ",".join(decoder.shape.mask)},
-        "frame": secret.frame.to_json(),
-        "count": secret.count,
-    }
+    decoder, frame = secret.decoder, secret.frame
+    header = _Header(
+        FORMAT,
+        VERSION,
+        decoder.shape,
+        _Frame(
+            frame.scale,
+            tuple(tuple(row) for row in frame.rotation.tolist()),  # type: ignore[arg-type]
+            tuple(frame.translation.tolist()),
+        ),
+        secret.count,
+    )
     halved = {name for name, _ in decoder.named_parameters()}
     tensors = {
         _WEIGHTS + name: (value.half() if name in halved else value).detach().cpu().contiguous()
@@ -121,37 +155,36 @@ def pack_secret(secret: HiddenSecret) -> bytes:
             "scramble.own": secret.scramble.own,
             "scramble.shown": secret.scramble.shown,
         }
-    return safetensors.torch.save(tensors, {"keyss": json.dumps(header)})
+    return safetensors.torch.save(tensors, {"keyss": msgspec.json.encode(header).decode()})
 
 
 def unpack_secret(data: bytes) -> HiddenSecret:
     """The secret of `pack_secret`. Raises InputError for anything else, for damage, and another version."""
     try:
         tensors = safetensors.torch.load(data)
-        header = json.loads(_metadata(data).get("keyss", "null"))
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise InputError("what the key opens is no secret of keyss")
-        if header.get("version") != VERSION:
-            raise InputError(
-                f"secret of version {header.get('version')!r}; this program reads version {VERSION}"
-            )
-        return _from_parts(header, tensors)
+        return _from_parts(_read_header(data), tensors)
     except _DAMAGE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"what the key opens is no secret of keyss, or damaged: {reason}") from error
+        raise InputError(f"what the key decrypts is no secret of keyss, or damaged: {reason}") from error
 
 
-def _metadata(data: bytes) -> dict[str, str]:
-    """The text that safetensors carries; `safetensors.torch.load` has checked the sizes."""
+def _read_header(data: bytes) -> _Header:
+    """The header in safetensors' metadata; `safetensors.torch.load` has checked the sizes."""
     size = int.from_bytes(data[:8], "little")
-    metadata = json.loads(data[8 : 8 + size]).get("__metadata__") or {}
-    if not isinstance(metadata, dict):
-        raise TypeError("metadata: expected an object")
-    return metadata
+    outer = msgspec.json.decode(data[8 : 8 + size], type=dict[str, msgspec.Raw])
+    text = msgspec.json.decode(outer["__metadata__"], type=dict[str, str])["keyss"].encode()
+    found = msgspec.json.decode(text, type=_Version)
+    if found.format != FORMAT:
+        raise InputError("what the key decrypts is no secret of keyss")
+    if found.version != VERSION:
+        raise InputError(f"secret of version {found.version}; this program reads version {VERSION}")
+    header = msgspec.json.decode(text, type=_Header)
+    if msgspec.json.encode(header) != text or parse_mask(",".join(header.shape.mask)) != header.shape.mask:
+        raise InputError("what the key decrypts is no secret of keyss: its header has more or other fields")
+    return header
 
 
-def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSecret:
-    shape = _shape(dict(header["shape"]))
+def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
     scramble = _scramble({name: tensors.pop(name) for name in list(tensors) if name.startswith("scramble.")})
     if not all(
         value.dtype in (torch.float16, torch.float32) and value.isfinite().all() for value in tensors.values()
@@ -163,15 +196,16 @@ def _from_parts(header: dict[str, Any], tensors: dict[str, Tensor]) -> HiddenSec
     faint = tensors.pop("faint", None)
     if faint is not None and (faint.dim() != 2 or faint.shape[1] != 7 or len(faint) == 0):
         raise InputError(f"transparent Gaussians: expected rows of 7 numbers, got shape {list(faint.shape)}")
-    decoder = Decoder(shape)
+    decoder = Decoder(header.shape)
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
     if not (decoder.knots.diff() > 0).all():
         raise InputError("opacity curve: expected ascending knots")
-    frame = Similarity.from_json(header["frame"])
-    count = header["count"]
-    if type(count) is not int or not 0 <= count <= MOST_GAUSSIANS:
-        raise InputError(f"number of Gaussians: expected 0 to {MOST_GAUSSIANS:,}, got {count!r}")
-    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble, faint, count)
+    frame = Similarity(
+        header.frame.scale,
+        torch.tensor(header.frame.rotation, dtype=torch.float64),
+        torch.tensor(header.frame.translation, dtype=torch.float64),
+    )
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble, faint, header.count)
 
 
 def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:
@@ -188,23 +222,3 @@ def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:
     ):
         raise InputError("scrambled Gaussians: expected a key, a band and two ascending tables")
     return Scramble(bytes(key.tolist()), (float(band[0]), float(band[1])), own, shown)
-
-
-def _shape(given: dict[str, Any]) -> DecoderShape:
-    """The shape that a header states, held to bounds. Raises InputError, and what `_DAMAGE` lists."""
-    expected = {field.name for field in fields(DecoderShape)}
-    if set(given) != expected:
-        raise InputError(f"decoder shape: expected {sorted(expected)}, got {sorted(given)}")
-    first, second = given["hidden"]
-    bounds = {"branch": (1, 4096), "frequencies": (0, 16), "sh_degree": (0, 3)}
-    sizes = [(first, 1, 4096), (second, 1, 4096), *((given[name], *span) for name, span in bounds.items())]
-    names = [
-        (given[name], get_args(get_type_hints(DecoderShape)[name]))
-        for name in ("kind", "conditioning", "design", "residuals")
-    ]
-    if not (
-        all(type(value) is int and low <= value <= high for value, low, high in sizes)
-        and all(value in allowed for value, allowed in names)
-    ):
-        raise InputError(f"decoder shape out of range: {given}")
-    return DecoderShape(**{**given, "mask": parse_mask(str(given["mask"])), "hidden": (first, second)})

@@ -1,34 +1,33 @@
-"""Hiding from posed photos: plain models of all scenes, one frame for all, joint training."""
+"""How the learned method hides: one frame for all scenes, joint training, encryption."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import combinations
-from pathlib import Path
+from dataclasses import asdict, replace
 
 import torch
 from torch import Tensor
 
-from keyss.channels.low_bits.byte_plan import check_room
-from keyss.channels.low_bits.container import embed
-from keyss.channels.sidecar import seal_sidecar
+from keyss.channels.base import Payload
+from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.low_bits.spread import check_payload_fits
+from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.alignment import align
-from keyss.core.errors import UsageError
+from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
-from keyss.fitting.loop import Reporter, train
-from keyss.fitting.plain import fit_scene
+from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.learned.config import HideConfig
+from keyss.methods.base import Context, KeyedSource, Source, Stego, advising
 from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.joint import JointRun, decoder_shape
+from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
-from keyss.methods.learned.revealing import decode, is_drawn
+from keyss.methods.learned.revealing import OpenedSecret, decode, is_drawn
 from keyss.methods.learned.scramble import (
     CHANNELS,
     KEY_BYTES,
@@ -38,75 +37,31 @@ from keyss.methods.learned.scramble import (
 )
 from keyss.methods.learned.targets import PlacedScene
 
-
-@dataclass(frozen=True)
-class Hidden:
-    """What hiding gives: what is published, what the keys open, and what stays private."""
-
-    stego: Gaussians  # to be published; carries the sealed secrets in its low bits unless there is a sidecar
-    sidecar: bytes | None
-    secrets: tuple[HiddenSecret, ...]  # as they come out again with their keys
-    plains: tuple[Gaussians, ...]  # plain models of the cover and the secrets, each in its own frame
-    seconds: float  # of all training, that before a resume included
+NAME = "learned"
+SIDECAR_ADVICE = "--sidecar writes a file beside it instead"
 
 
-def hide_scenes(
-    scenes: Sequence[Scene],
-    keys: Sequence[str],
-    config: HideConfig,
-    *,
-    plains: Sequence[Gaussians | None] | None = None,
-    sidecar: bool = False,
-    encoder: Callable[[str], Tensor] | None = None,
-    device: torch.device | str = "cpu",
-    checkpoints: Path | None = None,
-    resume: bool = False,
-    reporter: Reporter | None = None,
-) -> Hidden:
-    """Hide `scenes[1:]` in `scenes[0]`, each to be opened by its key.
+def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context) -> Stego:
+    """Hide `secrets` in `cover`, each to be opened by its key; see `keyss.methods.base.Method`.
 
-    `plains`: existing plain models, None for those to be fitted. `sidecar`: the sealed secrets go into a
-    file of their own and not into the low bits of the stego model. `encoder`: from a key to the embedding
-    [64] that conditions its decoder, by default what Argon2id gives. With `checkpoints` (a folder) the state
-    of every stage is kept there, and `resume` goes on from it. Raises UsageError for keys that are equal or
-    not one per secret and for a model too small for what it has to carry, Interrupted on Ctrl-C, InputError
-    for checkpoints of another run.
+    Raises UsageError for a model too small for what it has to carry, Interrupted on Ctrl-C, and InputError
+    for a checkpoint of another run.
     """
-    if len(keys) != len(scenes) - 1 or not keys:
-        raise UsageError(f"expected one key for each of {len(scenes) - 1} secret(s), got {len(keys)}")
-    device = torch.device(device)
-    derivation = KeyDerivation(salt=training_salt(scenes[0], config.fit.seed))
+    options = training_options(options)
+    sources, keys = [cover, *(each.source for each in secrets)], [each.key for each in secrets]
+    models = [source.model.with_sh_degree(options.fit.sh_degree) for source in sources]
+    scenes = [source.scene for source in sources]
+    derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.seed))
     derived = [DerivedKey(key, derivation) for key in keys]
-    if any(a.equals(b) for a, b in combinations(derived, 2)):
-        raise UsageError("two secrets have the same key: each needs its own")
+    encoder = encoder_of(options)
     embeddings = [key.embedding() for key in derived] if encoder is None else [encoder(key) for key in keys]
-    if not sidecar:
-        check_room(_largest_payload(config), config.fit.max_gaussians, len(keys), config.fit.sh_degree)
-
-    models, seconds = [], 0.0
-    for index, (scene, given) in enumerate(zip(scenes, plains or [None] * len(scenes), strict=True)):
-        if given is not None:
-            models.append(given.with_sh_degree(config.fit.sh_degree))
-            continue
-        role = "cover" if index == 0 else "secret" if len(scenes) == 2 else f"secret {index}"
-        result = fit_scene(
-            scene,
-            config.fit,
-            device=device,
-            title=f"plain model of the {role} ({scene.name})",
-            checkpoint=checkpoints / f"plain-{index}.safetensors" if checkpoints else None,
-            resume=resume,
-            reporter=reporter,
-        )
-        models.append(result.gaussians)
-        seconds += result.seconds
 
     cover_cameras = [view.camera for view in scenes[0].train]
     frames = [Similarity.identity()]
     frames += [align([view.camera for view in scene.train], cover_cameras) for scene in scenes[1:]]
     placed = [PlacedScene.of(*parts) for parts in zip(scenes, models, frames, strict=True)]
-    run = JointRun(placed, embeddings, config, device)
-    seconds += train(
+    run = JointRun(placed, embeddings, options, context.device)
+    seconds = train(
         run,
         "hide",
         fingerprint={
@@ -116,31 +71,31 @@ def hide_scenes(
                 hashlib.sha256(key.verifier() + embedding.numpy().tobytes()).hexdigest()
                 for key, embedding in zip(derived, embeddings, strict=True)
             ],
-            "config": json.loads(json.dumps(asdict(config))),  # tuples as they are read back
-            "device": device.type,
+            "options": json.loads(json.dumps(asdict(options))),  # tuples as they are read back
+            "device": context.device.type,
         },
-        seed=config.fit.seed,
-        checkpoint=checkpoints / "joint.safetensors" if checkpoints else None,
-        resume=resume,
-        checkpoint_seconds=config.fit.checkpoint_seconds,
-        evaluate_every=config.fit.evaluate_every,
-        reporter=reporter,
+        seed=options.fit.seed,
+        checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,
+        resume=context.resume,
+        checkpoint_seconds=options.fit.checkpoint_seconds,
+        evaluate_every=options.fit.evaluate_every,
+        reporter=context.reporter,
     )
     stego = run.gaussians().to("cpu")
     decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
     if run.warm:
         stego = stego[run.drawn().cpu()]
     scrambles: list[Scramble | None] = [None] * len(keys)
-    if run.warm and not sidecar:  # a sidecar is for files that will be rounded, which no scramble survives
+    if run.warm and not options.sidecar:  # which is for files that will be rounded: no scramble survives that
         for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
-            if config.decoder == "curve":  # a network would see the difference
+            if options.decoder == "curve":  # a network would see the difference
                 stego = with_lengths_of_the_cover(stego, decoder.band)
             scramble = Scramble.of(stego, key.expand("scramble", KEY_BYTES), decoder.band)
             stego, scrambles[index] = scramble.close(stego), scramble
-    anchors = choose_anchors(stego, torch.Generator().manual_seed(config.fit.seed))
+    anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.seed))
     transparent = stego[~is_drawn(stego)]
     faint = None
-    if sidecar and len(transparent):
+    if options.sidecar and len(transparent):
         columns = [transparent.means, transparent.opacity_logits[:, None], transparent.sh[:, 0]]
         faint = torch.cat(columns, dim=1)
     hidden = [
@@ -149,19 +104,51 @@ def hide_scenes(
     ]
     counts = [int(is_drawn(decode(stego, secret, secret.embedding)).sum()) for secret in hidden]
     packed = [pack_secret(replace(secret, count=count)) for secret, count in zip(hidden, counts, strict=True)]
-    sealed = None
-    if sidecar:
-        sealed = seal_sidecar(list(zip(keys, packed, strict=True)), entropy=_discarded(run, derived))
+    payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
+    sidecar, entropy = None, _discarded(run, derived)
+    if options.sidecar:
+        sidecar = encrypt_sidecar(payloads, entropy=entropy)
     else:
-        stego = embed(stego, list(zip(keys, packed, strict=True)))
-    return Hidden(stego, sealed, tuple(map(unpack_secret, packed)), tuple(models), seconds)
+        with advising(KeyssError, SIDECAR_ADVICE):
+            stego = LOW_BITS.prepare(stego).embed(payloads, entropy=entropy)
+    opened = tuple(OpenedSecret(unpack_secret(each)) for each in packed)
+    return Stego(stego, sidecar, opened, seconds, options.fit.iterations)
 
 
-def _largest_payload(config: HideConfig) -> int:
+def training_options(options: LearnedOptions) -> LearnedOptions:
+    """`options` whose `fit` is that of the joint training."""
+    iterations = options.iterations or options.fit.iterations
+    cap = options.max_gaussians or options.fit.max_gaussians
+    return replace(options, fit=replace(options.fit, iterations=iterations, max_gaussians=cap))
+
+
+def encoder_of(options: LearnedOptions) -> Callable[[str], Tensor] | None:
+    """From a key to the embedding [64] that conditions its decoder; None: Argon2id's. Raises BackendError."""
+    if options.key_encoder == "argon2":
+        return None
+    from keyss.methods.learned.clip_keys import MODEL, ClipKeys
+
+    return ClipKeys(options.clip_model or MODEL)
+
+
+def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:
+    """Raise UsageError if what keys open will hardly fit into the model that is to be trained.
+
+    `models`: of the cover and of the secrets, those that are known. A warm start from them adds no Gaussians.
+    """
+    options = training_options(options)
+    gaussians, known = options.fit.max_gaussians, [model for model in models if model is not None]
+    if options.start == "warm" and len(known) == len(models):
+        gaussians = min(gaussians, sum(len(model) for model in known))
+    with advising(UsageError, SIDECAR_ADVICE):
+        check_payload_fits(_largest_payload(options), gaussians, len(models) - 1, options.fit.sh_degree)
+
+
+def _largest_payload(options: LearnedOptions) -> int:
     """Bytes of a secret whose decoder cannot be compressed."""
-    decoder = Decoder(decoder_shape(config))
+    decoder = Decoder(decoder_shape(options))
     scramble = None
-    if config.start == "warm":
+    if options.start == "warm":
         tables = torch.rand(2, CHANNELS, KNOTS)
         scramble = Scramble(bytes(KEY_BYTES), (0.0, 1.0), tables[0], tables[1])
     secret = HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3), scramble)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from keyss.core.colour import OPPONENT
 from keyss.core.gaussians import Gaussians
 
 KNOTS = 65
@@ -33,10 +34,6 @@ _LEAST_GAP = 2.0**-9
 # Ranks are kept this far from 0 and 1, which the turn makes neighbours: rounding must not lead from one end
 # of the secret's values to the other.
 _MARGIN = 2.0**-13
-# Log scales and colours of a Gaussian go together: large ones are large along all axes, bright ones bright in
-# all channels. Taken apart into their sum and two differences, each of which is turned by itself, what is
-# published looks like Gaussians and colours of the cover. Orthonormal.
-_APART = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3.0], [2.0], [6.0]])
 
 Table = npt.NDArray[np.float64]
 
@@ -126,17 +123,22 @@ def _inside(stego: Gaussians, band: tuple[float, float]) -> torch.Tensor:
 
 
 def _channels(part: Gaussians) -> Table:
-    """[N, CHANNELS] positions, log scales and colours taken apart, opacity logits."""
+    """[N, CHANNELS] positions, log scales and colours taken apart, opacity logits.
+
+    Log scales and colours of a Gaussian go together: large ones are large along all axes, bright ones bright
+    in all channels. Their sum and two differences are shifted each by itself, so that what is published looks
+    like Gaussians and colours of the cover.
+    """
     columns = [part.means, part.log_scales, part.sh[:, 0], part.opacity_logits[:, None]]
     values: Table = torch.cat(columns, dim=1).detach().cpu().double().numpy()
-    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ _APART.T, values[:, 6:9] @ _APART.T
+    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ OPPONENT.T, values[:, 6:9] @ OPPONENT.T
     return values
 
 
 def _together(channels: Table) -> Table:
     """The inverse of `_channels`: [N, CHANNELS] positions, log scales, colours, opacity logits."""
     values = channels.copy()
-    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ _APART, values[:, 6:9] @ _APART
+    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ OPPONENT, values[:, 6:9] @ OPPONENT
     return values
 
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.image_metrics import thin
+from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
-from keyss.methods.learned.config import HideConfig, chosen_scenes
+from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.targets import PlacedScene
-from keyss.rendering.visibility import contributions
+from keyss.rendering.contributions import contributions
 
 # Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
 # higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
@@ -36,14 +36,14 @@ class Start:
     curves: tuple[tuple[list[float], list[float]], ...] | None
 
 
-def make_start(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
+def make_start(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
     """The start for the cover (first of `scenes`) and its secrets."""
     if config.start == "points":
         return _from_points(scenes, config, generator)
     return _from_models(scenes, config)
 
 
-def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: torch.Generator) -> Start:
+def _from_points(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
     """Combined SfM points: an equal share of the cap for every scene, what one leaves goes to the others."""
     fit = config.fit
     chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
@@ -56,7 +56,7 @@ def _from_points(scenes: Sequence[PlacedScene], config: HideConfig, generator: t
     return Start(Gaussians.cat(parts), None)
 
 
-def _from_models(scenes: Sequence[PlacedScene], config: HideConfig) -> Start:
+def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Start:
     """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     # What is never drawn would lie among the hidden.
@@ -122,5 +122,5 @@ def _most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
     """The `count` Gaussians that add most to what the training views show, in their order."""
     if count >= len(plain):
         return plain
-    cameras = [view.camera for view in thin(scene.train, SELECTION_VIEWS)]
+    cameras = [view.camera for view in subsample_views(scene.train, SELECTION_VIEWS)]
     return plain[contributions(plain, cameras).topk(count).indices.sort().values]

@@ -1,8 +1,8 @@
 """How the kernels are compiled, and where the compiled code is kept.
 
 numba's cache notices a change of the file that holds a kernel, but not of the files it imports. All
-kernels here share one cache folder whose name is a hash of every source file in this package, so any
-change makes a new folder.
+kernels here share one cache folder whose name is a hash of every source file in this package, and of the
+one number that kernels have from elsewhere, so any change makes a new folder.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numba
+
+from keyss.core.gaussians import DRAWN_OPACITY
 
 _numba: Any = numba  # typed in some versions only
 
@@ -72,7 +74,7 @@ def cache_folder() -> Path | None:
 
     The first writable of: `NUMBA_CACHE_DIR`, `__pycache__` beside this file, the user's cache folder.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(repr(DRAWN_OPACITY).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
     for parent in _cache_parents():

@@ -2,10 +2,13 @@
 
 import numpy as np
 
+from keyss.core.gaussians import DRAWN_OPACITY
+
 f32 = np.float32
 
 # Conventions of 3DGS as gsplat has them (classic mode).
-ALPHA_MIN = f32(1.0 / 255.0)  # contributions below this are skipped
+ALPHA_MIN = f32(DRAWN_OPACITY)  # contributions below this are skipped
+INVERSE_ALPHA_MIN = f32(1 / DRAWN_OPACITY)
 ALPHA_MAX = f32(0.999)  # alpha is clamped to this; no gradient passes a clamped alpha
 TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave no more than this ends its pixel and is not drawn
 RADIUS_SIGMAS = f32(3.33)  # reported radii are at most this many standard deviations

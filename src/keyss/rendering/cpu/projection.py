@@ -27,6 +27,7 @@ from keyss.rendering.cpu.layout import (
     GREEN,
     HALF,
     HUGE,
+    INVERSE_ALPHA_MIN,
     ONE,
     PACKED,
     RADIUS_SIGMAS,
@@ -40,7 +41,7 @@ from keyss.rendering.cpu.layout import (
     ZERO,
     f32,
 )
-from keyss.rendering.cpu.rows import gather3, gather4, scatter3, scatter_columns
+from keyss.rendering.cpu.rows import gather1, gather3, gather4, scatter
 from keyss.rendering.cpu.shading import inverse_length, prefetch_coefficients, shade
 from keyss.rendering.cpu.simd8 import (
     absolute,
@@ -51,7 +52,6 @@ from keyss.rendering.cpu.simd8 import (
     exp,
     fetch_add,
     floor8,
-    gather8,
     log,
     maximum,
     minimum,
@@ -195,10 +195,8 @@ def project(
                 for ahead in range(k + PREFETCH, min(k + PREFETCH + 8, visible)):
                     prefetch_coefficients(colors, sh_count, at(seen, ahead))
                 red, green, blue = shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
-                scatter3(
-                    footprints, seen, k, PACKED, RED,
-                    maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO),
-                )  # fmt: skip
+                drawn = (maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO))
+                scatter(footprints, seen, k, PACKED, RED, drawn)
                 # Written so that a NaN counts, too.
                 size_of_color = absolute(red) + absolute(green) + absolute(blue)
                 if any_gt(select_gt(CHANNEL_MAX, size_of_color, ZERO, ONE), ZERO):
@@ -221,8 +219,8 @@ def _project(
     x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
     fx = camera[FX]
     fy = camera[FY]
-    opacity = gather8(opacities, ids, start)
-    px, py, pz = gather3(means, ids, start)
+    opacity = gather1(opacities, ids, start)
+    px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z = camera_coordinates(camera, px, py, pz)
     # `seen` is 1 or 0. Every test is written so that a NaN fails it.
     seen = select_ge(opacity, ALPHA_MIN, ONE, ZERO)
@@ -239,10 +237,10 @@ def _project(
     jxx = rz * fx
     jyy = rz * fy
     a0, a1, a2, b0, b1, b2 = jacobian_rows(camera, jxx, ZERO - jxx * u, jyy, ZERO - jyy * v)
-    w, i, j, k = gather4(quats, ids, start)
+    w, i, j, k = gather4(quats, ids, start, 4, 0)
     norm = inverse_length(w * w + i * i + j * j + k * k)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(w * norm, i * norm, j * norm, k * norm)
-    s0, s1, s2 = gather3(scales, ids, start)
+    s0, s1, s2 = gather3(scales, ids, start, 3, 0)
     u0 = (a0 * r00 + a1 * r10 + a2 * r20) * s0
     u1 = (a0 * r01 + a1 * r11 + a2 * r21) * s1
     u2 = (a0 * r02 + a1 * r12 + a2 * r22) * s2
@@ -265,7 +263,7 @@ def _project(
         seen = select_ge(opacity, ALPHA_MIN, seen, ZERO)
     cov_xx = cov_xx + eps2d
     cov_yy = cov_yy + eps2d
-    level = maximum(log(maximum(opacity * f32(255.0), ONE)) * TWO, ZERO)
+    level = maximum(log(maximum(opacity * INVERSE_ALPHA_MIN, ONE)) * TWO, ZERO)
     sigmas = square_root(level)
     sigma_x = square_root(cov_xx)
     sigma_y = square_root(cov_yy)
@@ -290,14 +288,10 @@ def _project(
     store8(results, 40, select_gt(seen, HALF, columns * rows, ZERO))
 
     zero = splat(ZERO)
-    scatter_columns(
-        footprints, ids, start, PACKED, 0, mean_x, mean_y,
-        cov_yy * inverse * -HALF, cov_xy * inverse, cov_xx * inverse * -HALF, level, opacity, zero,
-    )  # fmt: skip
+    conic = (cov_yy * inverse * -HALF, cov_xy * inverse, cov_xx * inverse * -HALF)
+    scatter(footprints, ids, start, PACKED, 0, (mean_x, mean_y, *conic, level, opacity, zero))
     decay = exp(ZERO - cov_xx * inverse)
-    scatter_columns(
-        footprints, ids, start, PACKED, 8, zero, zero, extent_x, extent_y, decay, zero, zero, zero
-    )
+    scatter(footprints, ids, start, PACKED, 8, (zero, zero, extent_x, extent_y, decay, zero, zero, zero))
 
 
 @inlined

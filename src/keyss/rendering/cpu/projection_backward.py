@@ -34,13 +34,12 @@ from keyss.rendering.cpu.projection import (
     rotation_matrix,
     slope_limits,
 )
-from keyss.rendering.cpu.rows import gather3, gather4, gather_columns, scatter3, scatter4
+from keyss.rendering.cpu.rows import gather1, gather3, gather4, gather8, load_transposed, scatter
 from keyss.rendering.cpu.shading import inverse_length, prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
     at,
     divide,
     fetch_add,
-    gather8,
     load8,
     maximum,
     minimum,
@@ -51,7 +50,6 @@ from keyss.rendering.cpu.simd8 import (
     splat,
     store8,
     sum_lanes,
-    transpose,
 )
 
 # What `_sum_pairs` puts where in its buffer.
@@ -98,9 +96,9 @@ def project_backward(
 
     means2d_gradient and means2d_absgrad are of this camera only. camera_gradient has one row per piece of
     work: the sums over its Gaussians for rotation (9), translation (3) and position (3). With need_colors
-    or need_camera false, colors_gradient or camera_gradient is not touched. `channels` is 0 after `blend`,
-    and the number of channels after `blend_features`: those of the colours, and one for the depth where
-    there is one more.
+    or need_camera false, colors_gradient or camera_gradient is not touched. `channels` is 0 where colours
+    were drawn from the footprints, else the number of channels: those of the colours, and one for the depth
+    where there is one more.
     """
     count = means.shape[0]
     with_depth = channels > colors.shape[2]
@@ -137,10 +135,8 @@ def project_backward(
             dy = dx
             dz = dx
             if sh_count > 0:
-                _, _, _, _, _, _, _, red = gather_columns(footprints, ids, start, PACKED, RED - RED % 8)
-                green, blue, _, _, _, _, _, _ = gather_columns(
-                    footprints, ids, start, PACKED, GREEN - GREEN % 8
-                )
+                _, _, _, _, _, _, _, red = gather8(footprints, ids, start, PACKED, RED - RED % 8)
+                green, blue, _, _, _, _, _, _ = gather8(footprints, ids, start, PACKED, GREEN - GREEN % 8)
                 # The maximum of 0.5 + basis . colors and 0 lets no gradient through where it is 0.
                 red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
                 green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
@@ -233,10 +229,7 @@ def _sum_pairs(
                 if not first_camera:
                     total += colors_gradient[i, 0, extra]
                 colors_gradient[i, 0, extra] = total
-    m0, m1, m2, m3, m4, m5, red, green = transpose(
-        load8(sums, SUMS), load8(sums, SUMS + 8), load8(sums, SUMS + 16), load8(sums, SUMS + 24),
-        load8(sums, SUMS + 32), load8(sums, SUMS + 40), load8(sums, SUMS + 48), load8(sums, SUMS + 56),
-    )  # fmt: skip
+    m0, m1, m2, m3, m4, m5, red, green = load_transposed(sums, SUMS)
     store8(sums, SUMS, m0)
     store8(sums, SUMS + 8, m1)
     store8(sums, SUMS + 16, m2)
@@ -262,15 +255,15 @@ def _gaussian_gradients(
     s_xx = load8(sums, SUMS + 24)
     s_xy = load8(sums, SUMS + 32)
     s_yy = load8(sums, SUMS + 40)
-    _, _, conic_xx, conic_xy, conic_yy, _, _, _ = gather_columns(footprints, ids, start, PACKED, 0)
+    _, _, conic_xx, conic_xy, conic_yy, _, _, _ = gather8(footprints, ids, start, PACKED, 0)
     conic_xx = conic_xx * -TWO
     conic_xy = conic_xy * -ONE
     conic_yy = conic_yy * -TWO
     mean_x = conic_xx * s_x + conic_xy * s_y
     mean_y = conic_xy * s_x + conic_yy * s_y
-    opacity_gradient = divide(s_1, gather8(opacities, ids, start))
+    opacity_gradient = divide(s_1, gather1(opacities, ids, start))
     if not first_camera:
-        opacity_gradient = opacity_gradient + gather8(opacities_gradient, ids, start)
+        opacity_gradient = opacity_gradient + gather1(opacities_gradient, ids, start)
     store8(results, 0, opacity_gradient)
     store8(results, 8, mean_x)
     store8(results, 16, mean_y)
@@ -290,7 +283,7 @@ def _gaussian_gradients(
     cov_yy = (t_10 * conic_xy + t_11 * conic_yy) * HALF
 
     # The forward projection again, up to V = J W R S.
-    px, py, pz = gather3(means, ids, start)
+    px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z = camera_coordinates(camera, px, py, pz)
     rz = divide(ONE, z)
     slope_x = x * rz
@@ -302,7 +295,7 @@ def _gaussian_gradients(
     jyy = rz * camera[FY]
     jyz = ZERO - jyy * clamped_y
     a0, a1, a2, b0, b1, b2 = jacobian_rows(camera, jxx, jxz, jyy, jyz)
-    qw, qx, qy, qz = gather4(quats, ids, start)
+    qw, qx, qy, qz = gather4(quats, ids, start, 4, 0)
     square = qw * qw + qx * qx + qy * qy + qz * qz
     norm = inverse_length(square)
     qw = qw * norm
@@ -310,7 +303,7 @@ def _gaussian_gradients(
     qy = qy * norm
     qz = qz * norm
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qw, qx, qy, qz)
-    s0, s1, s2 = gather3(scales, ids, start)
+    s0, s1, s2 = gather3(scales, ids, start, 3, 0)
     p0 = a0 * r00 + a1 * r10 + a2 * r20
     p1 = a0 * r01 + a1 * r11 + a2 * r21
     p2 = a0 * r02 + a1 * r12 + a2 * r22
@@ -428,20 +421,20 @@ def _one_where_equal(a, b):
 def _add3(array, ids, start, first_camera, x, y, z):
     """Add 3 vectors to the columns of an array [N, 3]; for the first camera, overwrite them."""
     if not first_camera:
-        old_x, old_y, old_z = gather3(array, ids, start)
+        old_x, old_y, old_z = gather3(array, ids, start, 3, 0)
         x = x + old_x
         y = y + old_y
         z = z + old_z
-    scatter3(array, ids, start, 3, 0, x, y, z)
+    scatter(array, ids, start, 3, 0, (x, y, z))
 
 
 @inlined
 def _add4(array, ids, start, first_camera, w, x, y, z):
     """`_add3` for arrays [N, 4]."""
     if not first_camera:
-        old_w, old_x, old_y, old_z = gather4(array, ids, start)
+        old_w, old_x, old_y, old_z = gather4(array, ids, start, 4, 0)
         w = w + old_w
         x = x + old_x
         y = y + old_y
         z = z + old_z
-    scatter4(array, ids, start, w, x, y, z)
+    scatter(array, ids, start, 4, 0, (w, x, y, z))

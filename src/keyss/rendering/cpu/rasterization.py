@@ -14,7 +14,7 @@ from keyss.core import BackendError
 from keyss.rendering.cpu import (
     binning,
     blending,
-    blending_features,
+    blending_backward,
     memory,
     projection,
     projection_backward,
@@ -60,7 +60,7 @@ class Settings:
 
     @property
     def feature_channels(self) -> int:
-        """Channels that are drawn by `blending_features`; 0 where `blending` does it, for RGB alone."""
+        """Channels in an array of their own; 0 where the three colours lie in the footprints."""
         return self.channels if self.with_depth or self.color_channels != 3 else 0
 
     @property
@@ -75,7 +75,7 @@ class Drawing:
 
     camera: Array  # [CAMERA]
     footprints: Array  # [N, PACKED]
-    features: Array  # [N, feature_channels] channels to draw
+    features: Array | None  # [N, feature_channels] channels to draw; None for colours in the footprints
     first_slots: Array  # [N] first slot of each Gaussian's pairs
     slot_counts: Array  # [N] how many pairs it has
     tile_starts: Array  # [tiles + 1] first list entry of each tile
@@ -332,16 +332,14 @@ def _draw(
         entry_slots,
     )
     ends = memory.empty((columns * rows,), np.int64)
-    blend = blending_features.blend_features if settings.feature_channels else blending.blend
+    own_colors = features if settings.feature_channels else None
     run(
-        blend,
+        blending.blend,
         footprints,
-        features,
+        own_colors,
         entries,
         tile_starts,
         columns,
-        width,
-        height,
         background,
         image,
         alpha,
@@ -349,7 +347,7 @@ def _draw(
         ends,
     )
     return Drawing(
-        camera, footprints, features, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
+        camera, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
     )
 
 
@@ -365,10 +363,8 @@ def _blend_backward(
     slots = len(drawing.entries)
     moments = memory.empty((slots * MOMENTS,), np.float32)
     extras = memory.empty((slots * settings.extra_width,), np.float32)
-    features = settings.feature_channels > 0
-    blend_backward = blending_features.blend_features_backward if features else blending.blend_backward
     run(
-        blend_backward,
+        blending_backward.blend_backward,
         drawing.footprints,
         drawing.features,
         drawing.entries,
@@ -376,8 +372,6 @@ def _blend_backward(
         drawing.tile_starts,
         drawing.ends,
         -(-settings.width // TILE_WIDTH),
-        settings.width,
-        settings.height,
         image,
         transmittance,
         image_gradient,

@@ -1,110 +1,124 @@
 """Rows of arrays in and out of vectors: column k of 8 rows, which may lie anywhere, becomes one vector.
 
 A row is what an array holds of one Gaussian; `ids[start:start + 8]` says which 8. One may be there several
-times; what is stored must then be the same for all of them.
+times; what is stored must then be the same for all of them. Arrays are flat: row i starts at i * stride.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
 
 from __future__ import annotations
 
-from keyss.rendering.cpu.jit import inlined
-from keyss.rendering.cpu.simd8 import (
-    at,
-    load3,
-    load4,
-    load8,
-    store3,
-    store4,
-    store8,
-    transpose,
-)
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+
+from keyss.rendering.cpu.simd8 import FLOAT, INT, VECTOR, element, float32x8, intrinsic, shuffle
 
 
-@inlined
-def gather3(array, ids, start):
-    """The columns of an array [N, 3]."""
-    x, y, z, _, _, _, _, _ = transpose(
-        load3(array, 3 * at(ids, start)),
-        load3(array, 3 * at(ids, start + 1)),
-        load3(array, 3 * at(ids, start + 2)),
-        load3(array, 3 * at(ids, start + 3)),
-        load3(array, 3 * at(ids, start + 4)),
-        load3(array, 3 * at(ids, start + 5)),
-        load3(array, 3 * at(ids, start + 6)),
-        load3(array, 3 * at(ids, start + 7)),
-    )
-    return x, y, z
+def _transposed(builder, rows):
+    """The 8 vectors whose i-th has the i-th lanes of all rows, in their order."""
+    rows = list(rows)
+    # Lanes are exchanged between rows 4, 2 and 1 apart.
+    for distance in (4, 2, 1):
+        low = [lane if not lane & distance else 8 + lane - distance for lane in range(8)]
+        high = [lane + distance if not lane & distance else 8 + lane for lane in range(8)]
+        for i in range(8):
+            if not i & distance:
+                a, b = rows[i], rows[i + distance]
+                rows[i] = shuffle(builder, a, b, low)
+                rows[i + distance] = shuffle(builder, a, b, high)
+    return rows
 
 
-@inlined
-def gather4(array, ids, start):
-    """The columns of an array [N, 4]."""
-    w, x, y, z, _, _, _, _ = transpose(
-        load4(array, 4 * at(ids, start)),
-        load4(array, 4 * at(ids, start + 1)),
-        load4(array, 4 * at(ids, start + 2)),
-        load4(array, 4 * at(ids, start + 3)),
-        load4(array, 4 * at(ids, start + 4)),
-        load4(array, 4 * at(ids, start + 5)),
-        load4(array, 4 * at(ids, start + 6)),
-        load4(array, 4 * at(ids, start + 7)),
-    )
-    return w, x, y, z
+def _addresses(context, builder, signature, arguments):
+    """Where the columns of each of the 8 rows start, for arguments (array, ids, start, stride, column)."""
+    array, ids, start, stride, column = arguments[:5]
+    first = element(context, builder, signature.args[1], ids, start)
+    for lane in range(8):
+        row = builder.load(builder.gep(first, [INT(lane)]))
+        place = builder.add(builder.mul(row, stride), column)
+        yield element(context, builder, signature.args[0], array, place)
 
 
-@inlined
-def gather_columns(array, ids, start, stride, column):
-    """Columns column:column + 8 of rows of `stride` floats."""
-    return transpose(
-        load8(array, at(ids, start) * stride + column),
-        load8(array, at(ids, start + 1) * stride + column),
-        load8(array, at(ids, start + 2) * stride + column),
-        load8(array, at(ids, start + 3) * stride + column),
-        load8(array, at(ids, start + 4) * stride + column),
-        load8(array, at(ids, start + 5) * stride + column),
-        load8(array, at(ids, start + 6) * stride + column),
-        load8(array, at(ids, start + 7) * stride + column),
-    )
+def _parts(builder, address, count):
+    """`count` floats as vectors of 8, 4, 2 and 1: (first lane, lanes, address). Nothing beyond is touched."""
+    first = 0
+    for size in (8, 4, 2, 1):
+        if count & size:
+            part = ir.VectorType(FLOAT, size)
+            yield first, size, builder.bitcast(builder.gep(address, [INT(first)]), part.as_pointer())
+            first += size
 
 
-@inlined
-def scatter3(array, ids, start, stride, column, x, y, z):
-    """Write columns column:column + 3 of rows of `stride` floats."""
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(x, y, z, x, x, x, x, x)
-    store3(array, at(ids, start) * stride + column, h0)
-    store3(array, at(ids, start + 1) * stride + column, h1)
-    store3(array, at(ids, start + 2) * stride + column, h2)
-    store3(array, at(ids, start + 3) * stride + column, h3)
-    store3(array, at(ids, start + 4) * stride + column, h4)
-    store3(array, at(ids, start + 5) * stride + column, h5)
-    store3(array, at(ids, start + 6) * stride + column, h6)
-    store3(array, at(ids, start + 7) * stride + column, h7)
+def _gathering(count):
+    @intrinsic
+    def gather(typingctx, array, ids, start, stride, column):
+        def codegen(context, builder, signature, arguments):
+            rows = []
+            for row in _addresses(context, builder, signature, arguments):
+                value = ir.Constant(VECTOR, None)
+                for first, size, address in _parts(builder, row, count):
+                    part = builder.load(address)
+                    part.align = 4
+                    wide = ir.Constant(ir.VectorType(INT, 8), [min(lane, size - 1) for lane in range(8)])
+                    lanes = [8 + lane - first if first <= lane < first + size else lane for lane in range(8)]
+                    value = shuffle(builder, value, builder.shuffle_vector(part, part, wide), lanes)
+                rows.append(value)
+            return context.make_tuple(builder, signature.return_type, _transposed(builder, rows)[:count])
+
+        return types.UniTuple(float32x8, count)(array, ids, start, types.intp, types.intp), codegen
+
+    return gather
 
 
-@inlined
-def scatter4(array, ids, start, w, x, y, z):
-    """Write the columns of an array [N, 4]."""
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(w, x, y, z, x, x, x, x)
-    store4(array, 4 * at(ids, start), h0)
-    store4(array, 4 * at(ids, start + 1), h1)
-    store4(array, 4 * at(ids, start + 2), h2)
-    store4(array, 4 * at(ids, start + 3), h3)
-    store4(array, 4 * at(ids, start + 4), h4)
-    store4(array, 4 * at(ids, start + 5), h5)
-    store4(array, 4 * at(ids, start + 6), h6)
-    store4(array, 4 * at(ids, start + 7), h7)
+# (array, ids, start, stride, column): columns column:column + count of the 8 rows, as a tuple of vectors.
+gather3 = _gathering(3)
+gather4 = _gathering(4)
+gather8 = _gathering(8)
 
 
-@inlined
-def scatter_columns(array, ids, start, stride, column, v0, v1, v2, v3, v4, v5, v6, v7):
-    """Write columns column:column + 8 of rows of `stride` floats."""
-    h0, h1, h2, h3, h4, h5, h6, h7 = transpose(v0, v1, v2, v3, v4, v5, v6, v7)
-    store8(array, at(ids, start) * stride + column, h0)
-    store8(array, at(ids, start + 1) * stride + column, h1)
-    store8(array, at(ids, start + 2) * stride + column, h2)
-    store8(array, at(ids, start + 3) * stride + column, h3)
-    store8(array, at(ids, start + 4) * stride + column, h4)
-    store8(array, at(ids, start + 5) * stride + column, h5)
-    store8(array, at(ids, start + 6) * stride + column, h6)
-    store8(array, at(ids, start + 7) * stride + column, h7)
+@intrinsic
+def gather1(typingctx, array, ids, start):
+    """The floats array[ids[start]], ... array[ids[start + 7]] as one vector."""
+
+    def codegen(context, builder, signature, arguments):
+        one, zero = (ir.Constant(ir.IntType(64), value) for value in (1, 0))
+        result = ir.Constant(VECTOR, ir.Undefined)
+        for lane, address in enumerate(_addresses(context, builder, signature, (*arguments, one, zero))):
+            result = builder.insert_element(result, builder.load(address), INT(lane))
+        return result
+
+    return float32x8(array, ids, start), codegen
+
+
+@intrinsic
+def scatter(typingctx, array, ids, start, stride, column, values):
+    """Write a tuple of vectors to as many columns, from `column` on."""
+
+    def codegen(context, builder, signature, arguments):
+        count = signature.args[5].count
+        columns = cgutils.unpack_tuple(builder, arguments[5], count)
+        rows = _transposed(builder, columns + [ir.Constant(VECTOR, ir.Undefined)] * (8 - count))
+        for value, row in zip(rows, _addresses(context, builder, signature, arguments), strict=True):
+            for first, size, address in _parts(builder, row, count):
+                lanes = ir.Constant(ir.VectorType(INT, size), list(range(first, first + size)))
+                builder.store(builder.shuffle_vector(value, value, lanes), address).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, ids, start, types.intp, types.intp, values), codegen
+
+
+@intrinsic
+def load_transposed(typingctx, array, index):
+    """The columns of the 8 x 8 floats from flat position `index`, as a tuple of vectors."""
+
+    def codegen(context, builder, signature, arguments):
+        address = element(context, builder, signature.args[0], *arguments)
+        rows = []
+        for row in range(8):
+            place = builder.gep(address, [INT(8 * row)])
+            rows.append(builder.load(builder.bitcast(place, VECTOR.as_pointer())))
+            rows[-1].align = 4
+        return context.make_tuple(builder, signature.return_type, _transposed(builder, rows))
+
+    return types.UniTuple(float32x8, 8)(array, index), codegen

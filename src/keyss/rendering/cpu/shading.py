@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from keyss.rendering.cpu.jit import inlined
 from keyss.rendering.cpu.layout import HALF, NORM_MIN, ONE, POSITION, ZERO
-from keyss.rendering.cpu.rows import gather3, gather_columns, scatter_columns
+from keyss.rendering.cpu.rows import gather3, gather8, scatter
 from keyss.rendering.cpu.sh import sh_basis, sh_direction_gradient
 from keyss.rendering.cpu.simd8 import (
     at,
@@ -25,7 +25,7 @@ from keyss.rendering.cpu.simd8 import (
 @inlined
 def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
     """Red, green and blue, not clamped, of the 8 Gaussians ids[start:]."""
-    px, py, pz = gather3(means, ids, start)
+    px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z, _ = view_directions(camera, px, py, pz)
     sh_basis(basis, sh_count, x, y, z)
     load_coefficients(colors, sh_count, ids, start, coefficients)
@@ -49,7 +49,7 @@ def shade_backward(
 
     For the first camera what was in colors_gradient is overwritten, for others added to.
     """
-    px, py, pz = gather3(means, ids, start)
+    px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z, inverse = view_directions(camera, px, py, pz)
     dx = splat(ZERO)
     dy = dx
@@ -121,7 +121,7 @@ def load_coefficients(colors, sh_count, ids, start, coefficients):
         return
     for block in range(0, used, 8):
         k = min(block, used - 8)  # the last 8 may overlap those before
-        v0, v1, v2, v3, v4, v5, v6, v7 = gather_columns(colors, ids, start, stride, k)
+        v0, v1, v2, v3, v4, v5, v6, v7 = gather8(colors, ids, start, stride, k)
         store8(coefficients, 8 * k, v0)
         store8(coefficients, 8 * k + 8, v1)
         store8(coefficients, 8 * k + 16, v2)
@@ -144,9 +144,9 @@ def store_coefficients(colors_gradient, sh_count, ids, start, coefficients):
         return
     for block in range(0, used, 8):
         k = min(block, used - 8)
-        scatter_columns(
-            colors_gradient, ids, start, stride, k,
+        values = (
             load8(coefficients, 8 * k), load8(coefficients, 8 * k + 8), load8(coefficients, 8 * k + 16),
             load8(coefficients, 8 * k + 24), load8(coefficients, 8 * k + 32), load8(coefficients, 8 * k + 40),
             load8(coefficients, 8 * k + 48), load8(coefficients, 8 * k + 56),
         )  # fmt: skip
+        scatter(colors_gradient, ids, start, stride, k, values)

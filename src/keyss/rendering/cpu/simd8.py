@@ -27,10 +27,10 @@ intrinsic: Any = (
     extending.intrinsic
 )  # what it makes is called inside kernels only, without the typing context
 
-_FLOAT = ir.FloatType()
-_INT = ir.IntType(32)
-_VECTOR = ir.VectorType(_FLOAT, 8)
-_INT_VECTOR = ir.VectorType(_INT, 8)
+FLOAT = ir.FloatType()
+INT = ir.IntType(32)
+VECTOR = ir.VectorType(FLOAT, 8)
+INT_VECTOR = ir.VectorType(INT, 8)
 _ONE, _TWO, _LN_2 = np.float32(1), np.float32(2), np.float32(np.log(2))
 _TWO_THIRDS, _TWO_FIFTHS, _TWO_SEVENTHS, _TWO_NINTHS = (np.float32(2 / n) for n in (3, 5, 7, 9))
 
@@ -48,23 +48,23 @@ float32x8 = Float32x8()
 @register_model(Float32x8)
 class _Float32x8Model(models.PrimitiveModel):
     def __init__(self, manager, numba_type):
-        super().__init__(manager, numba_type, _VECTOR)
+        super().__init__(manager, numba_type, VECTOR)
 
 
 # ---------------------------------------------------------------------------------------- building blocks
 
 
 def _constant(value):
-    return ir.Constant(_VECTOR, [float(np.float32(value))] * 8)
+    return ir.Constant(VECTOR, [float(np.float32(value))] * 8)
 
 
-def _shuffle(builder, a, b, lanes):
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, 8), lanes))
+def shuffle(builder, a, b, lanes):
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, 8), lanes))
 
 
 def _splat(builder, scalar):
-    undefined = ir.Constant(_VECTOR, ir.Undefined)
-    return _shuffle(builder, builder.insert_element(undefined, scalar, _INT(0)), undefined, [0] * 8)
+    undefined = ir.Constant(VECTOR, ir.Undefined)
+    return shuffle(builder, builder.insert_element(undefined, scalar, INT(0)), undefined, [0] * 8)
 
 
 def _operand(argument_type):
@@ -83,7 +83,7 @@ def _multiply_add(builder, a, b, c):
     return builder.fadd(builder.fmul(a, b), c)
 
 
-def _element(context, builder, array_type, array, index):
+def element(context, builder, array_type, array, index):
     return builder.gep(context.make_array(array_type)(context, builder, array).data, [index])
 
 
@@ -127,7 +127,7 @@ def load8(typingctx, array, index):
 
     def codegen(context, builder, signature, arguments):
         address = builder.bitcast(
-            _element(context, builder, signature.args[0], *arguments), _VECTOR.as_pointer()
+            element(context, builder, signature.args[0], *arguments), VECTOR.as_pointer()
         )
         value = builder.load(address)
         value.align = 4
@@ -141,75 +141,11 @@ def store8(typingctx, array, index, value):
     """Write the 8 floats from flat position `index`."""
 
     def codegen(context, builder, signature, arguments):
-        address = _element(context, builder, signature.args[0], *arguments[:2])
-        builder.store(arguments[2], builder.bitcast(address, _VECTOR.as_pointer())).align = 4
+        address = element(context, builder, signature.args[0], *arguments[:2])
+        builder.store(arguments[2], builder.bitcast(address, VECTOR.as_pointer())).align = 4
         return context.get_dummy_value()
 
     return types.void(array, index, value), codegen
-
-
-def _partial(parts):
-    """Loads and stores of the first lanes only, in parts of so many floats: nothing beyond is touched."""
-
-    def places(context, builder, signature, arguments):
-        address = _element(context, builder, signature.args[0], *arguments)
-        start = 0
-        for size in parts:
-            part = ir.VectorType(_FLOAT, size)
-            yield start, part, builder.bitcast(builder.gep(address, [_INT(start)]), part.as_pointer())
-            start += size
-
-    @intrinsic
-    def load(typingctx, array, index):
-        def codegen(context, builder, signature, arguments):
-            value = ir.Constant(_VECTOR, None)
-            for start, part, address in places(context, builder, signature, arguments):
-                loaded = builder.load(address)
-                loaded.align = 4
-                wide = [min(lane, part.count - 1) for lane in range(8)]
-                wide = builder.shuffle_vector(loaded, loaded, ir.Constant(_INT_VECTOR, wide))
-                own = range(start, start + part.count)
-                value = _shuffle(
-                    builder, value, wide, [8 + lane - start if lane in own else lane for lane in range(8)]
-                )
-            return value
-
-        return float32x8(array, index), codegen
-
-    @intrinsic
-    def store(typingctx, array, index, value):
-        def codegen(context, builder, signature, arguments):
-            value = arguments[2]
-            for start, part, address in places(context, builder, signature, arguments[:2]):
-                lanes = ir.Constant(ir.VectorType(_INT, part.count), list(range(start, start + part.count)))
-                builder.store(builder.shuffle_vector(value, value, lanes), address).align = 4
-            return context.get_dummy_value()
-
-        return types.void(array, index, value), codegen
-
-    return load, store
-
-
-load2, store2 = _partial((2,))  # the 2 floats from flat position `index`; the other lanes are 0
-load3, store3 = _partial((2, 1))
-load4, store4 = _partial((4,))
-
-
-@intrinsic
-def gather8(typingctx, array, indices, start):
-    """The floats at flat positions indices[start], ... indices[start + 7]."""
-
-    def codegen(context, builder, signature, arguments):
-        array_type, indices_type, _ = signature.args
-        result = ir.Constant(_VECTOR, ir.Undefined)
-        first = _element(context, builder, indices_type, *arguments[1:])
-        for lane in range(8):
-            index = builder.load(builder.gep(first, [_INT(lane)]))
-            value = builder.load(_element(context, builder, array_type, arguments[0], index))
-            result = builder.insert_element(result, value, _INT(lane))
-        return result
-
-    return float32x8(array, indices, start), codegen
 
 
 @intrinsic
@@ -218,12 +154,12 @@ def store_interleaved(typingctx, array, index, a, b, c):
 
     def codegen(context, builder, signature, arguments):
         a, b, c = arguments[2:]
-        wide = ir.VectorType(_INT, 16)
+        wide = ir.VectorType(INT, 16)
         ab = builder.shuffle_vector(a, b, ir.Constant(wide, list(range(16))))
         cc = builder.shuffle_vector(c, c, ir.Constant(wide, list(range(16))))
         mask = [8 * (i % 3) + i // 3 for i in range(24)]
-        value = builder.shuffle_vector(ab, cc, ir.Constant(ir.VectorType(_INT, 24), mask))
-        address = _element(context, builder, signature.args[0], *arguments[:2])
+        value = builder.shuffle_vector(ab, cc, ir.Constant(ir.VectorType(INT, 24), mask))
+        address = element(context, builder, signature.args[0], *arguments[:2])
         builder.store(value, builder.bitcast(address, value.type.as_pointer())).align = 4
         return context.get_dummy_value()
 
@@ -235,10 +171,10 @@ def load_interleaved(typingctx, array, index):
     """Read (a, b, c) as `store_interleaved` writes them."""
 
     def codegen(context, builder, signature, arguments):
-        address = _element(context, builder, signature.args[0], *arguments)
-        wide = builder.load(builder.bitcast(address, ir.VectorType(_FLOAT, 24).as_pointer()))
+        address = element(context, builder, signature.args[0], *arguments)
+        wide = builder.load(builder.bitcast(address, ir.VectorType(FLOAT, 24).as_pointer()))
         wide.align = 4
-        parts = [_shuffle(builder, wide, wide, [3 * lane + k for lane in range(8)]) for k in range(3)]
+        parts = [shuffle(builder, wide, wide, [3 * lane + k for lane in range(8)]) for k in range(3)]
         return context.make_tuple(builder, signature.return_type, parts)
 
     return types.UniTuple(float32x8, 3)(array, index), codegen
@@ -259,7 +195,7 @@ def ramp(typingctx, start):
     """(start, start + 1, ... start + 7)."""
 
     def codegen(context, builder, signature, arguments):
-        steps = ir.Constant(_VECTOR, [float(i) for i in range(8)])
+        steps = ir.Constant(VECTOR, [float(i) for i in range(8)])
         return builder.fadd(_splat(builder, arguments[0]), steps)
 
     return float32x8(types.float32), codegen
@@ -322,7 +258,7 @@ def _unary(name):
     @intrinsic
     def function(typingctx, a):
         def codegen(context, builder, signature, arguments):
-            return builder.call(_llvm_function(builder, name, _VECTOR, [_VECTOR]), arguments)
+            return builder.call(_llvm_function(builder, name, VECTOR, [VECTOR]), arguments)
 
         return float32x8(float32x8), codegen
 
@@ -340,8 +276,8 @@ def negative_abs(typingctx, a):
     """-|a|."""
 
     def codegen(context, builder, signature, arguments):
-        bits = builder.bitcast(arguments[0], _INT_VECTOR)
-        return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(1 << 31)] * 8)), _VECTOR)
+        bits = builder.bitcast(arguments[0], INT_VECTOR)
+        return builder.bitcast(builder.or_(bits, ir.Constant(INT_VECTOR, [-(1 << 31)] * 8)), VECTOR)
 
     return float32x8(float32x8), codegen
 
@@ -359,24 +295,14 @@ def any_gt(typingctx, a, b):
 
 
 @intrinsic
-def lane(typingctx, a, index):
-    """One of the 8 floats."""
-
-    def codegen(context, builder, signature, arguments):
-        return builder.extract_element(*arguments)
-
-    return types.float32(float32x8, index), codegen
-
-
-@intrinsic
 def sum_lanes(typingctx, a):
     """The sum of the 8 lanes, always taken in the same order."""
 
     def codegen(context, builder, signature, arguments):
         value = arguments[0]
         for lanes in ([4, 5, 6, 7, 0, 1, 2, 3], [2, 3, 0, 1, 6, 7, 4, 5], [1, 0, 3, 2, 5, 4, 7, 6]):
-            value = builder.fadd(value, _shuffle(builder, value, value, lanes))
-        return builder.extract_element(value, _INT(0))
+            value = builder.fadd(value, shuffle(builder, value, value, lanes))
+        return builder.extract_element(value, INT(0))
 
     return types.float32(float32x8), codegen
 
@@ -387,37 +313,17 @@ def sum_lanes_of_8(typingctx, a0, a1, a2, a3, a4, a5, a6, a7):
 
     def codegen(context, builder, signature, arguments):
         def add_neighbours(a, b):
-            even = _shuffle(builder, a, b, [0, 2, 8, 10, 4, 6, 12, 14])
-            odd = _shuffle(builder, a, b, [1, 3, 9, 11, 5, 7, 13, 15])
+            even = shuffle(builder, a, b, [0, 2, 8, 10, 4, 6, 12, 14])
+            odd = shuffle(builder, a, b, [1, 3, 9, 11, 5, 7, 13, 15])
             return builder.fadd(even, odd)
 
         pairs = [add_neighbours(arguments[i], arguments[i + 1]) for i in range(0, 8, 2)]
         low, high = add_neighbours(*pairs[:2]), add_neighbours(*pairs[2:])
-        left = _shuffle(builder, low, high, [0, 1, 2, 3, 8, 9, 10, 11])
-        right = _shuffle(builder, low, high, [4, 5, 6, 7, 12, 13, 14, 15])
+        left = shuffle(builder, low, high, [0, 1, 2, 3, 8, 9, 10, 11])
+        right = shuffle(builder, low, high, [4, 5, 6, 7, 12, 13, 14, 15])
         return builder.fadd(left, right)
 
     return float32x8(*[float32x8] * 8), codegen
-
-
-@intrinsic
-def transpose(typingctx, a0, a1, a2, a3, a4, a5, a6, a7):
-    """The 8 vectors whose i-th has the i-th lanes of all arguments, in their order."""
-
-    def codegen(context, builder, signature, arguments):
-        rows = list(arguments)
-        # Lanes are exchanged between rows 4, 2 and 1 apart.
-        for distance in (4, 2, 1):
-            low = [lane if not lane & distance else 8 + lane - distance for lane in range(8)]
-            high = [lane + distance if not lane & distance else 8 + lane for lane in range(8)]
-            for i in range(8):
-                if not i & distance:
-                    a, b = rows[i], rows[i + distance]
-                    rows[i] = _shuffle(builder, a, b, low)
-                    rows[i + distance] = _shuffle(builder, a, b, high)
-        return context.make_tuple(builder, signature.return_type, rows)
-
-    return types.UniTuple(float32x8, 8)(*[float32x8] * 8), codegen
 
 
 @intrinsic
@@ -426,12 +332,12 @@ def _exponent_and_fraction(typingctx, x):
 
     def codegen(context, builder, signature, arguments):
         def constant(value):
-            return ir.Constant(_INT_VECTOR, [value] * 8)
+            return ir.Constant(INT_VECTOR, [value] * 8)
 
-        bits = builder.bitcast(arguments[0], _INT_VECTOR)
+        bits = builder.bitcast(arguments[0], INT_VECTOR)
         exponent = builder.ashr(builder.sub(bits, constant(0x3F3504F3)), constant(23))
         fraction = builder.sub(bits, builder.shl(exponent, constant(23)))
-        values = [builder.sitofp(exponent, _VECTOR), builder.bitcast(fraction, _VECTOR)]
+        values = [builder.sitofp(exponent, VECTOR), builder.bitcast(fraction, VECTOR)]
         return context.make_tuple(builder, signature.return_type, values)
 
     return types.UniTuple(float32x8, 2)(float32x8), codegen
@@ -472,16 +378,16 @@ def _exponential(power):
         def codegen(context, builder, signature, arguments):
             (x,) = arguments
             scaled = builder.fmul(x, _constant(_LOG2_E))
-            round_to_nearest = _llvm_function(builder, "llvm.rint.v8f32", _VECTOR, [_VECTOR])
+            round_to_nearest = _llvm_function(builder, "llvm.rint.v8f32", VECTOR, [VECTOR])
             exponent = builder.call(round_to_nearest, [scaled])
             fraction = builder.fsub(scaled, exponent)
             result = _constant(_EXP2_COEFFICIENTS[-1])
             for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
                 result = _multiply_add(builder, result, fraction, _constant(coefficient))
-            steps = builder.fptosi(exponent, _INT_VECTOR)
-            steps = builder.add(steps, ir.Constant(_INT_VECTOR, [power] * 8))
-            shift = builder.shl(steps, ir.Constant(_INT_VECTOR, [23] * 8))
-            result = builder.bitcast(builder.add(builder.bitcast(result, _INT_VECTOR), shift), _VECTOR)
+            steps = builder.fptosi(exponent, INT_VECTOR)
+            steps = builder.add(steps, ir.Constant(INT_VECTOR, [power] * 8))
+            shift = builder.shl(steps, ir.Constant(INT_VECTOR, [23] * 8))
+            result = builder.bitcast(builder.add(builder.bitcast(result, INT_VECTOR), shift), VECTOR)
             return builder.select(builder.fcmp_ordered(">", x, _constant(lowest)), result, _constant(0.0))
 
         return float32x8(float32x8), codegen
@@ -501,7 +407,7 @@ def at(typingctx, array, index):
     """array.flat[index], without numba's test for negative indices."""
 
     def codegen(context, builder, signature, arguments):
-        return builder.load(_element(context, builder, signature.args[0], *arguments))
+        return builder.load(element(context, builder, signature.args[0], *arguments))
 
     return array.dtype(array, index), codegen
 
@@ -511,7 +417,7 @@ def put(typingctx, array, index, value):
     """array.flat[index] = value, without numba's test for negative indices."""
 
     def codegen(context, builder, signature, arguments):
-        builder.store(arguments[2], _element(context, builder, signature.args[0], *arguments[:2]))
+        builder.store(arguments[2], element(context, builder, signature.args[0], *arguments[:2]))
         return context.get_dummy_value()
 
     return types.void(array, index, array.dtype), codegen
@@ -522,7 +428,7 @@ def fetch_add(typingctx, array, index, value):
     """Atomically add to an integer element; returns what it was before."""
 
     def codegen(context, builder, signature, arguments):
-        address = _element(context, builder, signature.args[0], *arguments[:2])
+        address = element(context, builder, signature.args[0], *arguments[:2])
         return builder.atomic_rmw("add", address, arguments[2], "monotonic")
 
     return array.dtype(array, index, array.dtype), codegen
@@ -532,11 +438,11 @@ def _prefetch(write):
     @intrinsic
     def prefetch(typingctx, array, index):
         def codegen(context, builder, signature, arguments):
-            address = _element(context, builder, signature.args[0], *arguments)
+            address = element(context, builder, signature.args[0], *arguments)
             address = builder.bitcast(address, ir.IntType(8).as_pointer())
-            kinds = [address.type, _INT, _INT, _INT]
+            kinds = [address.type, INT, INT, INT]
             function = _llvm_function(builder, "llvm.prefetch.p0", ir.VoidType(), kinds)
-            builder.call(function, [address, _INT(write), _INT(3), _INT(1)])
+            builder.call(function, [address, INT(write), INT(3), INT(1)])
             return context.get_dummy_value()
 
         return types.void(array, index), codegen
@@ -552,7 +458,7 @@ def _rounding(name):
     @intrinsic
     def to_integer(typingctx, x):
         def codegen(context, builder, signature, arguments):
-            function = _llvm_function(builder, f"llvm.{name}.f32", _FLOAT, [_FLOAT])
+            function = _llvm_function(builder, f"llvm.{name}.f32", FLOAT, [FLOAT])
             return builder.fptosi(builder.call(function, arguments), ir.IntType(64))
 
         return types.int64(types.float32), codegen

@@ -1,4 +1,4 @@
-"""Leaving out the Gaussians that would be missed least."""
+"""Which Gaussians would be missed least."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from keyss.core.gaussians import Gaussians
 
 
 def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
-    """The `count` Gaussians of `visible_rows`."""
-    return (
-        gaussians if count >= len(gaussians) else gaussians[torch.from_numpy(visible_rows(gaussians, count))]
-    )
+    """The `count` Gaussians of `most_visible_rows`; all of them if there are no more."""
+    if count >= len(gaussians):
+        return gaussians
+    return gaussians[torch.from_numpy(most_visible_rows(gaussians, count))]
 
 
-def visible_rows(gaussians: Gaussians, count: int) -> npt.NDArray[np.int64]:
+def most_visible_rows(gaussians: Gaussians, count: int) -> npt.NDArray[np.int64]:
     """[count] the Gaussians with the largest opacity times size, in their order.
 
     Size is the square root of the cross-section, and no more than that of a typical large Gaussian: else a

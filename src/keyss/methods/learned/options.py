@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, Self
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.fitting.config import FitConfig
-from keyss.methods.learned.mask import Mask
+from keyss.methods.base import CommandLineOption, MethodOptions
+from keyss.methods.learned.mask import Mask, parse_mask
 
-Start = Literal["warm", "points"]
 Scenes = Literal["both", "cover", "secret"]  # "both": all, however many secrets there are
 
 
 @dataclass(frozen=True, kw_only=True)
-class HideConfig:
-    """The joint training of the published model and the decoder (KeySS, section 3.4)."""
+class LearnedOptions(MethodOptions):
+    """The joint training of the published model and the decoder (KeySS, section 3.4); `fit` has its rates."""
 
-    fit: FitConfig = field(default_factory=FitConfig)  # schedule, cap and rates, also of the plain models
+    # Of the joint training: those of `fit` by default, and where only models are given, what suits them
+    # (`keyss.methods.learned.sizing`).
+    iterations: int | None = None
+    max_gaussians: int | None = None
 
-    start: Start = "warm"  # from the plain models' Gaussians, or sparse points (paper)
+    start: Annotated[
+        Literal["warm", "points"],
+        CommandLineOption("Start from plain models, or from sparse points (the paper's)."),
+    ] = "warm"
     points: Scenes = "both"  # start from points: whose sparse points (combined SfM initialisation)
     poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
     densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
@@ -28,7 +33,14 @@ class HideConfig:
     # drawn from a pose of its own and compared with its photo. The paper has the first kind only.
     common_poses: float = 0.1
 
-    mask: Mask = ("op",)  # theta: the attributes that the decoder updates
+    mask: Annotated[  # theta
+        Mask,
+        CommandLineOption(
+            "Attributes that the decoder changes, some of these; more than op take a network.",
+            metavar="op,ro,sc,xyz,sh",
+            parse=parse_mask,
+        ),
+    ] = ("op",)
     decoder: Literal["curve", "network"] = "curve"  # the paper has a network
     conditioning: Literal["gate", "bias"] = "gate"  # how the key enters the decoder; bias: the paper's
     hidden: tuple[int, int] = (64, 64)  # widths of a network's common branch
@@ -38,6 +50,18 @@ class HideConfig:
     residuals: Literal["signed", "one-sided"] = "signed"  # one-sided: ReLU on all but the opacity's
     decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
     weight_decay: float = 1e-4
+    key_encoder: Annotated[
+        Literal["argon2", "clip"],
+        CommandLineOption("What conditions the decoder; the encryption is always under Argon2id's key."),
+    ] = "argon2"
+    clip_model: Annotated[
+        str | None,
+        CommandLineOption("CLIP for --key-encoder clip; without it ViT-L/14 in the cache.", metavar="FOLDER"),
+    ] = None
+    sidecar: Annotated[
+        bool,
+        CommandLineOption("Write what a key opens to decoder.sealed, not into the low bits of stego.ply."),
+    ] = False
 
     cover_weight: float = 0.5  # beta_cover
     secret_weight: float = 0.5  # beta_secret, of each secret
@@ -51,6 +75,8 @@ class HideConfig:
     prune_by: Literal["all", "cover"] = "all"  # whose opacities spare a Gaussian; cover: the authors' code
 
     def __post_init__(self) -> None:
+        if self.clip_model is not None and self.key_encoder != "clip":
+            raise UsageError("a CLIP model is for the key encoder clip (--clip-model, --key-encoder clip)")
         if self.poses != "both" and self.common_poses < 1:
             raise UsageError(
                 "poses of some scenes only: needs common_poses = 1, for all scenes are drawn from them"
@@ -70,15 +96,17 @@ class HideConfig:
                 f"mask {','.join(self.mask)} with start {self.start} needs a network"
             )
 
-    def adapted(self, mask: Mask | None = None, start: Start | None = None) -> HideConfig:
-        """The same with another mask or start, and with a network where a curve cannot do it."""
-        mask, start = mask or self.mask, start or self.start
-        curve = self.decoder == "curve" and mask == ("op",) and start == "warm"
-        return replace(self, mask=mask, start=start, decoder="curve" if curve else "network")
+    def adapted(self, **changes: Any) -> Self:
+        """The same with changed fields, and with a network where an opacity remap cannot do it."""
+        start, mask = (changes.get(name, getattr(self, name)) for name in ("start", "mask"))
+        if start != "warm" or mask != ("op",):
+            changes.setdefault("decoder", "network")
+        return replace(self, **changes)
 
-    def with_fit(self, **changes: object) -> HideConfig:
-        """The same with changed fields of `fit`."""
-        return replace(self, fit=replace(self.fit, **changes))  # type: ignore[arg-type]
+    def with_fit(self, **changes: Any) -> Self:
+        """The same with changed fields of `fit`; size and length are those of the joint training too."""
+        own = {name: changes[name] for name in ("iterations", "max_gaussians") if name in changes}
+        return replace(super().with_fit(**changes), **own)
 
 
 def chosen_scenes(which: Scenes, count: int) -> list[int]:
@@ -86,7 +114,7 @@ def chosen_scenes(which: Scenes, count: int) -> list[int]:
     return {"both": list(range(count)), "cover": [0], "secret": list(range(1, count))}[which]
 
 
-_PAPER = HideConfig(
+_PAPER = LearnedOptions(
     fit=replace(FIT_PRESETS["paper"], ssim_weight=0.5),
     start="points",
     common_poses=1.0,
@@ -102,9 +130,9 @@ _PAPER = HideConfig(
     incorrect_every=1,
 )
 
-PRESETS: dict[str, HideConfig] = {
-    "best": HideConfig(),
-    "quick": HideConfig(fit=FIT_PRESETS["quick"]),
+PRESETS: dict[str, LearnedOptions] = {
+    "best": LearnedOptions(),
+    "quick": LearnedOptions(fit=FIT_PRESETS["quick"]),
     # The paper as written, and what its authors' code does otherwise: for comparison only.
     "paper": _PAPER,
     "released": replace(

@@ -1,0 +1,144 @@
+"""How an encrypted payload is spread over cells, and how much fits.
+
+It is cut into chunks of one cell each; the chunks of a block are coded with Reed-Solomon so that the loss of
+a quarter of all Gaussians, whichever they are, leaves enough of every block. All cells of the payload's share
+of carriers are used: what it does not need becomes redundancy, and the number of cells tells nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import binom
+
+from keyss.channels.low_bits import reed_solomon
+from keyss.channels.low_bits.bits import bytes_per_gaussian
+from keyss.channels.low_bits.layout import header_carriers, part_bytes, shares
+from keyss.core.errors import InputError, UsageError
+from keyss.keys.encryption import encrypted_size
+
+REMOVAL = 0.25  # share of the Gaussians that may be removed at random
+FAILURE = 1e-7  # probability that a payload is lost all the same
+TYPICAL_SHARE = 0.75  # Gaussians whose low bits are random, of a trained model; 0.58 to 0.94 were measured
+TAG_BYTES = 6  # of a chunk's cell: one foreign cell in 2^48 fits, for a single wrong chunk spoils a payload
+NUMBER_BYTES = 3  # of a chunk
+MAX_BLOCKS = (1 << 24) // reed_solomon.MAX_CHUNKS
+
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """`blocks` codewords of `n` chunks, `k` of them data, of `chunk` bytes each. Raises ValueError."""
+
+    blocks: int
+    n: int
+    k: int
+    chunk: int
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.blocks <= MAX_BLOCKS and 1 <= self.k <= self.n <= reed_solomon.MAX_CHUNKS):
+            raise ValueError(f"impossible codewords: {self}")
+
+    @property
+    def capacity(self) -> int:
+        """Bytes of data."""
+        return self.blocks * self.k * self.chunk
+
+    def encode(self, data: bytes, cells: int) -> Bytes:
+        """[cells, NUMBER_BYTES + chunk] numbered chunks; those that are left over repeat the first ones."""
+        blocks = np.frombuffer(data.ljust(self.capacity, b"\0"), np.uint8)
+        coded = np.concatenate(
+            [reed_solomon.encode(block, self.n) for block in blocks.reshape(self.blocks, self.k, self.chunk)]
+        )
+        numbers = np.arange(cells, dtype="<u4") % len(coded)
+        return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :NUMBER_BYTES], coded[numbers]], 1)
+
+    def decode(self, chunks: Bytes, size: int) -> bytes:
+        """The first `size` bytes from numbered chunks in any order. Raises InputError if too few are left."""
+        blocks: list[dict[int, Bytes]] = [{} for _ in range(self.blocks)]
+        numbers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
+        for number, chunk in zip(numbers.tolist(), chunks[:, NUMBER_BYTES:], strict=True):
+            if number < self.blocks * self.n:
+                blocks[number // self.n][number % self.n] = chunk
+        decoded = [reed_solomon.decode(rows, self.k, self.n) for rows in blocks]
+        whole = [block for block in decoded if block is not None]
+        if len(whole) < len(decoded):
+            raise InputError(
+                f"the key is right, but too much of the model was removed: {len(decoded) - len(whole)} of "
+                f"{len(decoded)} blocks are lost"
+            )
+        return np.concatenate(whole).tobytes()[:size]
+
+
+def chunk_bytes(sh_degree: int) -> int:
+    """Bytes of payload in one cell: 0, 12, 35 and 66 at degrees 0 to 3."""
+    return max(0, bytes_per_gaussian(sh_degree) - TAG_BYTES - NUMBER_BYTES) if part_bytes(sh_degree) else 0
+
+
+def plan_spread(carriers: int, secrets: int, sh_degree: int, size: int) -> Spread | None:
+    """The most redundant way to spread `size` bytes for each of `secrets`; None if it would not be safe."""
+    chunk = chunk_bytes(sh_degree)
+    left = carriers // shares(secrets) - header_carriers(sh_degree, 0)
+    if chunk < 1 or left < 1:
+        return None
+    blocks = min(-(-left // reed_solomon.MAX_CHUNKS), MAX_BLOCKS)
+    n = min(left // blocks, reed_solomon.MAX_CHUNKS)
+    k = max(1, -(-size // (chunk * blocks)))
+    return Spread(blocks, n, k, chunk) if k <= _most_data(n, blocks) else None
+
+
+def payload_capacity(carriers: int, secrets: int = 1, sh_degree: int = 3) -> int:
+    """Bytes of encrypted payload for each of `secrets` in a model with so many carriers; may be 0."""
+    smallest = plan_spread(carriers, secrets, sh_degree, 1)
+    if smallest is None:
+        return 0
+    return smallest.blocks * _most_data(smallest.n, smallest.blocks) * smallest.chunk
+
+
+def carriers_for(size: int, secrets: int, sh_degree: int) -> int:
+    """The least number of carriers in which `size` bytes for each of `secrets` fit. `sh_degree`: 1 to 3."""
+    if chunk_bytes(sh_degree) == 0:
+        raise ValueError(f"no number of carriers will do for SH degree {sh_degree}")
+    low, high = 0, 1 << 10
+    while payload_capacity(high, secrets, sh_degree) < size:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        enough = payload_capacity(middle, secrets, sh_degree) >= size
+        low, high = (low, middle) if enough else (middle, high)
+    return high
+
+
+def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
+    """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained."""
+    size = encrypted_size(compressed)
+    if payload_capacity(int(gaussians * TYPICAL_SHARE), secrets, sh_degree) < size:
+        raise UsageError(too_small(gaussians, TYPICAL_SHARE, size, secrets, sh_degree))
+
+
+def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree: int) -> str:
+    """What to tell the owner of a model of which a share `usable` can be used."""
+    if chunk_bytes(sh_degree) == 0:
+        return "a model without spherical harmonics has no room for anything in its low bits"
+    need = carriers_for(size, secrets, sh_degree) / max(usable, 0.01)
+    digits = max(0, len(str(int(need))) - 2)
+    rounded = math.ceil(need / 10**digits) * 10**digits
+    each = "" if secrets == 1 else f" for each of {secrets} secrets"
+    return (
+        f"a model of {gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low bits; "
+        f"{rounded:,} Gaussians (--max-gaussians) would do"
+    )
+
+
+@lru_cache(maxsize=1024)
+def _most_data(n: int, blocks: int) -> int:
+    """The largest k with which all blocks survive removal with probability 1 - FAILURE; 0 if none."""
+    for k in range(n, 0, -1):
+        if binom.sf(n - k, n, REMOVAL) * blocks < FAILURE:
+            return k
+    return 0

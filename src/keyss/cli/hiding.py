@@ -1,0 +1,253 @@
+"""The commands that hide and reveal. `keyss hide` has the options of the method that is chosen.
+
+Everything heavy is imported inside the commands, so that `keyss --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from keyss.cli.arguments import (
+    Background,
+    Device,
+    Iterations,
+    KeyFiles,
+    MaxGaussians,
+    OutFolder,
+    Overwrite,
+    Resume,
+    Seed,
+    Width,
+    optional,
+    schedule,
+)
+
+if TYPE_CHECKING:
+    from keyss.methods.base import CommandLineOption, Method
+
+DEFAULT_METHOD = "learned"
+
+
+def hide(
+    *,
+    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see, or a .ply model.")],
+    secret: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        arg(metavar="SCENE", help="Scene or .ply model to hide in it; at least one."),
+    ],
+    method: str = DEFAULT_METHOD,
+    key_file: KeyFiles = (),
+    out: OutFolder,
+    preset: str = "best",
+    iterations: Iterations = None,
+    max_gaussians: MaxGaussians = None,
+    width: Width = None,
+    background: Background = None,
+    cover_model: Annotated[
+        Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
+    ] = None,
+    secret_model: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
+    ] = (),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: Seed = None,
+    **own: Any,
+) -> None:
+    """Hide secret scenes in a cover scene, each under its own key.
+
+    Every method has options of its own: see `keyss hide --method METHOD --help`.
+
+    example: keyss hide --cover SCENE_A --secret SCENE_B --key-file key.txt -o runs/hidden
+
+    example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
+    """
+    from keyss import api
+    from keyss.cli.keys import keys, warn_of_weak_keys
+    from keyss.cli.tables import print_files, print_hiding
+    from keyss.core.errors import UsageError
+    from keyss.methods import registry
+    from keyss.progress import reporter
+
+    if not secret:
+        raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
+    if secret_model and len(secret_model) != len(secret):
+        raise UsageError(
+            f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
+        )
+    chosen = registry.get(method)
+    known = _own_options(chosen)
+    changes = {
+        name: parse(value) if (parse := known[name][1].parse) else value
+        for name, value in own.items()
+        if value not in (None, False)
+    }
+    options = chosen.presets[preset].adapted(**changes)
+    options = options.with_fit(**schedule(iterations, max_gaussians, seed))
+    models = secret_model or (None,) * len(secret)
+    opening = keys(key_file, len(secret), confirm=True)
+    warn_of_weak_keys(opening)
+    result = api.hide(
+        cover,
+        [api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)],
+        method=options,
+        width=width,
+        background=background,
+        cover_model=cover_model,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
+    print_hiding(result.metrics)
+    print_files(
+        out,
+        {
+            "stego.ply": "the cover with the secret in it: this is what to publish",
+            "decoder.sealed": "what the keys open, encrypted: needed for revealing",
+            "private": "plain models of all scenes: keep them to yourself",
+            "metrics.json": "the numbers",
+            "config.json": "what ran",
+        },
+    )
+
+
+def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
+    """`hide` as it is to be parsed: with the options of the method that `arguments` choose, and no others.
+
+    Raises UsageError for an option that only another method has.
+    """
+    from keyss.core.errors import UsageError
+    from keyss.methods.registry import METHODS
+
+    given = _method_in(arguments)
+    method = METHODS[given if given in METHODS else DEFAULT_METHOD]
+    flags = {name: _flags(each) for name, each in METHODS.items()}
+    for argument in arguments:
+        flag = argument.partition("=")[0].replace("_", "-")
+        having = [name for name in METHODS if flag in flags[name]]
+        if having and method.name not in having:
+            known = ", ".join(sorted(flags[method.name])) or "none"
+            raise UsageError(
+                f"{flag} is an option of --method {' and '.join(having)}; --method {method.name} has of its "
+                f"own: {known}"
+            )
+    return _with_options_of(method)
+
+
+def _with_options_of(method: Method) -> Callable[..., None]:
+    """`hide` with a signature for tyro: what all methods take, then the options of this one."""
+    from keyss.methods.registry import METHODS
+
+    def command(**arguments: Any) -> None:
+        hide(**arguments)
+
+    summaries = "; ".join(f"{each.name}: {each.summary}" for each in METHODS.values())
+    hints = get_type_hints(hide, include_extras=True)
+    hints["method"] = Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")]
+    hints["preset"] = Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")]
+    defaults = {name: each.default for name, each in inspect.signature(hide).parameters.items()}
+    defaults |= {"method": method.name, "preset": next(iter(method.presets))}
+    for name in ("own", "return"):
+        hints.pop(name), defaults.pop(name, None)
+    for name, (kind, option) in _own_options(method).items():
+        aliases = [f"--{option.alias}"] if option.alias else None
+        if kind is bool:
+            hints[name], defaults[name] = Annotated[bool, arg(help=option.help, aliases=aliases)], False
+            continue
+        choices = "{" + ",".join(get_args(kind)) + "}" if get_origin(kind) is Literal else None
+        given = str if option.parse else kind
+        metavar = option.metavar or choices or "TEXT"
+        described = optional(metavar, option.help, "the preset's", aliases)
+        hints[name], defaults[name] = Annotated[given | None, described], None
+    command.__name__, command.__doc__, command.__annotations__ = "hide", hide.__doc__, hints
+    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=hint)
+            for name, hint in hints.items()
+        ]
+    )
+    return command
+
+
+def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
+    """Of the fields of a method's options that the command line has, types and descriptions."""
+    from keyss.methods.base import CommandLineOption
+
+    hints = get_type_hints(method.options, include_extras=True)
+    described = {each.name: get_args(hints[each.name]) for each in fields(method.options)}
+    return {
+        name: (kind, extra)
+        for name, (kind, *extras) in ((name, args) for name, args in described.items() if args)
+        for extra in extras
+        if isinstance(extra, CommandLineOption)
+    }
+
+
+def _flags(method: Method) -> set[str]:
+    """As they are typed: `--prune-to-fit`, `--thin`."""
+    options = _own_options(method).items()
+    names = [name for own, (_, option) in options for name in (own, option.alias) if name]
+    return {f"--{name.replace('_', '-')}" for name in names}
+
+
+def _method_in(arguments: Sequence[str]) -> str | None:
+    """The last value of `--method`."""
+    found = None
+    for index, argument in enumerate(arguments):
+        name, _, value = argument.partition("=")
+        if name == "--method":
+            found = value or "".join(arguments[index + 1 : index + 2])
+    return found
+
+
+def reveal(
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply.")],
+    *,
+    key_file: Annotated[
+        Path | None, optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt")
+    ] = None,
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
+    decoder: Annotated[
+        Path | None,
+        optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
+    ] = None,
+    frame: Annotated[
+        Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
+    ] = "secret",
+    decoy: Annotated[bool, arg(help="With a wrong key, write the cover instead of failing.")] = False,
+    force: Annotated[
+        bool, arg(help="For a .ply that was quantised: skip the check that the decoder belongs to it.")
+    ] = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+) -> None:
+    """Bring a secret back with its key.
+
+    example: keyss reveal runs/hidden/stego.ply --key-file key.txt -o secret.ply
+    """
+    from keyss import api
+    from keyss.cli.keys import keys
+
+    (key,) = keys((key_file,) if key_file else (), 1)
+    revealed = api.reveal(
+        stego,
+        key,
+        decoder=decoder,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
+    print(f"{out}: {len(revealed):,} Gaussians")

@@ -1,0 +1,125 @@
+"""3DGS models on disk, whatever their format: the one door through which the rest of the program goes.
+
+A new format is a module with a reader and a writer, and one entry in `FORMATS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.files.output import check_output_file
+from keyss.files.ply import read_ply, write_ply
+
+
+@dataclass(frozen=True)
+class ModelFormat:
+    """One file format of 3DGS models."""
+
+    name: str
+    suffixes: tuple[str, ...]  # in lower case and with the dot; the first is the usual one
+    magic: bytes  # the first bytes of every file
+    read: Callable[[Path], Gaussians]  # on the CPU; raises InputError
+    write: Callable[[Path, Gaussians], None]  # atomically; raises OutputError
+
+
+FORMATS = [ModelFormat("PLY", (".ply",), b"ply", read_ply, write_ply)]
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What a person asks first about a 3DGS model on disk."""
+
+    format: str
+    count: int
+    sh_degree: int  # 0 to 3
+    bytes: int  # size of the file
+    lower: tuple[float, ...]  # smallest x, y, z of the means
+    upper: tuple[float, ...]  # largest x, y, z of the means
+    faint_share: float  # share of the Gaussians with opacity below 0.05, in [0, 1]
+
+
+def is_model_path(path: Path | str) -> bool:
+    """Whether a name ends as those of model files do; the file itself is not looked at."""
+    return _by_suffix(path) is not None
+
+
+def read_model(path: Path | str) -> Gaussians:
+    """The model at `path`, on the CPU. The format is told by the first bytes.
+
+    Raises InputError for a file that is missing, of no known format, named as one of another format, or not
+    a whole and finite model.
+    """
+    path = Path(path)
+    return _by_content(path).read(path)
+
+
+def write_model(path: Path | str, model: Gaussians) -> None:
+    """Atomically write `model` in the format that the suffix of `path` names.
+
+    Raises UsageError for an unknown suffix, OutputError for a model that is empty or not finite and when the
+    system refuses.
+    """
+    _for_writing(path).write(Path(path), model)
+
+
+def check_model_output(path: Path | str, overwrite: bool) -> Path:
+    """`path`, if `write_model` may write there: see `check_output_file`, and UsageError for its suffix."""
+    path = check_output_file(path, overwrite)
+    _for_writing(path)
+    return path
+
+
+def describe_model(path: Path | str) -> ModelInfo:
+    """Read the model at `path` and sum it up. Raises InputError as `read_model` does."""
+    path = Path(path)
+    found = _by_content(path)
+    model = found.read(path)
+    return ModelInfo(
+        format=found.name,
+        count=len(model),
+        sh_degree=model.sh_degree,
+        bytes=path.stat().st_size,
+        lower=tuple(model.means.amin(0).tolist()),
+        upper=tuple(model.means.amax(0).tolist()),
+        faint_share=float((model.opacities < 0.05).float().mean()),
+    )
+
+
+def _by_suffix(path: Path | str) -> ModelFormat | None:
+    name = Path(path).name.lower()
+    return next((each for each in FORMATS if name.endswith(each.suffixes)), None)
+
+
+def _for_writing(path: Path | str) -> ModelFormat:
+    found = _by_suffix(path)
+    if found is None:
+        raise UsageError(f"cannot write a model as {path}: expected a name that ends in {_known()}")
+    return found
+
+
+def _by_content(path: Path) -> ModelFormat:
+    if not path.is_file():
+        raise InputError(f"{path}: expected a 3DGS model ({_known()}), but there is no such file")
+    try:
+        with path.open("rb") as file:
+            start = file.read(max(len(each.magic) for each in FORMATS))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    found = next((each for each in FORMATS if start.startswith(each.magic)), None)
+    named = _by_suffix(path)
+    if found is None:
+        raise InputError(f"{path}: expected a 3DGS model ({_known()}), but it begins with {start!r}")
+    if named is not None and named is not found:
+        raise InputError(
+            f"{path}: the name says {named.name}, but the content is {found.name}; "
+            f"rename it to end in {found.suffixes[0]}"
+        )
+    return found
+
+
+def _known() -> str:
+    return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)

@@ -1,0 +1,65 @@
+"""The methods there are, each entered with one line."""
+
+from __future__ import annotations
+
+from keyss.channels.base import Content
+from keyss.channels.low_bits import LowBitsReader
+from keyss.channels.sidecar import decrypt_slots, read_header
+from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.keys.derivation import DerivedKey
+from keyss.methods.base import Method, MethodOptions, Opened
+from keyss.methods.carry.method import CarryMethod
+from keyss.methods.decoy import Decoy
+from keyss.methods.learned.method import LearnedMethod
+
+METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod())}
+
+
+def get(name: str) -> Method:
+    """The method of that name. Raises UsageError."""
+    if name not in METHODS:
+        raise UsageError(f"method {name!r}: expected {' or '.join(METHODS)}")
+    return METHODS[name]
+
+
+def of_options(options: MethodOptions) -> Method:
+    """The method whose options these are. Raises UsageError."""
+    for method in METHODS.values():
+        if type(options) is method.options:
+            return method
+    known = ", ".join(method.options.__name__ for method in METHODS.values())
+    raise UsageError(f"expected options of a method ({known}), got {type(options).__name__}")
+
+
+def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, decoy: bool = False) -> Opened:
+    """What `key` opens in the low bits of `stego`, or in the bytes of a `sidecar`.
+
+    With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
+    wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
+    """
+    if sidecar is not None:
+        derived = DerivedKey(key, read_header(sidecar)[0])
+        try:
+            return _unpacked(decrypt_slots(sidecar, derived))
+        except WrongKeyError:
+            if not decoy:
+                raise
+            return Decoy.of(stego, derived)
+    reader = LowBitsReader.of(stego)
+    for derived in reader.keys(key, 1) if decoy else reader.keys(key):
+        try:
+            return _unpacked(reader.extract(derived))
+        except WrongKeyError:
+            if decoy:
+                return Decoy.of(stego, derived)
+    raise WrongKeyError("this key opens nothing here")
+
+
+def _unpacked(content: Content) -> Opened:
+    if content.method not in METHODS:
+        raise InputError(
+            f"what the key opens was hidden by the method {content.method!r}; this program has "
+            f"{', '.join(METHODS)}"
+        )
+    return METHODS[content.method].unpack(content)

@@ -1,0 +1,40 @@
+"""`metrics.json`: what a run came to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from keyss._version import __version__
+from keyss.fitting.image_metrics import ImageQuality
+from keyss.measure.hiding import HidingQuality
+
+
+@dataclass(frozen=True, kw_only=True)
+class HideMetrics(HidingQuality):
+    """A hiding, whatever its method: PSNRs in dB and SSIMs on test photos, through the written files."""
+
+    version: int = 1
+    keyss: str = __version__  # the program that wrote it
+    method: str
+    gaussians: int  # of the published model
+    secret_gaussians: tuple[int, ...]  # of the revealed secrets
+    iterations: int  # of the method's own training, 0 without one
+    seconds: float  # of hiding, without fitting plain models and measuring
+    width: int  # pixels of the cover's photos
+    seed: int
+    details: Mapping[str, Any] = field(default_factory=dict)  # numbers of the method's own
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitMetrics(ImageQuality):
+    """A plain model on the test photos."""
+
+    version: int = 1
+    keyss: str = __version__
+    gaussians: int
+    iterations: int
+    seconds: float
+    width: int  # pixels of the photos
+    seed: int

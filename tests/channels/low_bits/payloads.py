@@ -1,0 +1,39 @@
+"""Payloads below the level of keys: into a model's low bits, and out again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from keyss.channels.base import Payload
+from keyss.channels.low_bits import LOW_BITS, LowBitsReader
+from keyss.core import Gaussians
+from keyss.keys import DerivedKey
+
+
+def embed(model: Gaussians, secrets: Sequence[tuple[str, bytes]], entropy: bytes | None = None) -> Gaussians:
+    contents = [(key, Payload("test", data)) for key, data in secrets]
+    return LOW_BITS.prepare(model).embed(contents, entropy=entropy)
+
+
+def embed_derived(
+    model: Gaussians,
+    secrets: Sequence[tuple[Sequence[DerivedKey], bytes]],
+    entropy: bytes | None = None,
+) -> Gaussians:
+    contents = [(keys, Payload("test", data)) for keys, data in secrets]
+    return LOW_BITS.prepare(model).embed_derived(contents, entropy=entropy)
+
+
+def extract(stego: Gaussians, key: str) -> bytes:
+    return _data(LOW_BITS.extract(stego, key))
+
+
+def extract_derived(stego: Gaussians | LowBitsReader, key: DerivedKey) -> bytes:
+    reader = LowBitsReader.of(stego) if isinstance(stego, Gaussians) else stego
+    return _data(reader.extract(key))
+
+
+def _data(content: object) -> bytes:
+    assert isinstance(content, Payload)
+    assert content.method == "test"
+    return content.data

@@ -1,0 +1,66 @@
+"""Known answers: files that were written once open ever after, and damaged ones fail for the reason named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from keyss.channels.base import Records
+from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.sidecar import decrypt_sidecar
+from keyss.core import Gaussians, InputError, KeyssError, WrongKeyError
+from keyss.files.ply import read_ply
+
+FOLDER = Path(__file__).parents[1] / "vectors"
+SIDECAR = json.loads((FOLDER / "sidecar.json").read_text())
+CARRIED = json.loads((FOLDER / "carried.json").read_text())
+SEALED = (FOLDER / "sidecar.sealed").read_bytes()
+
+
+def test_a_sidecar_opens() -> None:
+    opened = decrypt_sidecar(SEALED, SIDECAR["key"])
+    assert (opened.method, opened.data.hex()) == (SIDECAR["method"], SIDECAR["payload"])
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "words"),
+    [
+        (b"", InputError, "not a sidecar"),
+        (b"PK" + SEALED[2:], InputError, "not a sidecar"),
+        (SEALED[:8] + b"\x02" + SEALED[9:], InputError, "version 2; this program reads version 1"),
+        (SEALED[:-1], InputError, "not a whole"),
+        (SEALED + b"\0", InputError, "not a whole"),
+        (SEALED[:9] + bytes(16) + SEALED[25:], WrongKeyError, "opens nothing"),
+    ],
+)
+def test_sidecars_that_must_fail(data: bytes, error: type[KeyssError], words: str) -> None:
+    with pytest.raises(error, match=words):
+        decrypt_sidecar(data, SIDECAR["key"])
+
+
+def _moved(stego: Gaussians) -> Gaussians:
+    return replace(stego, means=stego.means + 0.01)
+
+
+def _quantised(stego: Gaussians) -> Gaussians:
+    return stego.map(lambda values: values.half().float())
+
+
+@pytest.mark.parametrize("change", [_moved, _quantised, lambda stego: stego.with_sh_degree(2)])
+def test_stego_models_that_must_fail(change: Callable[[Gaussians], Gaussians]) -> None:
+    with pytest.raises(WrongKeyError, match="opens nothing"):
+        LOW_BITS.extract(change(read_ply(FOLDER / "carried.ply")), CARRIED["key"])
+
+
+def test_what_is_left_of_a_stego_model_comes_out() -> None:
+    stego = read_ply(FOLDER / "carried.ply")
+    order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(0))
+    content = LOW_BITS.extract(stego[order[:360]], CARRIED["key"])
+    assert isinstance(content, Records)
+    assert content.method == "carry"
+    assert 4 <= len(content.records) <= CARRIED["count"]

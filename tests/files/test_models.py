@@ -1,0 +1,109 @@
+"""The one door for models: which format is chosen, and that a format is one entry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from keyss.core import Gaussians, InputError, OutputError, UsageError
+from keyss.files import models, read_model, write_model
+from keyss.files.models import ModelFormat, check_model_output, describe_model, is_model_path
+from tiny_scenes import random_gaussians
+
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def write_toy(path: Path, model: Gaussians) -> None:
+    save_file({name: getattr(model, name).contiguous() for name in FIELDS}, path)
+    path.write_bytes(b"TOY!" + path.read_bytes())
+
+
+def read_toy(path: Path) -> Gaussians:
+    bare = path.with_name("bare")
+    bare.write_bytes(path.read_bytes().removeprefix(b"TOY!"))
+    return Gaussians(**load_file(bare))
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second format, entered as a new one would be: by one more item of the list."""
+    entry = ModelFormat("toy", (".toy", ".toy.bin"), b"TOY!", read_toy, write_toy)
+    monkeypatch.setattr(models, "FORMATS", [*models.FORMATS, entry])
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
+
+
+def test_a_new_format_is_read_written_and_described(toy: None, tmp_path: Path) -> None:
+    model = random_gaussians(9, sh_degree=2)
+    for name, kind in (("a.toy", "toy"), ("b.TOY.bin", "toy"), ("c.ply", "PLY"), ("d.Ply", "PLY")):
+        path = tmp_path / name
+        assert is_model_path(path)
+        write_model(path, model)
+        assert path.read_bytes().startswith(b"TOY!" if kind == "toy" else b"ply\n")
+        assert same(read_model(path), model)
+        assert describe_model(path).format == kind
+
+
+def test_the_content_decides_where_the_name_says_nothing(toy: None, tmp_path: Path) -> None:
+    model = random_gaussians(5)
+    for suffix in (".ply", ".toy"):
+        write_model(tmp_path / f"a{suffix}", model)
+        renamed = (tmp_path / f"a{suffix}").rename(tmp_path / "download")
+        assert not is_model_path(renamed)
+        assert same(read_model(renamed), model)
+
+
+def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
+    write_model(tmp_path / "a.toy", random_gaussians(5))
+    path = (tmp_path / "a.toy").rename(tmp_path / "a.ply")
+    for read in (read_model, describe_model):
+        with pytest.raises(
+            InputError, match=r"a\.ply: the name says PLY, but the content is toy; .* end in \.toy"
+        ):
+            read(path)
+
+
+@pytest.mark.parametrize("data", [b"", b"pl", b"\x89PNG\r\n\x1a\n"])
+def test_unknown_content_is_told_what_is_supported(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(InputError, match=r"expected a 3DGS model \(\.ply\), but it begins with b"):
+        read_model(tmp_path / "a.ply")
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing.ply"):
+        with pytest.raises(InputError, match=r"expected a 3DGS model \(\.ply\), but there is no such file"):
+            read_model(path)
+
+
+@pytest.mark.parametrize("name", ["a.splat", "a", "ply", "a.ply.txt"])
+def test_unknown_names_are_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    assert not is_model_path(name)
+    for write in (lambda path: write_model(path, random_gaussians(5)), lambda p: check_model_output(p, True)):
+        with pytest.raises(UsageError, match=rf"{name}: expected a name that ends in \.ply$"):
+            write(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_outputs_are_not_overwritten_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    assert check_model_output(path, False) == path
+    path.touch()
+    with pytest.raises(OutputError, match="exists"):
+        check_model_output(path, False)
+    assert check_model_output(str(path), True) == path
+
+
+def test_describes(tmp_path: Path) -> None:
+    model, path = random_gaussians(50, sh_degree=1), tmp_path / "a.ply"
+    write_model(path, model)
+    info = describe_model(path)
+    assert (info.count, info.sh_degree, info.bytes) == (50, 1, path.stat().st_size)
+    assert info.lower == tuple(model.means.amin(0).tolist())
+    assert info.upper == tuple(model.means.amax(0).tolist())
+    assert info.faint_share == pytest.approx(float((model.opacities < 0.05).float().mean()))

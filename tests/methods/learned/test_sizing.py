@@ -1,0 +1,38 @@
+"""Models take the place of photos: room for all of their Gaussians, and both come out as they went in."""
+
+from __future__ import annotations
+
+from keyss.fitting.image_metrics import mean_psnr
+from keyss.methods.base import SceneInput
+from keyss.methods.learned.options import LearnedOptions
+from keyss.methods.learned.revealing import reveal_gaussians
+from keyss.methods.learned.sizing import sized
+from keyss.rendering.orbit import scene_of_model
+from methods.learned.hiding import hide_scenes, open_secret
+from tiny_scenes import random_gaussians
+
+SIZE = 48
+
+
+def test_one_model_hides_in_another_without_photos() -> None:
+    models = [random_gaussians(1200, seed=0), random_gaussians(700, seed=1)]
+    scenes = [scene_of_model(model, "m", size=SIZE) for model in models]
+    config = sized(LearnedOptions(), [SceneInput(model, photos=False) for model in models])
+    assert (config.fit.max_gaussians, config.fit.iterations, config.fit.sh_degree) == (1900, 400, 3)
+    hidden = hide_scenes(scenes, ["key"], config.with_fit(iterations=30, evaluate_every=0), plains=models)
+    revealed = reveal_gaussians(hidden.stego, open_secret(hidden.stego, "key"))
+    assert mean_psnr(hidden.stego, scenes[0].test, scenes[0].background) > 40
+    assert mean_psnr(revealed, scenes[1].test, scenes[1].background) > 40
+
+
+def test_what_is_asked_for_is_kept() -> None:
+    models = [random_gaussians(120, sh_degree=0), random_gaussians(70, sh_degree=0)]
+    inputs = [SceneInput(model, photos=False) for model in models]
+    assert sized(LearnedOptions(), inputs).fit.sh_degree == 1
+    asked = LearnedOptions().with_fit(iterations=900, max_gaussians=500)
+    found = sized(asked, inputs)
+    assert (found.fit.iterations, found.fit.max_gaussians) == (900, 500)
+    too_few = LearnedOptions().with_fit(max_gaussians=189)
+    assert sized(too_few, inputs) == too_few  # something has to be left out: a training like any other
+    assert sized(asked, [inputs[0], SceneInput(models[1], photos=True)]) == asked
+    assert sized(asked, [inputs[0], SceneInput(None, photos=True)]) == asked

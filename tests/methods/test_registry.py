@@ -1,0 +1,200 @@
+"""A method is a folder and a line in the registry: one that nobody knows does all that the others do."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+import torch
+
+import keyss
+from channels.low_bits.trained_like import trained_like
+from keyss import Gaussians, Secret
+from keyss.channels.base import Content, Payload
+from keyss.channels.low_bits import LOW_BITS
+from keyss.cli import main
+from keyss.core import InputError, UsageError, WrongKeyError
+from keyss.methods import registry
+from keyss.methods.base import (
+    Capabilities,
+    CommandLineOption,
+    Context,
+    Frame,
+    KeyedSource,
+    MethodOptions,
+    SceneInput,
+    Source,
+    Stego,
+)
+from methods.learned.hiding import some_secret
+from tiny_scenes import random_gaussians
+
+KEY = "a key of many characters: 93hXmQ2"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WholeOptions(MethodOptions):
+    """Of the method below."""
+
+    most: Annotated[int, CommandLineOption("Gaussians of a secret at most.", metavar="N", alias="limit")] = (
+        100
+    )
+
+
+@dataclass(frozen=True)
+class OpenedWhole:
+    """A secret that was embedded as it is."""
+
+    model: Gaussians
+    frame: None = None
+    decode: None = None
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        return self.model
+
+    def fingerprint(self) -> str:
+        return f"{len(self.model):016x}"
+
+
+class WholeMethod:
+    """Embeds the secret's floats as they are."""
+
+    name = "whole"
+    summary = "embed the floats themselves"
+    capabilities = Capabilities(
+        trains=False,
+        decoder=False,
+        standard_file=True,
+        most_secrets=1,
+        sidecar=False,
+        recommended_for="tests",
+    )
+    options = WholeOptions
+    presets: Mapping[str, WholeOptions] = {"small": WholeOptions(), "large": WholeOptions(most=1000)}
+
+    def prepare(self, inputs: Sequence[SceneInput], options: WholeOptions) -> WholeOptions:
+        model = inputs[1].model
+        if model is not None and len(model) > options.most:
+            raise UsageError(f"expected at most {options.most} Gaussians, got {len(model)}")
+        return options
+
+    def hide(
+        self, cover: Source, secrets: Sequence[KeyedSource], options: WholeOptions, context: Context
+    ) -> Stego:
+        (secret,) = secrets
+        model = secret.source.model
+        columns = [getattr(model, each.name) for each in fields(Gaussians)]
+        rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
+        payload = Payload("whole", rows.numpy().tobytes())
+        stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])
+        return Stego(stego, None, (self.unpack(payload),), 0.0, details={"floats": rows.numel()})
+
+    def unpack(self, content: Content) -> OpenedWhole:
+        assert isinstance(content, Payload)
+        rows = torch.from_numpy(np.frombuffer(content.data, np.float32).reshape(-1, 14).copy())
+        means, quats, scales, logits, sh = rows.split((3, 4, 3, 1, 3), dim=1)
+        return OpenedWhole(Gaussians(means, quats, scales, logits[:, 0], sh[:, None]))
+
+    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
+        return {}
+
+
+@pytest.fixture(autouse=True)
+def entered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registry.METHODS, "whole", WholeMethod())
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> tuple[Path, Path]:
+    cover, secret = tmp_path / "cover.ply", tmp_path / "secret.ply"
+    keyss.write_model(cover, trained_like(2500))
+    keyss.write_model(secret, random_gaussians(60, sh_degree=0))
+    return cover, secret
+
+
+def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
+    cover, secret = models
+    result = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run")
+    assert result.metrics.method == "whole"
+    (secret_quality,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
+    assert plain is not None
+    assert secret_quality.psnr == pytest.approx(plain.psnr, abs=1e-3)
+    assert result.metrics.details == {"floats": 60 * 14}
+    assert keyss.evaluate(tmp_path / "run", [KEY]) == result.metrics
+    revealed = keyss.reveal(tmp_path / "run" / "stego.ply", KEY)
+    assert torch.equal(revealed.means, random_gaussians(60, sh_degree=0).means)
+    with pytest.raises(WrongKeyError):
+        keyss.reveal(result.stego, "wrong")
+    with pytest.raises(UsageError, match="at most 10"):
+        keyss.hide(cover, [Secret(secret, KEY)], method=WholeOptions(most=10))
+    with pytest.raises(UsageError, match="1 to 1 secrets"):
+        keyss.hide(cover, [Secret(secret, KEY), Secret(secret, "other")], method="whole")
+
+
+def test_from_the_command_line(
+    models: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    monkeypatch.setenv("KEYSS_KEY", KEY)
+    monkeypatch.setenv("COLUMNS", "160")
+    with pytest.raises(SystemExit):
+        main(["hide", "--method", "whole", "--help"])
+    said = capsys.readouterr().out
+    assert "--limit N" in said
+    assert "--most N" in said
+    assert "{small,large}" in said
+    assert "whole: embed the floats themselves" in said
+    hide = ["hide", "--method", "whole", "--cover", str(models[0]), "--secret", str(models[1])]
+    run = str(tmp_path / "run")
+    assert main([*hide, "--width", "24", "--limit", "59", "-o", run]) == 2
+    assert "expected at most 59" in capsys.readouterr().err
+    assert main([*hide, "--width", "24", "--limit", "60", "-o", run]) == 0
+    assert "floats: 840" in capsys.readouterr().out
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["method"], config["options"]["most"]) == ("whole", 60)
+    assert main(["evaluate", run]) == 0
+    assert main(["reveal", f"{run}/stego.ply", "-o", str(tmp_path / "revealed.ply")]) == 0
+    assert main(["info", run]) == 0
+    assert "whole" in capsys.readouterr().out
+
+
+def test_a_method_that_this_program_does_not_have_is_named(
+    models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cover, secret = models
+    stego = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run").stego
+    monkeypatch.delitem(registry.METHODS, "whole")
+    with pytest.raises(InputError, match="'whole'"):
+        keyss.reveal(stego, KEY)
+    with pytest.raises(InputError, match="'whole'"):
+        keyss.evaluate(tmp_path / "run", [KEY])
+    with pytest.raises(UsageError, match="learned or carry"):
+        keyss.hide(cover, [Secret(secret, KEY)], method="whole")
+    with pytest.raises(UsageError, match="WholeOptions"):
+        keyss.hide(cover, [Secret(secret, KEY)], method=WholeOptions())
+
+
+@pytest.mark.parametrize("own", ["learned", "carry"])
+def test_what_lies_in_a_model_tells_its_method(own: str) -> None:
+    """One reading of the low bits serves all methods."""
+    from keyss.methods.carry.carrying import encode_all
+    from keyss.methods.learned.payload import pack_secret
+
+    prepared = LOW_BITS.prepare(trained_like(2500))
+    content: dict[str, Callable[[], Any]] = {
+        "learned": lambda: Payload("learned", pack_secret(some_secret(prepared.cover))),
+        "carry": lambda: encode_all(prepared, [trained_like(100, 1)])[0],
+    }
+    stego = prepared.embed([(KEY, content[own]())])
+    opened = registry.open_model(stego, KEY)
+    assert type(opened).__module__.startswith(f"keyss.methods.{own}")
+    assert 0 < len(opened.reveal(stego)) <= 2500
