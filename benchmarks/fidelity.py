@@ -23,6 +23,7 @@ import msgspec
 import torch
 
 import keyss
+from benchmark_record import make_record, write_record
 from keyss.core import Scene, WrongKeyError
 from keyss.core.alignment import align
 from keyss.core.similarity import Similarity
@@ -257,6 +258,20 @@ def sooner(results: Sequence[dict[str, Any]]) -> str:
     return "".join(lines)
 
 
+def numbers_and_ratios(results: Iterable[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
+    """What the record of the benchmark keeps: decibels, seconds, and the cost of a step."""
+    numbers, ratios = {}, {}
+    for result in results:
+        name = f"{', '.join(result['names'])}, {result['preset']}, seed {result['seed']}"
+        metrics = result["metrics"]
+        numbers[f"{name}: cover, dB"] = metrics["cover"]["psnr"]
+        for index, each in enumerate(metrics["secrets"], 1):
+            numbers[f"{name}: secret {index}, dB"] = each["psnr"]
+        numbers[f"{name}: hiding, s"] = metrics["seconds"]
+        ratios[f"{name}: step / plain step"] = result["cost"]
+    return numbers, ratios
+
+
 def write_between_marks(path: Path, text: str) -> None:
     """Replace what stands between the marks in a document."""
     document = path.read_text()
@@ -294,6 +309,7 @@ def main() -> None:
     if later := sooner(results):
         text += f"\n{later}"
     print(text)
+    print(write_record(make_record("fidelity", *numbers_and_ratios(results))))
     if settings.write is not None:
         write_between_marks(settings.write, text)
 

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
+from benchmark_record import make_record, numbers_of_table, processor_name, write_record
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
 from keyss.files.atomic import write_bytes
@@ -52,9 +53,9 @@ class Case:
     def scene(self) -> tuple[Gaussians, Camera]:
         if self.file is not None:
             gaussians = read_model(self.file)
-            return gaussians, _camera_before(gaussians.means, self.width, self.height)
+            return gaussians, camera_before(gaussians.means, self.width, self.height)
         gaussians = made_up(self.count)
-        return gaussians, _camera_before(gaussians.means, self.width, self.height)
+        return gaussians, camera_before(gaussians.means, self.width, self.height)
 
 
 CASES = (
@@ -80,7 +81,7 @@ def made_up(count: int) -> Gaussians:
     )
 
 
-def _camera_before(means: Tensor, width: int, height: int) -> Camera:
+def camera_before(means: Tensor, width: int, height: int) -> Camera:
     """A camera that sees most of the Gaussians: four spreads before their middle."""
     middle = means.median(0).values
     spread = (means - middle).abs().median(0).values.max() / 0.6745
@@ -94,7 +95,7 @@ def _camera_before(means: Tensor, width: int, height: int) -> Camera:
 def load_kernels() -> None:
     """Draw a few Gaussians, forward and backward."""
     gaussians = made_up(10).map(lambda tensor: tensor.requires_grad_())
-    render(gaussians, _camera_before(gaussians.means.detach(), 8, 8)).sum().backward()
+    render(gaussians, camera_before(gaussians.means.detach(), 8, 8)).sum().backward()
 
 
 class Times:
@@ -218,7 +219,7 @@ def measure_against_torch(threads: int, repeats: int) -> list[str]:
     torch.set_num_threads(threads)
     count, width, height = 1000, 64, 48
     gaussians = made_up(count)
-    camera = _camera_before(gaussians.means, width, height)
+    camera = camera_before(gaussians.means, width, height)
     weights = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(1))
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     leaves = [tensor.detach().requires_grad_() for tensor in tensors]
@@ -271,15 +272,6 @@ def table(titles: list[str], rows: list[list[str]]) -> str:
     return "\n".join(lines)
 
 
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--large", action="store_true", help="1M Gaussians at 1600x1066 too")
@@ -305,28 +297,33 @@ def main() -> None:
 
     n = options.repeats
     pairs = [(case, threads) for case in cases for threads in options.threads]
-    parts = [
-        f"{_processor()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
-        f"{torch.__version__}. Milliseconds of wall time: the smallest of {n} repeats, and in brackets the "
-        "median.",
-        table(
+    tables = [
+        (
             ["scene, SH 3", "threads", "forward only", "forward", "backward", "M pairs blended",
              "G pairs/s forward only", "G pairs/s both", "arithmetic floor of forward only", "peak MiB"],
             [alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
         ),
-        table(
+        (
             ["training step", "threads", "rasterizer alone", "render", "loss", "backward", "optimiser",
              "step", "step / rasterizer"],
             [alone(measure_step, case, threads, n) for case, threads in pairs],
         ),
-        table(
+        (
             ["plain torch", "threads", "its forward", "its backward", "our forward", "our backward",
              "forward, times faster", "backward, times faster"],
             [alone(measure_against_torch, threads, n) for threads in options.threads],
         ),
     ]  # fmt: skip
-    text = "\n\n".join(parts)
+    heading = (
+        f"{processor_name()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
+        f"{torch.__version__}. Milliseconds of wall time: the smallest of {n} repeats, and in brackets the "
+        "median."
+    )
+    text = "\n\n".join([heading, *(table(titles, rows) for titles, rows in tables)])
     print(text)
+    numbers = {name: value for each in tables for name, value in numbers_of_table(*each).items()}
+    ratios = {name: value for name, value in numbers.items() if name.endswith("step / rasterizer")}
+    print(write_record(make_record("rasterizer", numbers, ratios)))
     if options.write is not None:
         page = options.write.read_text()
         if START not in page or END not in page:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
+from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 
 @pytest.fixture(scope="session")

@@ -550,7 +550,14 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "file exists": (
         5,
         "--overwrite",
-        lambda f: ["reveal", f / "hidden/stego.ply", "--key-file", f / "key.txt", "-o", f / "hidden/stego.ply"],
+        lambda f: [
+            "reveal",
+            f / "hidden/stego.ply",
+            "--key-file",
+            f / "key.txt",
+            "-o",
+            f / "hidden/stego.ply",
+        ],
     ),
     "folder of the file missing": (
         5,

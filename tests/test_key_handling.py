@@ -14,7 +14,8 @@ from typing import get_args, get_type_hints
 import pytest
 
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.channels.sidecar import seal_sidecar, unseal_sidecar
+from keyss.channels.base import Payload
+from keyss.channels.sidecar import decrypt_sidecar, encrypt_sidecar
 from keyss.cli import commands, main
 from keyss.cli.hiding import hide_with_options
 from keyss.core.errors import KeyssError
@@ -105,5 +106,5 @@ def test_errors_and_representations_do_not_show_the_key() -> None:
     assert KEY not in repr(derived)
     assert derived.expand("seal", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
-        unseal_sidecar(seal_sidecar([("another", b"x")]), KEY)
+        decrypt_sidecar(encrypt_sidecar([("another", Payload("test", b"x"))]), KEY)
     assert not _spelt(str(caught.value).encode())

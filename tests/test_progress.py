@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from keyss.progress import LiveLine, PlainLines, clock, reporter
+from keyss.progress import ProgressLines, clock, reporter
 
 
 class Timer:
@@ -34,8 +34,8 @@ def text(of: Console) -> str:
 
 
 def test_the_stream_decides() -> None:
-    assert isinstance(reporter(console(True)), LiveLine)
-    assert isinstance(reporter(console(False)), PlainLines)
+    assert reporter(console(True)).live
+    assert not reporter(console(False)).live
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_clock(seconds: float, shown: str) -> None:
 
 def test_plain_lines_come_now_and_then(timer: Timer) -> None:
     log = console(False)
-    lines = PlainLines(log, 10.0, timer)
+    lines = ProgressLines(log, timer=timer)
     lines.start("hide", 300, 0)
     for iteration in range(1, 101):
         timer.now += 0.25
@@ -64,7 +64,7 @@ def test_plain_lines_come_now_and_then(timer: Timer) -> None:
 
 def test_plain_lines_of_a_resumed_run(timer: Timer) -> None:
     log = console(False)
-    lines = PlainLines(log, 10.0, timer)
+    lines = ProgressLines(log, timer=timer)
     lines.start("fit [x]", 300, 200)
     for iteration in (201, 300):
         timer.now += 9.9
@@ -79,7 +79,7 @@ def test_plain_lines_of_a_resumed_run(timer: Timer) -> None:
 
 def test_the_time_left_is_of_the_recent_speed(timer: Timer) -> None:
     log = console(False)
-    lines = PlainLines(log, 0.0, timer)
+    lines = ProgressLines(log, 0.0, timer)
     lines.start("fit", 1000, 0)
     for iteration, seconds in [(1, 100.0), *((i, 0.5) for i in range(2, 101))]:
         timer.now += seconds
@@ -89,7 +89,7 @@ def test_the_time_left_is_of_the_recent_speed(timer: Timer) -> None:
 
 def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> None:
     screen = console(True)
-    line = LiveLine(screen, timer)
+    line = ProgressLines(screen, timer=timer)
     line.start("hide", 300, 0)
     for iteration in range(1, 301):
         timer.now += 0.1
@@ -100,3 +100,16 @@ def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> 
     assert "150/300 10.0 it/s, 0:15 left, 12,345 Gaussians, PSNR cover 25.13" in shown
     assert shown.count("12,345") < 150
     assert "300/300 in 0:30, 12,345 Gaussians, PSNR cover 25.13" in shown
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_it_may_be_used_again(timer: Timer, terminal: bool) -> None:
+    """As for the models of several scenes in turn."""
+    screen = console(terminal)
+    lines = ProgressLines(screen, timer=timer)
+    for title in ("cover", "secret"):
+        lines.start(title, 2, 0)
+        timer.now += 1
+        lines.update(2, 0, {})
+        lines.finish()
+    assert [text(screen).count(title) > 1 for title in ("cover", "secret")] == [True, True]

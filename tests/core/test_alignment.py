@@ -44,7 +44,7 @@ def ring(seed: int, turn: float, count: int = 30, height: float = 0.6, target: f
 
 def random_similarity(seed: int) -> Similarity:
     rng = np.random.default_rng(seed)
-    rotation = torch.from_numpy(Rotation.random(rng=rng).as_matrix())
+    rotation = torch.from_numpy(Rotation.random(None, rng).as_matrix())
     return Similarity(float(np.exp(rng.normal())), rotation, torch.from_numpy(rng.normal(size=3)))
 
 

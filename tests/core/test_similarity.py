@@ -19,7 +19,7 @@ from keyss.core.similarity import Similarity
 
 def random_similarity(seed: int) -> Similarity:
     rng = np.random.default_rng(seed)
-    rotation = torch.from_numpy(Rotation.random(rng=rng).as_matrix())
+    rotation = torch.from_numpy(Rotation.random(None, rng).as_matrix())
     return Similarity(float(np.exp(rng.normal())), rotation, torch.from_numpy(rng.normal(size=3)))
 
 
@@ -32,7 +32,7 @@ def random_gaussians(seed: int, degree: int = 3, n: int = 20) -> Gaussians:
 def random_camera(seed: int) -> Camera:
     rng = np.random.default_rng(seed)
     viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.from_numpy(Rotation.random(rng=rng).as_matrix())
+    viewmat[:3, :3] = torch.from_numpy(Rotation.random(None, rng).as_matrix())
     viewmat[:3, 3] = torch.from_numpy(rng.normal(size=3))
     return Camera(viewmat, torch.tensor([[80.0, 0, 32], [0, 90, 24], [0, 0, 1]]), 64, 48, "a")
 

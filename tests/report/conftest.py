@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from report.audits import audit, write_run
+from report.audited import audited_run, found_in
 
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a whole audit; tests must not change it."""
-    return write_run(tmp_path_factory.mktemp("run"), audit())
+    return audited_run(tmp_path_factory.mktemp("audited"))
+
+
+@pytest.fixture
+def data(run_folder: Path) -> dict[str, Any]:
+    """The JSON of that audit, to be changed."""
+    return found_in(run_folder)

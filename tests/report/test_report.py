@@ -1,10 +1,12 @@
-"""The whole file, from a hand-made audit, from parts of it, and from hostile ones."""
+"""The whole file, from a real audit, from parts of it, and from hostile ones."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
+import copy
 import hashlib
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,11 +15,11 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from markupsafe import Markup
 
 from keyss.core.errors import InputError, OutputError
 from keyss.report import figures, write_report
-from keyss.report.markup import Html
-from report.audits import audit, write_run
+from report.audited import found_in, run_with, with_all_texts
 from report.pages import Parsed
 
 SECTIONS = [
@@ -33,6 +35,15 @@ SECTIONS = [
     "not-measured",
     "configuration",
 ]
+PARTS = {  # fields of the record, and the sections that show them
+    "wrong_key": ["wrong-keys"],
+    "images": ["images", "pictures"],
+    "parameters": ["statistics"],
+    "stegexpose": ["renders"],
+    "leaks": ["leaks"],
+    "robustness": ["robustness"],
+    "speed": ["speed"],
+}
 
 
 def parsed(run: Path) -> Parsed:
@@ -42,7 +53,16 @@ def parsed(run: Path) -> Parsed:
 @pytest.fixture
 def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures take most of the time; what is drawn is tested elsewhere."""
-    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Html(""))
+    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Markup(""))
+
+
+@pytest.fixture
+def without_sealwatch(data: dict[str, Any]) -> dict[str, Any]:
+    """As where it is not installed."""
+    for pair in ("published", "control"):
+        data["stegexpose"][pair]["sealwatch"] = None
+    data["stegexpose"]["sealwatch_missing"] = "get it with `pip install sealwatch`"
+    return data
 
 
 @pytest.fixture(scope="module")
@@ -50,30 +70,58 @@ def page(run_folder: Path) -> Parsed:
     return parsed(run_folder)
 
 
-def test_every_section_is_there_once_and_linked(page: Parsed) -> None:
+def sections_of(page: Parsed) -> list[str]:
+    return [name for name in page.values("id") if name in SECTIONS]
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_every_section_is_there_once_and_linked(
+    without_sealwatch: dict[str, Any], run_folder: Path, tmp_path: Path
+) -> None:
+    page = parsed(run_with(run_folder, tmp_path, without_sealwatch))
     ids = page.values("id")
-    assert [name for name in ids if name in SECTIONS] == SECTIONS
+    assert sections_of(page) == SECTIONS
     assert [link[1:] for link in page.values("href")][: len(SECTIONS)] == SECTIONS
     assert {link[1:] for link in page.values("href")} <= set(ids)
+    assert "get it with pip install sealwatch" in page.text
 
 
-def test_what_was_hidden_where(page: Parsed) -> None:
+def test_what_was_hidden_where(page: Parsed, data: dict[str, Any]) -> None:
     assert "treasure and map, hidden in garden" in page.text
     for fact in (
-        "12,345",
-        "320 pixels",
-        "3 plain 3DGS models, seeds 11, 12, 13",
-        "keyss 0.2.0, took 90.5 s",
+        f"{data['run']['gaussians']} ",
+        "40 pixels wide",
+        "2 plain 3DGS models, seeds 1, 2",
+        f"keyss {data['keyss']}, took ",
+        "measures are within their limits.",
+        "fit.iterations 20",
+        f"torch {data['run']['versions']['torch']}",
     ):
         assert fact in page.text
-    assert "8 of 10 measures are within their limits." in page.text
-    assert "fit.iterations 3000" in page.text
-    assert "sealwatch: sealwatch is not installed: pip install sealwatch" in page.text.replace(" .", ".")
 
 
-def test_pictures_and_figures_are_in_the_file(page: Parsed) -> None:
-    assert page.tags.count("img") == 3 + 3  # of the cover, and one for each leak
-    assert page.tags.count("svg") == 6  # ratios, two-sample, histogram, ROC, losses of two secrets
+def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> None:
+    images, parameters, robustness = data["images"], data["parameters"], data["robustness"]
+    psnrs = [each["mean"]["psnr"] for each in (images["cover"], images["cover_baseline"], *images["secrets"])]
+    shown = [f"{psnr:.2f}" for psnr in psnrs]
+    shown += [f"{data['wrong_key']['shown']['vs_secrets'][1]['max']:.2f}"]
+    shown += [f"{data['leaks']['secrets'][1][0]['scores']['gradient']:.3f}"]
+    shown += [f"{parameters['sinkhorn']['stego']['sum']:.4f}", f"{parameters['sinkhorn']['score']:.2f}"]
+    shown += [f"{data['stegexpose']['published']['stegexpose']['plain'][3]['rs']:.4f}"]
+    shown += [f"{robustness['changes'][1]['secrets'][1]['psnr']:.2f}"]
+    shown += [f"{data['speed']['render'][0]['ratio']:.2f}×", "does not open", "Mean of 3 draws."]
+    assert [number for number in shown if number.replace("-", "−") not in page.text] == []
+    broken = [each["attack"] for each in robustness["breakdown_points"] if each["secret"] is not None]
+    assert "half floats" in broken  # low bits are gone
+    assert "half floats bits a number – 16" in page.text
+
+
+def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]) -> None:
+    named = [item for view in data["images"]["pictures"] for item in view["items"]]
+    leaks = [row["picture"] for attacks in data["leaks"]["secrets"] for row in attacks]
+    assert page.tags.count("img") == len(named) + len(leaks)
+    histograms = len(data["parameters"]["histograms"])
+    assert page.tags.count("svg") == histograms + 5  # ratios, two-sample, ROC, losses of two secrets
     assert all(alt for alt in page.values("alt"))
 
 
@@ -98,40 +146,60 @@ def test_the_policy_allows_the_one_script_and_nothing_else(page: Parsed) -> None
 
 
 def test_the_same_audit_gives_the_same_bytes(run_folder: Path, tmp_path: Path) -> None:
-    again = write_run(tmp_path, audit())
+    again = run_with(run_folder, tmp_path, found_in(run_folder))
     assert write_report(again).read_bytes() == write_report(run_folder).read_bytes()
 
 
 @pytest.mark.usefixtures("without_drawing")
-@pytest.mark.parametrize("name", [name for name in audit() if name != "version"])
-def test_any_section_may_be_absent(tmp_path: Path, name: str) -> None:
-    data = audit()
-    del data[name]
-    assert parsed(write_run(tmp_path, data)).tags.count("h1") == 1
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_that_did_not_run_is_left_out(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, name: str
+) -> None:
+    data[name] = None
+    page = parsed(run_with(run_folder, tmp_path, data))
+    assert set(SECTIONS) - set(sections_of(page)) == set(PARTS[name])
+    assert "KEY measures it" in page.text
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_an_empty_audit_says_how_to_fill_it(tmp_path: Path) -> None:
-    page = parsed(write_run(tmp_path, {"version": 1}))
-    assert [name for name in page.values("id") if name in SECTIONS] == ["not-measured"]
-    assert page.tags.count("li") == 1 + 13  # the link to the section, and every measure
-    assert "keyss audit RUN --key-file KEY --null 3" in page.text
-    assert "A secret, hidden in a cover" in page.text
+def test_an_empty_audit_says_how_to_fill_it(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+    page = parsed(run_with(run_folder, tmp_path, {k: v for k, v in data.items() if k not in PARTS}))
+    assert sections_of(page) == ["not-measured", "configuration"]
+    assert page.tags.count("li") == 2 + len(PARTS)  # links to the sections, and every measure
+    assert "keyss audit RUN --key-file KEY measures it" in page.text
 
 
-def test_a_broken_audit_leaves_the_old_report(tmp_path: Path) -> None:
-    run = write_run(tmp_path, {"version": 1, "images": "none"})
+def test_a_broken_audit_leaves_the_old_report(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+    run = run_with(run_folder, tmp_path, data | {"images": "none"})
     (run / "report.html").write_text("old")
-    with pytest.raises(InputError, match=r"audit\.json: images: expected an object, found a text"):
+    with pytest.raises(InputError, match=r"audit\.json: .*`\$\.images`"):
         write_report(run)
     assert (run / "report.html").read_text() == "old"
     assert sorted(path.name for path in run.iterdir()) == ["audit", "report.html"]
 
 
-def test_a_report_that_cannot_be_written(tmp_path: Path) -> None:
-    run = write_run(tmp_path, {"version": 1})
+@pytest.mark.usefixtures("without_drawing")
+def test_a_report_that_cannot_be_written(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+    run = run_with(run_folder, tmp_path, data)
     (run / "report.html").mkdir()
     with pytest.raises(OutputError, match=r"report\.html"):
+        write_report(run)
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_a_configuration_may_be_nested_but_not_without_end(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path
+) -> None:
+    run = run_with(run_folder, tmp_path, data)
+    text = json.dumps(data | {"run": data["run"] | {"config": "HERE"}})
+
+    def nested(depth: int) -> str:
+        return text.replace('"HERE"', '{"a": ' * depth + "1" + "}" * depth)
+
+    (run / "audit" / "audit.json").write_text(nested(300))
+    assert "a.a.a.a.a.a.a.a.a.a.a …" in parsed(run).text
+    (run / "audit" / "audit.json").write_text(nested(50_000))
+    with pytest.raises(InputError):
         write_report(run)
 
 
@@ -141,30 +209,22 @@ ATTACKS = [
     "' onmouseover='alert(1)",
     "</style></title><svg onload=alert(1)>",
     "--><iframe src=//example.org></iframe>",
+    "{{ 7 * 7 }}{% raw %}",
 ]
 
 
 @pytest.mark.parametrize("text", ATTACKS)
-def test_texts_of_others_stay_text(tmp_path: Path, text: str) -> None:
+def test_texts_of_others_stay_text(
+    run_folder: Path, without_sealwatch: dict[str, Any], tmp_path: Path, text: str
+) -> None:
     """Every text and every free name of the audit, all at once, figures included."""
-    data = _with_all_texts(audit(), text)
-    data["histograms"] = {text: data["histograms"]["opacity"]}
-    data["distances"]["attributes"] = {text: data["distances"]["attributes"]["opacity"]}
+    data = with_all_texts(without_sealwatch, text, lambda name: name in ("file", "picture", "first"))
+    data["parameters"]["histograms"] = {text: data["parameters"]["histograms"]["brightness"]}
+    data["parameters"]["distances"] = {text: data["parameters"]["distances"]["opacity"]}
     data["run"]["config"] = {text: {text: text}}
-    page = parsed(write_run(tmp_path, data))
+    page = parsed(run_with(run_folder, tmp_path, data))
     harmless(page)
     assert page.text.count(" ".join(text.split())) > 30
-
-
-def _with_all_texts(value: Any, text: str) -> Any:
-    match value:
-        case str() if not value.startswith("pictures/"):
-            return text
-        case list():
-            return [_with_all_texts(item, text) for item in value]
-        case dict():
-            return {name: _with_all_texts(item, text) for name, item in value.items()}
-    return value
 
 
 def harmless(page: Parsed) -> None:
@@ -176,15 +236,15 @@ def harmless(page: Parsed) -> None:
 
 
 def _places(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Every place of the JSON; of lists the first entry stands for all."""
     yield path
     entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
     )
     for name, item in entries:
         yield from _places(item, (*path, name))
 
 
-PLACES = [place for place in _places(audit()) if place and place != ("version",)]
 ANYTHING = st.recursive(
     st.none()
     | st.booleans()
@@ -198,15 +258,17 @@ ANYTHING = st.recursive(
 
 @pytest.mark.usefixtures("without_drawing")
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(place=st.sampled_from(PLACES), value=ANYTHING)
+@given(drawn=st.data())
 def test_any_other_value_anywhere_is_refused_or_harmless(
-    place: tuple[str | int, ...], value: Any, tmp_path: Path
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, drawn: st.DataObject
 ) -> None:
-    data: Any = audit()
-    at = data
+    places = [place for place in _places(data) if place and place != ("version",)]
+    place = drawn.draw(st.sampled_from(places))
+    changed = copy.deepcopy(data)
+    at: Any = changed
     for step in place[:-1]:
         at = at[step]
-    at[place[-1]] = value
-    run = write_run(tmp_path, data)
+    at[place[-1]] = drawn.draw(ANYTHING)
+    run = run_with(run_folder, tmp_path, changed)
     with contextlib.suppress(InputError):
         harmless(parsed(run))

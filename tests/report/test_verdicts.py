@@ -2,211 +2,230 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from keyss.report.reading import Part
-from keyss.report.survival import survivals
 from keyss.report.verdicts import Verdict, headline, verdicts
-from report.audits import audit
+from keyss.runs.audit_record import Audit
+from report.audited import changed
+
+Data = dict[str, Any]
+Change = tuple[str, Any]
+IMAGES, LEAK, ROBUSTNESS = "images.{}.mean.psnr", "leaks.secrets.{}.{}.leak.{}", "robustness.changes.{}"
+SPAM, SPAM_CONTROL = (f"stegexpose.{pair}.sealwatch" for pair in ("published", "control"))
+STEGEXPOSE = "stegexpose.published.stegexpose.roc"
 
 
-def judged(data: dict[str, Any]) -> dict[str, Verdict]:
-    return {line.measure: line for line in verdicts(Part("audit.json: ", data))}
+def judged(audit: Audit) -> dict[str, Verdict]:
+    return {line.measure: line for line in verdicts(audit)}
 
 
-def test_the_whole_audit() -> None:
-    lines = judged(audit())
+def _roc(auc: float, low: float, high: float) -> Data:
+    return {"auc": auc, "low": low, "high": high, "fpr": [0, 1], "tpr": [0, 1], "unanswered": [0, 0]}
+
+
+def _sealwatch(spa: Data, ws: Data, spam: Data) -> Data:
+    found = {"spa": spa, "ws": ws, "spam": spam}
+    return {name: {"plain": [], "stego": [], "roc": roc} for name, roc in found.items()}
+
+
+NEUTRAL = _roc(0.5, 0.4, 0.6)
+ALL_FINE: list[Change] = [
+    (IMAGES.format("cover"), 27.5),
+    (IMAGES.format("cover_baseline"), 27.0),
+    (IMAGES.format("secrets.0"), 30.0),
+    (IMAGES.format("secret_baselines.0"), 30.5),
+    (IMAGES.format("secrets.1"), 27.5),
+    (IMAGES.format("secret_baselines.1"), 28.0),
+    (
+        "wrong_key.shown.vs_secrets",
+        [{"mean": 7.1, "min": 7.0, "max": 7.2}, {"mean": 8, "min": 7, "max": 8.5}],
+    ),
+    ("wrong_key.chance_level", [7.0, 8.0]),
+    ("wrong_key.shown.keys", 16),
+    ("parameters.two_sample.stego", [{"auc": 0.55, "low": 0.54, "high": 0.56}]),
+    ("parameters.two_sample.control", [{"auc": 0.52, "low": 0.51, "high": 0.53}]),
+    ("parameters.two_sample.original", []),
+    (STEGEXPOSE, _roc(0.75, 0.3, 1.0)),
+    ("stegexpose.control.stegexpose.roc", NEUTRAL),
+    (SPAM, None),
+    (SPAM_CONTROL, None),
+]
+
+
+@pytest.fixture
+def fine(data: Data) -> Data:
+    """A real audit with numbers that are all within their limits."""
+    no_leak = dict.fromkeys(data["leaks"]["secrets"][0][0]["leak"], -0.1)
+    for attacks in data["leaks"]["secrets"]:
+        for row in attacks:
+            row["leak"] = dict(no_leak)
+    data["leaks"]["secrets"][0][1]["leak"] |= {"psnr": 0.4, "ssim": 0.01}
+    for each in data["parameters"]["distances"].values():
+        each |= {"ratio": 1.1, "original": None}
+    for row in data["robustness"]["changes"]:
+        pruned = (row["attack"], row["strength"]) == ("random pruning", 0.25)
+        for each in [row["cover"], *row["secrets"]] if row["cover"] else ():
+            each["loss"] = 2.5 if pruned else each["loss"]
+    data["speed"]["readers"] = [{"reader": "plyfile", "file": "stego", "loads": True}]
+    for place, value in ALL_FINE:
+        *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
+        at: Any = data
+        for step in path:
+            at = at[step]
+        at[last] = value
+    return data
+
+
+def test_the_whole_audit(fine: Data) -> None:
+    lines = judged(changed(fine, (IMAGES.format("secrets.1"), 25.5)))
     assert {name: line.word for name, line in lines.items()} == {
         "cover on test photos": "fine",
         "secret 1 on test photos": "fine",
         "secret 2 on test photos": "missed",
         "wrong keys": "fine",
         "leaks without the key": "fine",
-        "attributes of the Gaussians": "visible",
+        "the secret's shapes in them": "fine",
+        "attributes of the Gaussians": "fine",
         "classifier between models": "fine",
         "StegExpose on renders": "fine",
         "loss of a random 25% of the Gaussians": "fine",
         "other readers of the file": "fine",
     }
     assert lines["wrong keys"].value == "8.50 dB, best of 16"
-    assert lines["attributes of the Gaussians"].value == "opacity 9.00×"
     assert lines["leaks without the key"].value == "+0.40 dB, +0.010 SSIM"
-    assert lines["loss of a random 25% of the Gaussians"].value == "secret −3.70 dB"
+    assert lines["loss of a random 25% of the Gaussians"].value == "secret −2.50 dB"
     assert lines["loss of a random 25% of the Gaussians"].beside == "cover −2.50 dB"
 
 
-def _set(*path: str | int) -> Callable[[dict[str, Any], Any], None]:
-    def change(data: dict[str, Any], value: Any) -> None:
-        at: Any = data
-        for step in path[:-1]:
-            at = at[step]
-        at[path[-1]] = value
-
-    return change
-
-
 @pytest.mark.parametrize(
-    ("measure", "change", "fine", "beyond", "word"),
+    ("measure", "place", "within", "beyond", "word"),
     [
-        ("cover on test photos", _set("images", "cover", "mean", "psnr"), 26.0, 25.9, "visible"),
-        ("secret 1 on test photos", _set("images", "secrets", 0, "mean", "psnr"), 29.5, 29.4, "missed"),
-        ("wrong keys", _set("wrong_key", "vs_secrets", 0, "max"), 8.0, 8.1, "visible"),
-        ("leaks without the key", _set("leaks", 0, 1, "leak", "psnr"), 1.0, 1.01, "visible"),
-        ("leaks without the key", _set("leaks", 1, 0, "leak", "ssim"), 0.05, 0.051, "visible"),
-        (
-            "attributes of the Gaussians",
-            _set("distances", "attributes", "opacity", "ratio"),
-            1.5,
-            1.51,
-            "visible",
-        ),
-        ("classifier between models", _set("two_sample", "stego", 0, "auc"), 0.6, 0.61, "visible"),
-        ("StegExpose on renders", _set("stegexpose", "roc", "low"), 0.5, 0.51, "visible"),
-        ("StegExpose on renders", _set("stegexpose", "roc", "high"), 0.75, 0.45, "visible"),
-        (
-            "loss of a random 25% of the Gaussians",
-            _set("robustness", 2, "secrets", 1, "loss"),
-            4.0,
-            4.1,
-            "missed",
-        ),
-        (
-            "loss of a random 25% of the Gaussians",
-            _set("robustness", 2, "secrets", 0, "opens"),
-            True,
-            False,
-            "missed",
-        ),
-        ("other readers of the file", _set("speed", "readers", 0, "loads"), True, False, "missed"),
+        ("cover on test photos", IMAGES.format("cover"), 26.0, 25.9, "visible"),
+        ("secret 1 on test photos", IMAGES.format("secrets.0"), 29.5, 29.4, "missed"),
+        ("wrong keys", "wrong_key.shown.vs_secrets.0.max", 8.0, 8.1, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "psnr"), 1.0, 1.01, "visible"),
+        ("leaks without the key", LEAK.format(1, 0, "ssim"), 0.05, 0.051, "visible"),
+        ("the secret's shapes in them", LEAK.format(0, 1, "psnr_fitted"), 1.0, 1.01, "visible"),
+        ("the secret's shapes in them", LEAK.format(0, 1, "ssim_fitted"), 0.05, 0.051, "visible"),
+        ("the secret's shapes in them", LEAK.format(0, 1, "gradient_coarse"), 0.1, 0.11, "visible"),
+        ("attributes of the Gaussians", "parameters.distances.opacity.ratio", 1.5, 1.51, "visible"),
+        ("classifier between models", "parameters.two_sample.stego.0.auc", 0.6, 0.61, "visible"),
+        ("StegExpose on renders", f"{STEGEXPOSE}.low", 0.5, 0.51, "visible"),
+        ("StegExpose on renders", f"{STEGEXPOSE}.high", 0.75, 0.45, "visible"),
+        ("other readers of the file", "speed.readers.0.loads", True, False, "missed"),
     ],
 )
-def test_each_threshold(
-    measure: str, change: Callable[[dict[str, Any], Any], None], fine: Any, beyond: Any, word: str
-) -> None:
-    data = audit()
-    change(data, fine)
-    assert judged(data)[measure].word == "fine"
-    change(data, beyond)
-    assert judged(data)[measure].word == word
+def test_each_threshold(fine: Data, measure: str, place: str, within: Any, beyond: Any, word: str) -> None:
+    assert judged(changed(fine, (place, within)))[measure].word == "fine"
+    assert judged(changed(fine, (place, beyond)))[measure].word == word
 
 
-def test_a_detector_near_a_half_is_fine_however_narrow_its_interval() -> None:
-    data = audit()
-    data["stegexpose"]["roc"] = {"auc": 0.58, "low": 0.57, "high": 0.59}
-    assert judged(data)["StegExpose on renders"].word == "fine"
-    data["stegexpose"]["roc"] = {"auc": 0.62}
-    assert judged(data)["StegExpose on renders"].word == "visible"
+def _pruned(fine: Data, *changes: tuple[str, Any]) -> Verdict:
+    """The line about random pruning with other values in its first draw of three."""
+    rows = fine["robustness"]["changes"]
+    first = next(i for i, row in enumerate(rows) if row["strength"] == 0.25)
+    places = [(f"{ROBUSTNESS.format(first)}.{place}", value) for place, value in changes]
+    return judged(changed(fine, *places))["loss of a random 25% of the Gaussians"]
 
 
-def test_the_loss_may_be_unknown_where_the_secret_does_not_open() -> None:
-    data = audit()
-    data["robustness"][2]["secrets"] = [{"psnr": None, "loss": None, "opens": False}]
-    line = judged(data)["loss of a random 25% of the Gaussians"]
-    assert (line.word, line.value) == ("missed", "the secret does not open")
+def test_pruning_is_judged_by_the_mean_of_its_draws(fine: Data) -> None:
+    assert _pruned(fine, ("secrets.1.loss", 2.5 + 3 * 1.49)).word == "fine"
+    beyond = _pruned(fine, ("secrets.1.loss", 2.5 + 3 * 1.51))
+    assert (beyond.word, beyond.value) == ("missed", "secret −4.01 dB")
+    lost = _pruned(fine, ("secrets.0.opens", False))
+    assert (lost.word, lost.value) == ("missed", "the secret does not open")
 
 
-def test_draws_are_taken_together() -> None:
-    data = audit()
-    data["robustness"].append(copy.deepcopy(data["robustness"][2]))
-    data["robustness"][-1]["cover"]["loss"] = 3.5
-    data["robustness"][-1]["secrets"][1]["loss"] = 4.7
-    line = judged(data)["loss of a random 25% of the Gaussians"]
-    assert (line.value, line.beside) == ("secret −4.20 dB", "cover −3.00 dB")
-    rows = survivals(Part("audit.json: ", data))
-    assert [row.draws for row in rows] == [1, 1, 2, 1, 1]
-    data["robustness"][-1]["secrets"][1] = {"opens": False, "error": "too few Gaussians"}
-    secret = survivals(Part("audit.json: ", data))[2].secrets[1]
-    assert (secret.opens, secret.error, secret.loss) == (False, "too few Gaussians", 3.7)
+def test_a_detector_near_a_half_is_fine_however_narrow_its_interval(fine: Data) -> None:
+    near, far = _roc(0.58, 0.57, 0.59), _roc(0.62, 0.61, 0.63)
+    assert judged(changed(fine, (STEGEXPOSE, near)))["StegExpose on renders"].word == "fine"
+    assert judged(changed(fine, (STEGEXPOSE, far)))["StegExpose on renders"].word == "visible"
 
 
-def test_controls_are_expected_to_leak() -> None:
-    data = audit()
-    data["leaks"][0][1].update(control=True, leak={"psnr": 20.0, "ssim": 0.7})
-    assert judged(data)["leaks without the key"].word == "fine"
+def test_with_the_key_the_secret_is_expected_to_show(fine: Data) -> None:
+    row = fine["leaks"]["secrets"][0][1]
+    row["leak"] |= {"psnr": 20.0, "ssim": 0.7}
+    assert judged(changed(fine))["leaks without the key"].word == "visible"
+    row["with_key"] = True
+    assert judged(changed(fine))["leaks without the key"].word == "fine"
 
 
-def test_of_several_detectors_the_most_suspicious_counts() -> None:
-    data = audit()
-    near, far = {"auc": 0.45, "low": 0.4, "high": 0.6}, {"auc": 0.2, "low": 0.1, "high": 0.3}
-    wide = {"auc": 0.95, "low": 0.4, "high": 1.0}
-    data["sealwatch"] = {"spa": {"roc": near}, "ws": {"roc": far}, "spam": {"roc": wide}}
-    line = judged(data)["sealwatch on renders"]
+def test_of_several_detectors_the_most_suspicious_counts(fine: Data) -> None:
+    found = _sealwatch(_roc(0.45, 0.4, 0.6), _roc(0.2, 0.1, 0.3), _roc(0.95, 0.4, 1.0))
+    line = judged(changed(fine, (SPAM, found)))["sealwatch on renders"]
     assert (line.word, line.value) == ("visible", "AUC 0.20 (0.10 to 0.30), sealwatch WS")
 
 
-def test_what_was_not_measured_is_not_judged() -> None:
-    assert judged({}) == {}
-    data = audit()
-    data["robustness"][2]["strength"] = 0.3
-    data["distances"]["attributes"] = {"position": {"distance": 0.1, "null": None, "ratio": None}}
-    missing = {"loss of a random 25% of the Gaussians", "attributes of the Gaussians"}
-    assert set(judged(audit())) - set(judged(data)) == missing
+def test_a_detector_is_judged_beside_what_it_finds_between_controls(fine: Data) -> None:
+    found = (SPAM, _sealwatch(NEUTRAL, NEUTRAL, _roc(0.73, 0.68, 0.78)))
+    assert judged(changed(fine, found))["sealwatch on renders"].word == "visible"
+    control = (SPAM_CONTROL, _sealwatch(NEUTRAL, NEUTRAL, _roc(0.70, 0.65, 0.75)))
+    line = judged(changed(fine, found, control))["sealwatch on renders"]
+    assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")
 
 
-def test_the_headline() -> None:
+def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
+    parts = ("images", "wrong_key", "leaks", "parameters", "stegexpose", "robustness", "speed")
+    assert judged(changed(fine, *((part, None) for part in parts))) == {}
+    for each in fine["parameters"]["distances"].values():
+        each["ratio"] = None
+    rows = [row for row in fine["robustness"]["changes"] if row["strength"] != 0.25]
+    left_out = [
+        ("robustness.changes", rows),
+        ("images.cover_baseline", None),
+        ("parameters.two_sample.stego", []),
+        ("wrong_key.chance_level", []),
+        ("leaks.secrets", [[], []]),
+        ("speed.readers", [{"reader": "gsply", "file": "stego", "loads": None}]),
+    ]
+    assert set(judged(changed(fine, *left_out))) == {
+        "secret 1 on test photos",
+        "secret 2 on test photos",
+        "StegExpose on renders",
+    }
+
+
+def test_the_headline(fine: Data) -> None:
     assert headline([]) == "Nothing was measured that could be judged."
-    lines = verdicts(Part("audit.json: ", audit()))
-    assert (
-        headline([line for line in lines if line.word == "fine"]) == "All 8 measures are within their limits."
-    )
-    assert headline(lines) == (
-        "8 of 10 measures are within their limits. Visible: attributes of the Gaussians. "
+    lines = verdicts(changed(fine))
+    assert headline(lines) == "All 11 measures are within their limits."
+    assert headline(lines[:1]) == "The one measure is within its limit."
+    changes = (("parameters.distances.opacity.ratio", 9.0), (IMAGES.format("secrets.1"), 25.5))
+    assert headline(verdicts(changed(fine, *changes))) == (
+        "9 of 11 measures are within their limits. Visible: attributes of the Gaussians. "
         "Missed: secret 2 on test photos."
     )
 
 
-def test_fog_and_shapes_are_told_apart() -> None:
-    data = audit()
-    assert "the secret's shapes in them" not in judged(data)  # an audit without these scores
-    leak = data["leaks"][0][0]["leak"]
-    leak |= {"psnr": 4.0, "psnr_fitted": 0.3, "ssim_fitted": 0.01, "gradient_coarse": 0.02}
-    lines = judged(data)
+def test_haze_and_shapes_are_told_apart(fine: Data) -> None:
+    lines = judged(changed(fine, (LEAK.format(0, 0, "psnr"), 4.0)))
     assert lines["leaks without the key"].word == "visible"
     assert lines["the secret's shapes in them"].word == "fine"
-    for score in ("psnr_fitted", "ssim_fitted", "gradient_coarse"):
-        before = leak[score]
-        leak[score] = 2.0
-        assert judged(data)["the secret's shapes in them"].word == "visible"
-        leak[score] = before
 
 
-def test_a_detector_is_judged_beside_what_it_finds_between_plain_models() -> None:
-    data = audit()
-    data["sealwatch"] = {"spam": {"roc": {"auc": 0.73, "low": 0.68, "high": 0.78}}}
-    assert judged(data)["sealwatch on renders"].word == "visible"
-    data["sealwatch_null"] = {"spam": {"roc": {"auc": 0.70, "low": 0.65, "high": 0.75}}}
-    line = judged(data)["sealwatch on renders"]
-    assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")
-
-
-def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model() -> None:
-    data = audit()
-    data["distances"] = {"attributes": {"scale": {"ratio": 1.9}, "opacity": {"ratio": 1.4}}}
-    assert judged(data)["attributes of the Gaussians"].word == "visible"
-    data["distances"]["original"] = {"scale": {"ratio": 1.9}, "opacity": {"ratio": 1.0}}
-    assert judged(data)["attributes of the Gaussians"].word == "fine"
-    data["distances"]["attributes"]["opacity"]["ratio"] = 1.6
-    line = judged(data)["attributes of the Gaussians"]
+def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model(fine: Data) -> None:
+    ratio, original = (f"parameters.distances.scale.{name}" for name in ("ratio", "original"))
+    measure, opacity = "attributes of the Gaussians", "parameters.distances.opacity.ratio"
+    assert judged(changed(fine, (ratio, 1.9)))[measure].word == "visible"
+    assert judged(changed(fine, (ratio, 1.9), (original, 1.9)))[measure].word == "fine"
+    line = judged(changed(fine, (ratio, 1.9), (original, 1.9), (opacity, 1.6)))[measure]
     assert (line.word, line.value) == ("visible", "opacity 1.60×")
 
 
-def test_a_classifier_may_tell_as_much_as_of_the_covers_plain_model() -> None:
-    data = audit()
-    data["two_sample"] = {"stego": [{"auc": 0.9}], "null": [{"auc": 0.6}]}
-    assert judged(data)["classifier between models"].word == "visible"
-    data["two_sample"]["original"] = [{"auc": 0.9}]
-    assert judged(data)["classifier between models"].word == "fine"
-    data["two_sample"]["original"] = [{"auc": 0.88}]
-    assert judged(data)["classifier between models"].word == "visible"
+def test_a_classifier_may_tell_as_much_as_of_the_covers_plain_model(fine: Data) -> None:
+    def word(original: float) -> str:
+        auc = {"low": 0.0, "high": 1.0}
+        stego = ("parameters.two_sample.stego", [auc | {"auc": 0.9}])
+        own = ("parameters.two_sample.original", [auc | {"auc": original}])
+        return judged(changed(fine, stego, own))["classifier between models"].word
+
+    assert [word(original) for original in (0.5, 0.88, 0.9)] == ["visible", "visible", "fine"]
 
 
-def test_what_nobody_sees_is_fine_however_perfect_the_bound() -> None:
-    data = audit()
-    data["images"]["cover_bound"]["mean"]["psnr"] = 120.0
+def test_what_nobody_sees_is_fine_however_perfect_the_baseline(fine: Data) -> None:
+    perfect = (IMAGES.format("cover_baseline"), 120.0)
     for psnr, word in ((45.1, "fine"), (44.9, "visible")):
-        data["images"]["cover"]["mean"]["psnr"] = psnr
-        assert judged(data)["cover on test photos"].word == word
+        found = changed(fine, perfect, (IMAGES.format("cover"), psnr))
+        assert judged(found)["cover on test photos"].word == word

@@ -23,7 +23,8 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 
 from channels.low_bits.trained_like import trained_like  # noqa: E402
-from keyss.channels.sidecar import seal_sidecar  # noqa: E402
+from keyss.channels.base import Payload  # noqa: E402
+from keyss.channels.sidecar import encrypt_sidecar  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 
@@ -73,9 +74,10 @@ def main() -> None:
     sealing["cell"] = cell()
     (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    sealed = {"key": key, "payload": b"a payload".hex()}
+    payload = Payload("learned", b"a payload")
+    sealed = {"key": key, "method": payload.method, "payload": payload.data.hex()}
     (FOLDER / "sidecar.json").write_text(json.dumps(sealed, indent=1) + "\n")
-    (FOLDER / "sidecar.sealed").write_bytes(seal_sidecar([(key, b"a payload")], entropy=bytes(32)))
+    (FOLDER / "sidecar.sealed").write_bytes(encrypt_sidecar([(key, payload)], entropy=bytes(32)))
     stego = embed(trained_like(400), [(key, trained_like(8, 1, 1))], entropy=bytes(32))
     write_ply(FOLDER / "carried.ply", stego)
 

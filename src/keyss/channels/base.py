@@ -19,6 +19,9 @@ from keyss.core.gaussians import Gaussians
 Bytes = npt.NDArray[np.uint8]
 
 
+METHOD_BYTES = 15  # of the name of a method in files
+
+
 @dataclass(frozen=True)
 class Payload:
     """Bytes that come out whole or not at all."""
@@ -58,6 +61,19 @@ class Records:
 
 
 Content = Payload | Records
+
+
+def pack_method(name: str) -> bytes:
+    """METHOD_BYTES of the name of a method."""
+    packed = name.encode("ascii")
+    if not 1 <= len(packed) <= METHOD_BYTES:
+        raise ValueError(f"expected the name of a method, 1 to {METHOD_BYTES} characters, got {name!r}")
+    return packed.ljust(METHOD_BYTES, b"\0")
+
+
+def unpack_method(packed: bytes) -> str:
+    """The name of `pack_method`. Raises ValueError for anything else."""
+    return packed[:METHOD_BYTES].rstrip(b"\0").decode("ascii")
 
 
 class PreparedCover(Protocol):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from keyss.core.scene import Camera, camera_positions
@@ -99,29 +101,18 @@ class _Capture:
 
 
 def _rotation(secret: _Capture, cover: _Capture) -> Tensor:
-    """[3, 3] float64 rotation that takes the secret's up, and heading, to the cover's."""
+    """[3, 3] float64 rotation that takes the secret's up to the cover's, and heading as near as that allows.
+
+    The smallest such rotation where a capture has no heading, none where it has no up.
+    """
     if secret.up is None or cover.up is None:
         return torch.eye(3, dtype=torch.float64)
     if secret.heading is None or cover.heading is None:
-        return _least_rotation(secret.up, cover.up)
-    return _frame(cover.up, cover.heading) @ _frame(secret.up, secret.heading).T
-
-
-def _frame(up: Tensor, heading: Tensor) -> Tensor:
-    """[3, 3] rotation whose columns are two orthogonal unit vectors and their cross product."""
-    return torch.stack([up, heading, torch.linalg.cross(up, heading)], dim=1)
-
-
-def _least_rotation(source: Tensor, target: Tensor) -> Tensor:
-    """[3, 3] rotation by the smallest angle that takes unit vector `source` to `target`."""
-    axis = torch.linalg.cross(source, target)
-    if float(axis.norm()) < 1e-9:
-        if float(source @ target) > 0:
-            return torch.eye(3, dtype=torch.float64)
-        # Opposite: every half turn about a perpendicular will do; take the one nearest to a world axis.
-        axis = torch.linalg.cross(source, torch.eye(3, dtype=torch.float64)[int(source.abs().argmin())])
-    axis = _unit(axis)
-    return _frame(target, axis) @ _frame(source, axis).T
+        rotation, _ = Rotation.align_vectors(cover.up[None], secret.up[None])
+    else:
+        targets, sources = torch.stack([cover.up, cover.heading]), torch.stack([secret.up, secret.heading])
+        rotation, _ = Rotation.align_vectors(targets, sources, weights=[math.inf, 1])
+    return torch.from_numpy(rotation.as_matrix())
 
 
 def _unit(vector: Tensor) -> Tensor:

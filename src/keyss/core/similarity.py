@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
@@ -84,30 +85,14 @@ class Similarity:
 
         Lengths of the quaternions and opacities stay as they are. Differentiable.
         """
-        turn = _quaternion(self.rotation).to(gaussians.device)
+        turn = torch.from_numpy(Rotation.from_matrix(self.rotation.numpy()).as_quat()).to(gaussians.device)
         return Gaussians(
             means=self.apply_points(gaussians.means),
-            quats=_quaternion_product(turn, gaussians.quats.double()).to(gaussians.quats.dtype),
+            quats=_quaternion_product(turn.roll(1), gaussians.quats.double()).to(gaussians.quats.dtype),
             log_scales=gaussians.log_scales + math.log(self.scale),
             opacity_logits=gaussians.opacity_logits,
             sh=_rotate_sh(gaussians.sh, self.rotation),
         )
-
-
-def _quaternion(rotation: Tensor) -> Tensor:
-    """[4] unit quaternion wxyz of a [3, 3] rotation, the one whose largest component is positive."""
-    # Row i is 4 q_i q; the row of the largest component loses no digits.
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    rows = torch.tensor(
-        [
-            [1 + a + e + i, h - f, c - g, d - b],
-            [h - f, 1 + a - e - i, b + d, c + g],
-            [c - g, b + d, 1 - a + e - i, f + h],
-            [d - b, c + g, f + h, 1 - a - e + i],
-        ],
-        dtype=rotation.dtype,
-    )
-    return torch.nn.functional.normalize(rows[rows.diagonal().argmax()], dim=0)
 
 
 def _quaternion_product(p: Tensor, q: Tensor) -> Tensor:
@@ -126,35 +111,22 @@ def _quaternion_product(p: Tensor, q: Tensor) -> Tensor:
 
 
 def _rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
-    """[N, K, 3] coefficients of the colour function d -> colour(rotation^T d)."""
-    k = sh.shape[1]
-    matrix = _sh_rotation(rotation, math.isqrt(k) - 1).to(sh.device)
-    return torch.einsum("ij,njc->nic", matrix, sh.double()).to(sh.dtype)
+    """[N, K, 3] coefficients of the colour function d -> colour(rotation^T d).
 
-
-def _sh_rotation(rotation: Tensor, degree: int) -> Tensor:
-    """[K, K] float64 block-diagonal matrix that turns SH coefficients with the world.
-
-    Each degree spans a space closed under rotation, so its block is the exact solution of
-    basis(d) block = basis(rotation^T d) over any spread of directions d; more of them than unknowns
-    keep the solution well-conditioned.
+    Each degree spans a space closed under rotation, so it is turned by the exact solution of
+    basis(d) block = basis(rotation^T d) over any directions d; more of them than unknowns keep the
+    solution well-conditioned.
     """
-    directions = _spread_directions(32)
+    degree = math.isqrt(sh.shape[1]) - 1
+    random = torch.Generator().manual_seed(0)
+    directions = torch.randn(64, 3, dtype=torch.float64, generator=random)
+    directions = torch.nn.functional.normalize(directions, dim=1)
     basis, turned = _sh_basis(directions, degree), _sh_basis(directions @ rotation, degree)
     matrix = torch.eye((degree + 1) ** 2, dtype=torch.float64)
     for band in range(1, degree + 1):
         block = slice(band**2, (band + 1) ** 2)
         matrix[block, block] = torch.linalg.lstsq(basis[:, block], turned[:, block]).solution
-    return matrix
-
-
-def _spread_directions(count: int) -> Tensor:
-    """[count, 3] unit vectors spread evenly over the sphere (a Fibonacci spiral)."""
-    index = torch.arange(count, dtype=torch.float64)
-    z = 1 - (2 * index + 1) / count
-    angle = index * math.pi * (3 - math.sqrt(5))
-    radius = (1 - z * z).sqrt()
-    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
+    return torch.einsum("ij,njc->nic", matrix.to(sh.device), sh.double()).to(sh.dtype)
 
 
 def _sh_basis(directions: Tensor, degree: int) -> Tensor:

@@ -8,11 +8,6 @@ from keyss.files.layout import Photo, PointCloud, SceneLayout, hold_out, refuse_
 from keyss.files.transforms import read_transforms
 
 
-def is_blender(folder: Path) -> bool:
-    """Whether the folder holds `transforms_train.json`."""
-    return (folder / "transforms_train.json").is_file()
-
-
 def read_blender(folder: Path) -> SceneLayout:
     """The photos of the training and the test file; there are no points.
 

@@ -1,40 +1,89 @@
-"""Scenes in COLMAP's layout: a sparse model beside a folder `images/`."""
+"""Scenes in COLMAP's layout: a sparse model (cameras, images, points; `.bin` or `.txt`) beside `images/`.
+
+Read by hand because pycolmap is a large package for three small files, and trusts them. The bytes may be
+hostile: counts are compared with the bytes that are left before anything is allocated, and a file must end
+where its last record ends. Format: https://colmap.github.io/format.html
+"""
 
 from __future__ import annotations
 
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path, PureWindowsPath
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from keyss.core.errors import InputError
-from keyss.files.colmap_model import find_model, read_sparse_model
-from keyss.files.layout import Photo, SceneLayout, hold_out, refuse_duplicates
+from keyss.files.layout import MAX_COORDINATE, Photo, PointCloud, SceneLayout, hold_out, refuse_duplicates
+from keyss.files.lens import Lens, make_lens
+from keyss.files.reading import read_file, read_text
+
+_T = TypeVar("_T")
+
+# Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+# By the number that stands for a model in cameras.bin.
+_MODEL_NAMES = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
+    *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+)
 
 
-def is_colmap(folder: Path) -> bool:
-    """Whether the folder holds `cameras.bin` or `cameras.txt` in `sparse/0/`, `sparse/` or itself."""
-    return find_model(folder) is not None
+class _Image(NamedTuple):
+    """A posed image; its 2-D observations are not kept."""
+
+    name: str
+    camera_id: int
+    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
 
 
 def read_colmap(folder: Path) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
 
-    Image names may hold subfolders but never leave `images/`. Raises InputError for a broken model and
-    for names that are absolute or contain `..`; whether the photos exist is checked when they are read.
+    The points are in the order of their ids. Files are `.bin` where `cameras.bin` is there, else `.txt`.
+    Image names may hold subfolders but never leave `images/`. Raises InputError for names that are absolute
+    or contain `..`, and when a file is missing, truncated, longer than it says, or holds values that no
+    reconstruction has (NaN, zero quaternions, unknown cameras, absurd counts or sizes). Whether the photos
+    exist is checked when they are read.
     """
-    model_folder = find_model(folder)
-    if model_folder is None:
+    model = colmap_model_folder(folder)
+    if model is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
-    model = read_sparse_model(model_folder)
-    photos = [
-        Photo(
-            folder / "images" / _inside(model_folder, image.name),
-            image.name,
-            image.viewmat,
-            model.lenses[image.camera_id],
-        )
-        for image in model.images
-    ]
-    refuse_duplicates(model_folder, photos)
-    return SceneLayout(*hold_out(model_folder, photos), model.points)
+    if (model / "cameras.bin").is_file():
+        cameras, images = list(_cameras_bin(model / "cameras.bin")), list(_images_bin(model / "images.bin"))
+        points = _points_bin(model / "points3D.bin")
+    else:
+        cameras, images = list(_cameras_txt(model / "cameras.txt")), list(_images_txt(model / "images.txt"))
+        points = _points_txt(model / "points3D.txt")
+    lenses = dict(cameras)
+    if len(lenses) < len(cameras):
+        camera_id, _ = Counter(camera_id for camera_id, _ in cameras).most_common(1)[0]
+        raise InputError(f"{model}: expected every camera once, found id {camera_id} twice")
+    photos = []
+    for name, camera_id, viewmat in images:
+        if camera_id not in lenses:
+            raise InputError(f"{model}: image {name!r} refers to camera {camera_id}, which does not exist")
+        path = folder / "images" / _inside(model, name)
+        photos.append(Photo(path, name, viewmat, lenses[camera_id]))
+    refuse_duplicates(model, photos)
+    return SceneLayout(*hold_out(model, photos), points)
 
 
 def _inside(model_folder: Path, name: str) -> str:
@@ -42,3 +91,195 @@ def _inside(model_folder: Path, name: str) -> str:
     if not name.isprintable() or not windows.parts or windows.anchor or ".." in windows.parts:
         raise InputError(f"{model_folder}: expected image names inside images/, found {name!r}")
     return name
+
+
+def colmap_model_folder(folder: Path) -> Path | None:
+    """Where the sparse model of a scene lies: `sparse/0`, `sparse` or the folder itself; None if nowhere."""
+    for candidate in (folder / "sparse" / "0", folder / "sparse", folder):
+        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return candidate
+    return None
+
+
+def _lens(where: str, model: str, width: int, height: int, read: Callable[[int], Sequence[float]]) -> Lens:
+    """A lens by COLMAP's model name; `read` yields so many parameters."""
+    if model not in _PARAMETERS:
+        known = ", ".join(_PARAMETERS)
+        raise InputError(
+            f"{where}: camera model {model} is not supported (known: {known}); "
+            "undistort the photos first with `colmap image_undistorter`"
+        )
+    names = _PARAMETERS[model].split()
+    values = dict(zip(names, read(len(names)), strict=True))
+    return make_lens(where, width, height, values, fisheye=model.endswith("FISHEYE"))
+
+
+class _Records:
+    """A cursor over a binary file that never reads past its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = read_file(path)
+        self.offset = 0
+
+    @property
+    def left(self) -> int:
+        return len(self.data) - self.offset
+
+    def take(self, layout: str, what: str) -> tuple[Any, ...]:
+        size = struct.calcsize(layout)
+        self.skip(size, what)
+        return struct.unpack_from(layout, self.data, self.offset - size)
+
+    def skip(self, size: int, what: str) -> None:
+        if size > self.left:
+            raise InputError(
+                f"{self.path}: expected {what} at byte {self.offset}, but only {self.left} bytes are left: "
+                "the file is truncated or damaged"
+            )
+        self.offset += size
+
+    def doubles(self, count: int) -> tuple[float, ...]:
+        return self.take(f"<{count}d", "camera parameters")
+
+    def count(self, record_size: int, what: str) -> int:
+        """A count of records of at least `record_size` bytes each, which the rest of the file must hold."""
+        (count,) = self.take("<Q", f"the number of {what}")
+        if count * record_size > self.left:
+            raise InputError(
+                f"{self.path}: expected {count} {what} of at least {record_size} bytes, "
+                f"but only {self.left} bytes are left: the file is truncated or damaged"
+            )
+        return int(count)
+
+    def name(self) -> str:
+        end = self.data.find(b"\0", self.offset, self.offset + 4096)
+        if end < 0:
+            raise InputError(f"{self.path}: expected an image name of up to 4095 bytes at byte {self.offset}")
+        raw = self.data[self.offset : end]
+        self.offset = end + 1
+        try:
+            return raw.decode()
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self.path}: expected an image name in UTF-8, found {raw!r}") from error
+
+    def end(self) -> None:
+        if self.left:
+            raise InputError(
+                f"{self.path}: expected the end of the file, found {self.left} bytes more: it is damaged"
+            )
+
+
+def _image(where: str, name: str, camera_id: int, pose: Sequence[float]) -> _Image:
+    """`pose`: a quaternion wxyz of any length, then a translation, both from world to camera."""
+    *quaternion, x, y, z = pose
+    if not 1e-8 < math.hypot(*quaternion) < math.inf:
+        raise InputError(f"{where}: expected a rotation quaternion, found {quaternion}")
+    if not all(abs(t) <= MAX_COORDINATE for t in (x, y, z)):
+        raise InputError(f"{where}: expected a finite translation, found {[x, y, z]}")
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # scipy's order is xyzw
+    viewmat[:3, 3] = x, y, z
+    return _Image(name, camera_id, viewmat)
+
+
+def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
+    records = _Records(path)
+    for _ in range(records.count(24, "cameras")):
+        camera_id, number, width, height = records.take("<IiQQ", "a camera")
+        model = _MODEL_NAMES[number] if 0 <= number < len(_MODEL_NAMES) else f"number {number}"
+        yield camera_id, _lens(f"{path}: camera {camera_id}", model, width, height, records.doubles)
+    records.end()
+
+
+def _images_bin(path: Path) -> Iterator[_Image]:
+    records = _Records(path)
+    for _ in range(records.count(73, "images")):
+        image_id, *pose, camera_id = records.take("<I7dI", "an image")
+        yield _image(f"{path}: image {image_id}", records.name(), camera_id, pose)
+        records.skip(24 * records.count(24, "observations"), "observations")
+    records.end()
+
+
+def _points_bin(path: Path) -> PointCloud:
+    records = _Records(path)
+    data, end = records.data, len(records.data)
+    count = records.count(51, "points")
+    offsets = np.empty(count, dtype=np.int64)
+    offset, track_length = records.offset, struct.Struct("<Q").unpack_from
+    for i in range(count):  # bare offsets: scenes have millions of points, each with a track to skip
+        if offset + 51 > end:
+            raise InputError(
+                f"{path}: expected {count} points, but the file ends in point {i + 1}: it is truncated"
+            )
+        offsets[i] = offset
+        offset += 51 + 8 * track_length(data, offset + 43)[0]
+    if offset > end:
+        raise InputError(
+            f"{path}: expected the track of point {count}, but the file ends in it: it is truncated"
+        )
+    records.offset = offset
+    records.end()
+    fields = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
+    points = raw.view(fields)[:, 0]
+    points = points[np.argsort(points["id"], kind="stable")]
+    return PointCloud.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
+
+
+def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
+    for where, words in _rows(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."):
+        camera_id, width, height = (_number(int, where, words[i]) for i in (0, 2, 3))
+        yield camera_id, _lens(where, words[1], width, height, partial(_floats, where, words[4:]))
+
+
+def _images_txt(path: Path) -> Iterator[_Image]:
+    for where, words in _rows(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", lines=2):
+        yield _image(where, words[9], _number(int, where, words[8]), _floats(where, words[1:8], 7))
+
+
+def _points_txt(path: Path) -> PointCloud:
+    xyz, rgb, ids = [], [], []
+    for where, words in _rows(path, "POINT3D_ID X Y Z R G B ERROR TRACK..."):
+        ids.append(_number(int, where, words[0]))
+        xyz.append(_floats(where, words[1:4], 3))
+        rgb.append([_number(int, where, word) for word in words[4:7]])
+        if not all(0 <= c <= 255 for c in rgb[-1]):
+            raise InputError(f"{where}: expected colours of 0 to 255, found {rgb[-1]}")
+    order = sorted(range(len(ids)), key=ids.__getitem__)
+    positions = np.array(xyz, dtype=np.float64).reshape(-1, 3)[order]
+    return PointCloud.checked(path, positions, np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order])
+
+
+def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:
+    """(where, words) of each record, which takes so many `lines`, of which the first has a `layout`.
+
+    The last word is all the rest of its line (names of images may hold spaces), or split further if the
+    layout ends in `...`, and then it may be missing.
+    """
+    most = len(layout.split())
+    is_open = layout.endswith("...")
+    numbered = iter(enumerate(read_text(path).split("\n"), 1))
+    for number, line in numbered:
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split() if is_open else line.strip().split(maxsplit=most - 1)
+        if len(words) < most - is_open:
+            raise InputError(f"{path}, line {number}: expected `{layout}`, found {line[:80]!r}")
+        yield f"{path}, line {number}", words
+        for _ in range(lines - 1):
+            next(numbered, None)  # the line of an image's observations, which may be empty
+
+
+def _number(kind: Callable[[str], _T], where: str, word: str) -> _T:
+    try:
+        return kind(word)
+    except ValueError as error:
+        name = getattr(kind, "__name__", kind)
+        raise InputError(f"{where}: expected a number ({name}), found {word[:40]!r}") from error
+
+
+def _floats(where: str, words: Sequence[str], count: int) -> list[float]:
+    if len(words) != count:
+        raise InputError(f"{where}: expected {count} numbers, found {len(words)}")
+    return [_number(float, where, word) for word in words]

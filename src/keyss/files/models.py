@@ -68,8 +68,9 @@ def write_model(path: Path | str, model: Gaussians) -> None:
 
 def check_model_output(path: Path | str, overwrite: bool) -> Path:
     """`path`, if `write_model` may write there: see `check_output_file`, and UsageError for its suffix."""
+    path = check_output_file(path, overwrite)
     _for_writing(path)
-    return check_output_file(path, overwrite)
+    return path
 
 
 def describe_model(path: Path | str) -> ModelInfo:

@@ -11,11 +11,6 @@ from keyss.files.point_cloud import read_point_cloud
 from keyss.files.transforms import find_image, inside, read_transforms
 
 
-def is_nerfstudio(folder: Path) -> bool:
-    """Whether the folder holds `transforms.json`."""
-    return (folder / "transforms.json").is_file()
-
-
 def read_nerfstudio(folder: Path) -> SceneLayout:
     """The photos, and the points of `ply_file_path` where it is given.
 
@@ -35,32 +30,25 @@ def read_nerfstudio(folder: Path) -> SceneLayout:
 def _split(
     path: Path, meta: dict[str, Any], photos: tuple[Photo, ...]
 ) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    train = _listed(path, meta, "train_filenames", photos)
-    test = _listed(path, meta, "test_filenames", photos) or _listed(path, meta, "val_filenames", photos)
+    names = {photo.name for photo in photos}
+    train = _listed(path, meta, "train_filenames", names)
+    test = _listed(path, meta, "test_filenames", names) or _listed(path, meta, "val_filenames", names)
     if not train and not test:
         return hold_out(path, photos)
-    train = train or _without(photos, test)
-    test = test or _without(photos, train)
-    both = {photo.name for photo in train} & {photo.name for photo in test}
-    if both:
+    train, test = train or names - test, test or names - train
+    if both := train & test:
         raise InputError(f"{path}: expected training and test images apart, found {min(both)!r} in both")
-    return train, test
+    return tuple(p for p in photos if p.name in train), tuple(p for p in photos if p.name in test)
 
 
-def _without(photos: tuple[Photo, ...], others: tuple[Photo, ...]) -> tuple[Photo, ...]:
-    names = {photo.name for photo in others}
-    return tuple(photo for photo in photos if photo.name not in names)
-
-
-def _listed(path: Path, meta: dict[str, Any], key: str, photos: tuple[Photo, ...]) -> tuple[Photo, ...]:
-    names = meta.get(key)
-    if names is None:
-        return ()
-    if not isinstance(names, list):
-        raise InputError(f"{path}: expected a list as `{key}`, found {type(names).__name__}")
-    by_name = {photo.name: photo for photo in photos}
-    listed = {find_image(path.parent, inside(path, name)) for name in names}
-    unknown = listed - by_name.keys()
-    if unknown:
+def _listed(path: Path, meta: dict[str, Any], key: str, names: set[str]) -> set[str]:
+    """Those of the frames' `names` that the list `key` holds; none where there is no list."""
+    paths = meta.get(key)
+    if paths is None:
+        return set()
+    if not isinstance(paths, list):
+        raise InputError(f"{path}: expected a list as `{key}`, found {type(paths).__name__}")
+    listed = {find_image(path.parent, inside(path, each)) for each in paths}
+    if unknown := listed - names:
         raise InputError(f"{path}: expected `{key}` to name frames, found {min(unknown)!r}, which is none")
-    return tuple(photo for photo in photos if photo.name in listed)
+    return listed

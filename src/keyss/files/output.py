@@ -59,22 +59,21 @@ class OutputFolder:
         was_there = self.path.exists()
         staging = self.path / _STAGING
         try:
-            try:
-                shutil.rmtree(staging, ignore_errors=True)
-                for name, write in writers.items():
-                    (staging / name).parent.mkdir(parents=True, exist_ok=True)
-                    write(staging / name)
-                for name in writers:
-                    (self.path / name).parent.mkdir(parents=True, exist_ok=True)
-                    os.replace(staging / name, self.path / name)
-            except OSError as error:
-                raise OutputError(f"cannot write to {self.path}: {error.strerror or error}") from error
-            finally:
-                shutil.rmtree(staging, ignore_errors=True)
-        except BaseException:
+            shutil.rmtree(staging, ignore_errors=True)
+            for name, write in writers.items():
+                (staging / name).parent.mkdir(parents=True, exist_ok=True)
+                write(staging / name)
+            for name in writers:
+                (self.path / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(staging / name, self.path / name)
+        except BaseException as error:
             if not was_there:
                 shutil.rmtree(self.path, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise OutputError(f"cannot write to {self.path}: {error.strerror or error}") from error
             raise
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
         shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)
 
 

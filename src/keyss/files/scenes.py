@@ -16,18 +16,22 @@ from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.scene import Camera, Scene, View
-from keyss.files.blender import is_blender, read_blender
-from keyss.files.colmap import is_colmap, read_colmap
+from keyss.files.blender import read_blender
+from keyss.files.colmap import colmap_model_folder, read_colmap
 from keyss.files.images import probe_image, read_image, shrink
 from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
-from keyss.files.nerfstudio import is_nerfstudio, read_nerfstudio
+from keyss.files.nerfstudio import read_nerfstudio
 
 # In the order they are tried: a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it.
-_LAYOUTS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], SceneLayout]], ...] = (
-    ("COLMAP (sparse/0/cameras.bin or .txt, images/)", is_colmap, read_colmap),
-    ("Blender / NeRF-synthetic (transforms_train.json)", is_blender, read_blender),
-    ("Nerfstudio (transforms.json)", is_nerfstudio, read_nerfstudio),
+_LAYOUTS: tuple[tuple[str, Callable[[Path], object], Callable[[Path], SceneLayout]], ...] = (
+    ("COLMAP (sparse/0/cameras.bin or .txt, images/)", colmap_model_folder, read_colmap),
+    (
+        "Blender / NeRF-synthetic (transforms_train.json)",
+        lambda folder: (folder / "transforms_train.json").is_file(),
+        read_blender,
+    ),
+    ("Nerfstudio (transforms.json)", lambda folder: (folder / "transforms.json").is_file(), read_nerfstudio),
 )
 
 

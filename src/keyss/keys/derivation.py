@@ -69,11 +69,6 @@ class KeyDerivation:
             if not (type(value) is int and low <= value <= high):
                 raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
 
-    @staticmethod
-    def fresh() -> KeyDerivation:
-        """The default costs (RFC 9106, second recommendation) with a new random salt."""
-        return KeyDerivation(salt=secrets.token_bytes(SALT_BYTES))
-
 
 def expand(secret: bytes, label: str, length: int) -> bytes:
     """`length` bytes for one use of a uniformly random `secret`: HKDF-Expand with SHA-256 (RFC 5869)."""
@@ -90,8 +85,8 @@ class DerivedKey:
     """What a key becomes under one `KeyDerivation`.
 
     The labels in use: "embedding" (what conditions the decoder), "verifier" (tells keys apart while hiding),
-    "seal" (wraps the sidecar's data key), "cells/header" (carries the data key in a model's low bits),
-    "cells/writer" (what is random there depends on it), "carry/key" (carries that of a carried model).
+    "seal" (wraps the sidecar's data key), "low-bits/key" (encrypts the data key in a model's low bits),
+    "rank-shift" (encrypts transparent Gaussians), "writer" (what is random for the writer depends on it), "decoy".
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:

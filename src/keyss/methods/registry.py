@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from keyss.channels.base import Content, Payload
+from keyss.channels.base import Content
 from keyss.channels.low_bits import LowBitsReader
-from keyss.channels.sidecar import open_slots, read_header
+from keyss.channels.sidecar import decrypt_slots, read_header
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
@@ -12,8 +12,6 @@ from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
 from keyss.methods.decoy import Decoy
 from keyss.methods.learned.method import LearnedMethod
-
-_SIDECAR_METHOD = "learned"  # sidecars do not name the method; only one writes them
 
 METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod())}
 
@@ -43,7 +41,7 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
     if sidecar is not None:
         derived = DerivedKey(key, read_header(sidecar)[0])
         try:
-            return _unpacked(Payload(_SIDECAR_METHOD, open_slots(sidecar, derived)))
+            return _unpacked(decrypt_slots(sidecar, derived))
         except WrongKeyError:
             if not decoy:
                 raise

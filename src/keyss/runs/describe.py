@@ -97,7 +97,7 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     derivation = KeyDerivationInfo("Argon2id", costs.memory_kib, costs.time_cost, costs.parallelism)
-    return SidecarInfo("sealed decoder", str(path), path.stat().st_size, derivation)
+    return SidecarInfo("sidecar", str(path), path.stat().st_size, derivation)
 
 
 def _scene_info(scene: Scene) -> SceneInfo:

@@ -12,7 +12,7 @@ import pytest
 from keyss.channels.low_bits.cells import CellCipher
 from keyss.core import errors
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.keys.sealed import unseal
+from keyss.keys.encryption import decrypt
 
 FOLDER = Path(__file__).parents[3] / "tests" / "vectors"
 DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
@@ -43,14 +43,14 @@ def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
 def test_sealing() -> None:
     vector = SEALING["sealed"]
     parts = (bytes.fromhex(vector[name]) for name in ("data_key", "sealed", "associated"))
-    assert unseal(*parts).hex() == vector["payload"]
+    assert decrypt(*parts).hex() == vector["payload"]
 
 
 @pytest.mark.parametrize("vector", SEALING["invalid"], ids=lambda vector: vector["why"])
 def test_sealing_that_must_fail(vector: dict[str, Any]) -> None:
     good = SEALING["sealed"]
     with pytest.raises(getattr(errors, vector["error"]), match=vector["words"]):
-        unseal(
+        decrypt(
             bytes.fromhex(good["data_key"]),
             bytes.fromhex(vector["sealed"]),
             bytes.fromhex(good["associated"]),

@@ -20,7 +20,7 @@ def test_opacities_that_were_rounded_to_zero_are_taken_for_faint_ones() -> None:
     chosen = torch.arange(200) % 3 == 0
     rounded, faint = (
         replace(stego, opacity_logits=stego.opacity_logits.masked_fill(chosen, logit))
-        for logit in (-16.0, secret.decoder.faint_logit)
+        for logit in (-16.0, secret.decoder.nearly_opaque_logit)
     )
     assert torch.equal(
         reveal_gaussians(rounded, secret, force=True).opacity_logits,

@@ -54,7 +54,7 @@ from keyss.channels.low_bits.parameters import PayloadParameters, RecordParamete
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
-from keyss.keys.sealed import compressed_size, seal, sealed_size, unseal
+from keyss.keys.encryption import compressed_size, decrypt, encrypt, encrypted_size
 
 SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
 _ASSOCIATED = b"keyss/v1/low-bits"
@@ -179,7 +179,7 @@ class LowBitsReader:
     def _payload(self, found: PayloadParameters, data_key: bytes) -> Payload:
         chunks = self._decrypt(_chunk_cipher(data_key, self.sh_degree))
         sealed = found.spread.decode(chunks, found.size)
-        return Payload(found.method, unseal(_payload_key(data_key), sealed, _ASSOCIATED))
+        return Payload(found.method, decrypt(_payload_key(data_key), sealed, _ASSOCIATED))
 
     def _records(self, found: RecordParameters, data_key: bytes) -> Records:
         room = self.low.shape[1] // found.cells - TAG_BYTES
@@ -246,7 +246,7 @@ class _Writer:
         share = len(self.rows) // shares(len(contents))
         for index, (keys, content) in enumerate(contents):
             # Spread as its own size asks: what a key shows must not depend on the sizes of other secrets.
-            size = sealed_size(compressed_size(content.data))
+            size = encrypted_size(compressed_size(content.data))
             plan = spread.plan_spread(len(self.rows), len(contents), self._degree, size)
             if plan is None:
                 usable = len(self.rows) / len(self._cover)
@@ -256,7 +256,7 @@ class _Writer:
             self._next = index * share
             data_key = self._data_key(index)
             self._header(keys, data_key, PayloadParameters(content.method, size, plan).pack())
-            sealed = seal(_payload_key(data_key), content.data, _ASSOCIATED, size=size)
+            sealed = encrypt(_payload_key(data_key), content.data, _ASSOCIATED, size=size)
             cells = (index + 1) * share - self._next
             self._whole(_chunk_cipher(data_key, self._degree), plan.encode(sealed, cells))
 

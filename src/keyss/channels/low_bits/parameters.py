@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from keyss.channels.base import Bytes
+from keyss.channels.base import Bytes, pack_method, unpack_method
 from keyss.channels.low_bits.layout import MOST_CELLS, PARAMETER_COPIES, PREFIX_BYTES, part_bytes
 from keyss.channels.low_bits.spread import Spread
 from keyss.core.errors import InputError
@@ -78,7 +78,7 @@ def unpack(parts: Bytes, chunk_bytes: int) -> PayloadParameters | RecordParamete
     if version != VERSION:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
     try:
-        method = name.rstrip(b"\0").decode("ascii")
+        method = unpack_method(name)
         if service == _PAYLOAD_SERVICE:
             size, blocks, n, k = _PAYLOAD.unpack_from(prefix, _PREFIX.size)
             spread = Spread(blocks, n, k, chunk_bytes)
@@ -94,10 +94,7 @@ def unpack(parts: Bytes, chunk_bytes: int) -> PayloadParameters | RecordParamete
 
 
 def _prefix(service: int, method: str, numbers: bytes) -> bytes:
-    name = method.encode("ascii")
-    if not 1 <= len(name) <= 15:
-        raise ValueError(f"expected the name of a method, 1 to 15 characters, got {method!r}")
-    return (_PREFIX.pack(VERSION, service, name) + numbers).ljust(PREFIX_BYTES, b"\0")
+    return (_PREFIX.pack(VERSION, service, pack_method(method)) + numbers).ljust(PREFIX_BYTES, b"\0")
 
 
 def _joined(parts: dict[int, bytes], length: int) -> bytes:

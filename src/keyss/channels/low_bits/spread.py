@@ -19,7 +19,7 @@ from keyss.channels.low_bits import reed_solomon
 from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.layout import header_carriers, part_bytes, shares
 from keyss.core.errors import InputError, UsageError
-from keyss.keys.sealed import sealed_size
+from keyss.keys.encryption import encrypted_size
 
 REMOVAL = 0.25  # share of the Gaussians that may be removed at random
 FAILURE = 1e-7  # probability that a payload is lost all the same
@@ -116,7 +116,7 @@ def carriers_for(size: int, secrets: int, sh_degree: int) -> int:
 
 def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
     """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained."""
-    size = sealed_size(compressed)
+    size = encrypted_size(compressed)
     if payload_capacity(int(gaussians * TYPICAL_SHARE), secrets, sh_degree) < size:
         raise UsageError(too_small(gaussians, TYPICAL_SHARE, size, secrets, sh_degree))
 

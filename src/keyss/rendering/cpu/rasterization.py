@@ -33,6 +33,7 @@ from keyss.rendering.cpu.layout import (
 )
 from keyss.rendering.cpu.memory import Array
 from keyss.rendering.cpu.parallel import run
+from keyss.rendering.cpu.records import GaussianArrays, ProjectedArrays, ViewSettings
 
 MAX_PAIRS = 2**31 - 1  # places in the lists of tiles are int32
 
@@ -52,6 +53,14 @@ class Settings:
     with_depth: bool  # draw the depth as one more channel
     antialiased: bool
     absgrad: bool
+
+    def view(self, camera: Array) -> ViewSettings:
+        """What kernels need to know of a camera [CAMERA]."""
+        distances = (self.near_plane, self.far_plane, self.eps2d, self.radius_clip)
+        near, far, eps2d, radius_clip = (np.float32(distance) for distance in distances)
+        return ViewSettings(
+            camera, self.width, self.height, near, far, eps2d, radius_clip, self.antialiased, self.sh_count
+        )
 
     @property
     def channels(self) -> int:
@@ -73,7 +82,7 @@ class Settings:
 class Drawing:
     """What the backward pass needs to know of one camera's forward pass."""
 
-    camera: Array  # [CAMERA]
+    view: ViewSettings
     footprints: Array  # [N, PACKED]
     features: Array | None  # [N, feature_channels] channels to draw; None for colours in the footprints
     first_slots: Array  # [N] first slot of each Gaussian's pairs
@@ -134,12 +143,13 @@ class _Rasterize(torch.autograd.Function):
         images = _empty(*shape, settings.channels)
         alphas = _empty(*shape, 1)
         transmittances = _empty(*shape)  # 1 - alphas, without the rounding where alpha is nearly 1
-        gaussians = tuple(tensor.detach().numpy() for tensor in (means, quats, scales, opacities, colors))
+        tensors = (means, quats, scales, opacities, colors)
+        gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
         drawings = []
         for c in range(len(viewmats)):
             drawing = _draw(
                 gaussians,
-                _camera_array(viewmats[c], Ks[c]),
+                settings.view(_camera_array(viewmats[c], Ks[c])),
                 backgrounds[c].detach().numpy(),
                 settings,
                 any(ctx.needs_input_grad),
@@ -197,12 +207,8 @@ class _Rasterize(torch.autograd.Function):
             )
             run(
                 projection_backward.project_backward,
-                *(tensor.detach().numpy() for tensor in gaussians),
-                settings.sh_count,
-                drawing.camera,
-                settings.width,
-                settings.height,
-                settings.antialiased,
+                GaussianArrays(*(tensor.detach().numpy() for tensor in gaussians)),
+                drawing.view,
                 settings.feature_channels,
                 drawing.footprints,
                 drawing.first_slots,
@@ -214,7 +220,7 @@ class _Rasterize(torch.autograd.Function):
                 need_colors,
                 need_camera,
                 settings.absgrad,
-                *(gradient.numpy() for gradient in gradients),
+                GaussianArrays(*(gradient.numpy() for gradient in gradients)),
                 means2d_gradient[c].detach().numpy(),
                 absgrad[c].detach().numpy(),
                 camera_gradient,
@@ -241,8 +247,8 @@ def _empty(*shape: int, dtype: Any = np.float32) -> Tensor:
 
 
 def _draw(
-    gaussians: tuple[Array, ...],
-    camera: Array,
+    gaussians: GaussianArrays,
+    view: ViewSettings,
     background: Array,
     settings: Settings,
     for_backward: bool,
@@ -254,37 +260,15 @@ def _draw(
     transmittance: Array,
 ) -> Drawing:
     """One camera's forward pass; fills the last six arrays."""
-    means, quats, scales, opacities, colors = gaussians
-    count = len(means)
+    count = len(gaussians.means)
     width, height = settings.width, settings.height
     columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
     footprints = memory.empty((count, PACKED), np.float32)
     features = memory.empty((count, settings.feature_channels), np.float32)
     slot_counts = memory.empty((count,), np.int32)  # at first a bound
-    run(
-        projection.project,
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        settings.sh_count,
-        camera,
-        width,
-        height,
-        np.float32(settings.near_plane),
-        np.float32(settings.far_plane),
-        np.float32(settings.eps2d),
-        np.float32(settings.radius_clip),
-        settings.antialiased,
-        footprints,
-        features,
-        means2d,
-        depths,
-        radii,
-        slot_counts,
-    )
+    projected = ProjectedArrays(footprints, features, means2d, depths, radii, slot_counts)
+    run(projection.project, gaussians, view, projected)
     order, spare_order = (memory.empty((count,), np.int32) for _ in range(2))
     keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
     visible = binning.sort_by_depth(depths, order, spare_order, keys, spare_keys)
@@ -347,7 +331,7 @@ def _draw(
         ends,
     )
     return Drawing(
-        camera, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
+        view, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
     )
 
 

@@ -1,8 +1,8 @@
-"""Sealing bytes: compressed, padded, encrypted and authenticated under a data key of their own.
+"""Authenticated encryption of one payload: compressed, padded and encrypted under a data key of its own.
 
-ChaCha20-Poly1305 (RFC 8439) under a key that seals one message only, so the nonce may be zero: the writer
-draws the data key at random or derives it from everything that it seals (see `container`), and two messages
-never share one. Lengths are padded to a coarse bucket first: the size tells little of what is inside.
+ChaCha20-Poly1305 (RFC 8439) under a key that encrypts one message only, so the nonce may be zero: the
+writer draws the data key at random or derives it from everything that it encrypts, and two messages never
+share one. Lengths are padded to a coarse bucket first: the size tells little of what is inside.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ def bucket(size: int) -> int:
     return -(-size // step) * step
 
 
-def sealed_size(compressed: int) -> int:
-    """Bytes of a sealed payload whose compressed form takes `compressed` bytes."""
+def encrypted_size(compressed: int) -> int:
+    """Bytes of an encrypted payload whose compressed form takes `compressed` bytes."""
     return bucket(compressed + OVERHEAD)
 
 
 def compressed_size(payload: bytes) -> int:
-    """Bytes of `payload` when compressed as `seal` does it."""
+    """Bytes of `payload` when compressed as `encrypt` does it."""
     return len(_compressed(payload))
 
 
-def seal(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int | None = None) -> bytes:
-    """`payload` sealed under a fresh `data_key` (32 bytes), in `size` bytes or in its bucket's.
+def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int | None = None) -> bytes:
+    """`payload` encrypted under a fresh `data_key` (32 bytes), in `size` bytes or in its bucket's.
 
-    `associated` is authenticated along with it and has to be given again to open. Raises UsageError for a
+    `associated` is authenticated along with it and has to be given again to decrypt. Raises UsageError for a
     payload of more than 64 MiB.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
-        raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to seal, got {len(payload):,}")
+        raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to encrypt, got {len(payload):,}")
     packed = _compressed(payload)
-    size = sealed_size(len(packed)) if size is None else size
+    size = encrypted_size(len(packed)) if size is None else size
     plain = struct.pack("<I", len(packed)) + packed
     if size < len(packed) + OVERHEAD:
         raise ValueError(f"{len(packed)} bytes do not fit into {size}")
@@ -56,12 +56,12 @@ def seal(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int 
     return _cipher(data_key).encrypt(_NONCE, plain, associated)
 
 
-def unseal(data_key: bytes, sealed: bytes, associated: bytes = b"") -> bytes:
-    """The payload that was sealed. Raises InputError when anything at all is not as `seal` left it."""
+def decrypt(data_key: bytes, encrypted: bytes, associated: bytes = b"") -> bytes:
+    """The payload. Raises InputError when anything at all is not as `encrypt` left it."""
     try:
-        plain = _cipher(data_key).decrypt(_NONCE, sealed, associated)
+        plain = _cipher(data_key).decrypt(_NONCE, encrypted, associated)
     except (InvalidTag, ValueError) as error:
-        raise InputError("the sealed data are damaged: their authentication fails") from error
+        raise InputError("the encrypted data are damaged: their authentication fails") from error
     (length,) = struct.unpack_from("<I", plain.ljust(4, b"\0"))
     packed = plain[4 : 4 + length]
     # What follows is bounded although only a holder of the key can have written it.
@@ -69,9 +69,9 @@ def unseal(data_key: bytes, sealed: bytes, associated: bytes = b"") -> bytes:
     try:
         payload = unpacker.decompress(packed, MAX_PAYLOAD_BYTES)
     except zlib.error as error:
-        raise InputError(f"the sealed data cannot be decompressed: {error}") from error
+        raise InputError(f"the encrypted data cannot be decompressed: {error}") from error
     if len(packed) != length or not unpacker.eof or unpacker.unused_data:
-        raise InputError("the sealed data are not whole, or larger than 64 MiB")
+        raise InputError("the encrypted data are not whole, or larger than 64 MiB")
     return payload
 
 

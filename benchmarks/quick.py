@@ -1,0 +1,152 @@
+"""Whether something got slower, in under two minutes: `make benchmark-check`, `make benchmark-baseline`.
+
+    python benchmarks/quick.py             # measure and write the record of this commit
+    python benchmarks/quick.py --check     # compare with the baseline; exit status 1 where it is slower
+    python benchmarks/quick.py --baseline  # the record becomes the baseline
+
+Every part takes turns with a fixed workload on one thread: a product of matrices for what computes with
+floats, AES and BLAKE2b over 32 MiB for what encrypts. Each is worth its fastest round, and what is compared
+are ratios, so that a slower or busier machine shows the same. They still differ between kinds of processors
+(another width of vectors): store a baseline of your own before you change something, or believe only large
+changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import numpy as np
+import torch
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.modes import CTR
+from threadpoolctl import threadpool_limits
+
+from benchmark_record import RESULTS, make_record, read_record, regressions, write_record
+from channels.low_bits.trained_like import trained_like
+from keyss.fitting.config import FitConfig
+from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
+from keyss.methods.carry import embed, extract
+from keyss.rendering import render
+from rasterizer import camera_before, made_up
+
+BASELINE = RESULTS / "quick" / "baseline.json"
+TOLERANCE = 0.35  # share by which a ratio may grow; repeats on a busy machine stayed within 0.2
+WIDTH, HEIGHT, COUNT = 400, 266, 50_000  # of what is drawn
+CARRIED = 20_000  # Gaussians, in as many
+KEY = "the key of the benchmark"
+
+Part = Callable[[], object]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--baseline", action="store_true")
+    parser.add_argument("--rounds", type=int, default=12, help="rounds of each part")
+    parser.add_argument("--tolerance", type=float, default=TOLERANCE, help="share by which a ratio may grow")
+    options = parser.parse_args()
+
+    torch.set_num_threads(1)
+    with threadpool_limits(1):
+        drawing = fastest({"matrix_product": matrix_product(), **drawing_parts()}, options.rounds)
+        carrying = fastest({"encryption": encryption(), **carrying_parts()}, max(2, options.rounds // 2))
+    numbers = {f"{name}_seconds": seconds for name, seconds in {**drawing, **carrying}.items()}
+    ratios = {
+        **over("matrix_product", drawing),
+        "training_step / rasterizer": drawing["training_step"] / drawing["rasterizer"],
+        **over("encryption", carrying),
+    }
+    record = make_record("quick", numbers, ratios)
+    for name, ratio in ratios.items():
+        print(f"{name:32} {ratio:8.3f}")
+    if not options.check:
+        print(write_record(record, BASELINE if options.baseline else None))
+        return 0
+    changes = regressions(record, read_record(BASELINE), options.tolerance)
+    for change in changes:
+        print(f"slower: {change}", file=sys.stderr)
+    return 1 if changes else 0
+
+
+def over(workload: str, seconds: dict[str, float]) -> dict[str, float]:
+    """Each part's time over that of the fixed workload."""
+    return {f"{name} / {workload}": seconds[name] / seconds[workload] for name in seconds if name != workload}
+
+
+def fastest(parts: dict[str, Part], rounds: int) -> dict[str, float]:
+    """Seconds of each part's fastest round; they take turns, after one round that is not counted."""
+    best = dict.fromkeys(parts, float("inf"))
+    for repeat in range(rounds + 1):
+        for name, part in parts.items():
+            start = time.perf_counter()
+            part()
+            if repeat:
+                best[name] = min(best[name], time.perf_counter() - start)
+    return best
+
+
+def matrix_product() -> Part:
+    """Four products of 1024 x 1024 matrices by numpy's BLAS."""
+    matrix = np.random.default_rng(0).random((1024, 1024), np.float32)
+    return lambda: [matrix @ matrix for _ in range(4)]
+
+
+def encryption() -> Part:
+    """AES-256 and BLAKE2b over 32 MiB."""
+    data = bytes(2**25)
+
+    def both() -> None:
+        Cipher(AES(bytes(32)), CTR(bytes(16))).encryptor().update(data)
+        hashlib.blake2b(data).digest()
+
+    return both
+
+
+def drawing_parts() -> dict[str, Part]:
+    """The rasterizer forward and backward, the loss with its gradient, and a whole training step."""
+    gaussians = made_up(COUNT)
+    camera = camera_before(gaussians.means, WIDTH, HEIGHT)
+    config = FitConfig()
+    with torch.no_grad():
+        picture = render(gaussians, camera).clamp(0, 1)
+        target = Target.of(picture.flip(1))
+    weights = torch.randn(picture.shape, generator=torch.Generator().manual_seed(1))
+    leaves = gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_())
+    leaf = picture.clone().requires_grad_()
+    parameters = to_parameters(gaussians, torch.device("cpu"))
+    optimizers = make_optimizers(parameters, config, 1.0)
+
+    def training_step() -> None:
+        photometric_loss(render(to_gaussians(parameters), camera), target, config.ssim_weight).backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+    return {
+        "rasterizer": lambda: render(leaves, camera).backward(weights),
+        "loss": lambda: photometric_loss(leaf, target, config.ssim_weight).backward(),
+        "training_step": training_step,
+    }
+
+
+def carrying_parts() -> dict[str, Part]:
+    """Hiding one model in another without training, and revealing it, key derivation included."""
+    cover, secret = trained_like(CARRIED, 0), trained_like(CARRIED, 1)
+    stego = embed(cover, [(KEY, secret)])
+    return {
+        "carry_embed": lambda: embed(cover, [(KEY, secret)]),
+        "carry_extract": lambda: extract(stego, KEY),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

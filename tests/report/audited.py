@@ -1,0 +1,98 @@
+"""A small run that was really hidden and audited, and changes of what the audit found."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import keyss
+from keyss import Secret
+from keyss.audit import audit
+from keyss.measure.robustness import Change, converters, survival
+from keyss.measure.robustness.changes import half_floats, random_pruning
+from keyss.runs.audit_record import Audit
+from test_api import CONFIG, write_nerfstudio
+from tiny_scenes import random_gaussians, tiny_scene
+
+KEYS = ("the key of a treasure", "the key of a map")
+
+
+def audited_run(root: Path) -> Path:
+    """Two secrets in a garden, 40 x 30 pixels, audited by all parts; one tool for conversions is missing."""
+    scenes = [
+        write_nerfstudio(root / name, tiny_scene(seed))
+        for seed, name in enumerate(("garden", "treasure", "map"))
+    ]
+    secrets = [
+        Secret(scene, key, random_gaussians(150, seed))
+        for seed, (scene, key) in enumerate(zip(scenes[1:], KEYS, strict=True), start=1)
+    ]
+    keyss.hide(
+        scenes[0],
+        secrets,
+        config=CONFIG.with_fit(max_gaussians=1100, iterations=20),
+        width=40,
+        cover_model=random_gaussians(1000, seed=0),  # with room for decoders
+        out=root / "run",
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(survival, "default_changes", lambda *_, **__: _few_changes())
+        patch.setenv("KEYSS_SPLAT_TRANSFORM", str(root / "nowhere"))
+        audit(root / "run", KEYS, controls=2)
+    return root / "run"
+
+
+def _few_changes() -> list[Change]:
+    sog = next(each for each in converters() if each.format == ".sog")
+    return [
+        random_pruning(0.1),
+        *(random_pruning(0.25, draw) for draw in range(3)),
+        half_floats(),
+        sog.change(),
+    ]
+
+
+def found_in(run: Path) -> dict[str, Any]:
+    """The JSON of a run's audit, to be changed."""
+    data: dict[str, Any] = json.loads((run / "audit" / "audit.json").read_bytes())
+    return data
+
+
+def run_with(run: Path, folder: Path, data: object) -> Path:
+    """A copy of a run's audit in a new folder, with other JSON."""
+    shutil.copytree(run / "audit", folder / "audit", dirs_exist_ok=True)
+    (folder / "audit" / "audit.json").write_text(json.dumps(data))
+    return folder
+
+
+def changed(data: dict[str, Any], *changes: tuple[str, Any]) -> Audit:
+    """The record with other values at places such as "images.secrets.0.mean.psnr"."""
+    data = copy.deepcopy(data)
+    for place, value in changes:
+        *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
+        at: Any = data
+        for step in path:
+            at = at[step]
+        at[last] = value
+    return msgspec.convert(data, Audit)
+
+
+def with_all_texts(value: Any, text: str, keep: Callable[[str], bool]) -> Any:
+    """JSON with every text replaced but those under names to be kept."""
+    match value:
+        case str():
+            return text
+        case list():
+            return [with_all_texts(item, text, keep) for item in value]
+        case dict():
+            return {
+                name: item if keep(name) else with_all_texts(item, text, keep) for name, item in value.items()
+            }
+    return value

@@ -1,0 +1,146 @@
+"""Audits that are broken, hostile or from somewhere else."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from keyss.core.errors import InputError
+from keyss.report import untrusted
+from keyss.report.page import prose
+from keyss.report.untrusted import AuditPictures, check_bounds, clean, flat
+from keyss.runs.audit_record import Controls, read_audit
+from report.pages import Parsed
+
+
+@pytest.fixture
+def run(run_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the audit that may be changed, with a picture whose name is known."""
+    shutil.copytree(run_folder / "audit", tmp_path / "run" / "audit")
+    pictures = tmp_path / "run" / "audit" / "pictures"
+    (pictures / "cover-1-photo.png").rename(pictures / "photo.png")
+    return tmp_path / "run"
+
+
+def test_no_audit_says_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"found nothing there; `keyss audit .* makes one"):
+        read_audit(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"version": 1}', '{"version": 2}', '{"version": 2, "run": {}}'])
+def test_broken_audits_are_refused(run: Path, text: str) -> None:
+    (run / "audit" / "audit.json").write_text(text)
+    with pytest.raises(InputError, match=r"audit\.json: expected"):
+        read_audit(run)
+
+
+def test_numbers_and_lists_have_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_bounds(Controls(10**15, (1, 2)))
+    for huge in (10**400, -(10**16)):
+        with pytest.raises(InputError, match=r"audit\.seeds\[1\]: expected a number of at most 1e\+15"):
+            check_bounds(Controls(2, (1, huge)))
+    with pytest.raises(InputError, match=r"audit\.a\.b: expected a number"):
+        check_bounds({"a": {"b": 1e16}})
+    monkeypatch.setattr(untrusted, "_MAX_ENTRIES", 2)
+    check_bounds(Controls(2, (1, 2)))
+    with pytest.raises(InputError, match="at most 2 entries, found 3"):
+        check_bounds(Controls(3, (1, 2, 3)))
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("Füchse 狐 🦊", "Füchse 狐 🦊"),
+        ("two\nlines\ttab", "two lines tab"),
+        ("nul\0 bell\a", "nul\ufffd bell\ufffd"),
+        ("right\u202eleft", "right\ufffdleft"),
+        ("half \ud83e", "half \ufffd"),
+        ("x" * 5000, "x" * 999 + "…"),
+    ],
+)
+def test_texts_are_made_printable(text: str, shown: str) -> None:
+    assert clean(text) == shown
+    clean(text).encode()
+
+
+@given(text=st.text())
+def test_prose_is_text_with_code_in_backquotes(text: str) -> None:
+    page = Parsed(prose(text))
+    assert set(page.tags) <= {"code"}
+    assert "".join(page.texts) == clean(text).replace("`", "")
+
+
+def test_backquotes_mark_what_is_typed() -> None:
+    assert prose("run `a <b>` now") == "run <code>a &lt;b&gt;</code> now"
+    assert prose("<i>") == "&lt;i&gt;"
+
+
+def test_nested_values_as_rows() -> None:
+    config: dict[str, Any] = {"fit": {"seed": 7, "rate": 0.1, "on": True}, "mask": ["op", "sc"], "none": None}
+    assert flat(config) == [
+        ("fit.seed", "7"),
+        ("fit.rate", "0.1"),
+        ("fit.on", "yes"),
+        ("mask", "op, sc"),
+        ("none", "none"),
+    ]
+    deep_list: Any = 1
+    deep: dict[str, Any] = {}
+    for _ in range(900):
+        deep, deep_list = {"a": deep}, [deep_list]
+    assert len(flat({"deep": deep, "list": deep_list})) == 2
+
+
+def test_a_picture_comes_with_its_size(run: Path) -> None:
+    picture = AuditPictures(run).read("pictures/photo.png")
+    assert (picture.width, picture.height) == (40, 30)
+    assert picture.url.startswith("data:image/png;base64,iVBORw0KGgo")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../outside.png",
+        "pictures/../../outside.png",
+        "link.png",
+        "linked/outside.png",
+        "loop",
+        "{outside}",
+        "/etc/passwd",
+        "a\0b.png",
+        "x" * 900,
+    ],
+)
+def test_pictures_outside_the_audit_are_refused(run: Path, tmp_path: Path, name: str) -> None:
+    outside = tmp_path / "outside.png"
+    shutil.copy(run / "audit" / "pictures" / "photo.png", outside)
+    shutil.copy(outside, run / "outside.png")
+    (run / "audit" / "link.png").symlink_to(outside)
+    (run / "audit" / "linked").symlink_to(tmp_path)
+    (run / "audit" / "loop").symlink_to(run / "audit" / "loop")
+    with pytest.raises(InputError):
+        AuditPictures(run).read(name.format(outside=outside))
+
+
+def test_only_png_files_are_pictures(run: Path) -> None:
+    pictures = run / "audit" / "pictures"
+    (pictures / "drawing.png").write_text('<svg xmlns="http://www.w3.org/2000/svg"><script/></svg>')
+    (pictures / "cut.png").write_bytes((pictures / "photo.png").read_bytes()[:20])
+    for name in ("drawing.png", "cut.png", "missing.png", ""):
+        with pytest.raises(InputError):
+            AuditPictures(run).read(f"pictures/{name}")
+
+
+def test_pictures_have_a_limit_together(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = (run / "audit" / "pictures" / "photo.png").stat().st_size
+    monkeypatch.setattr(untrusted, "_MAX_PICTURES", 2 * size)
+    pictures = AuditPictures(run)
+    for _ in range(2):
+        pictures.read("pictures/photo.png")
+    with pytest.raises(InputError, match="at most 0 bytes"):
+        pictures.read("pictures/photo.png")

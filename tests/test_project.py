@@ -1,0 +1,153 @@
+"""What surrounds the code: the rule about skips on CI, metadata, links of the documents."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+import yaml
+
+import keyss
+from benchmark_record import (
+    BenchmarkRecord,
+    Change,
+    Machine,
+    numbers_of_table,
+    read_record,
+    regressions,
+    write_record,
+)
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+SKIPPING = """
+import pytest
+
+def test_a_missing_tool():
+    pytest.skip("needs a chisel")
+
+def test_a_missing_gpu():
+    pytest.skip("CUDA is not available")
+
+@pytest.mark.skipif(True, reason="needs a hammer")
+def test_a_mark():
+    pass
+
+@pytest.mark.xfail(reason="known")
+def test_an_expected_failure():
+    assert False
+
+def test_what_runs():
+    pass
+"""
+
+
+def outcome(folder: Path, ci: str) -> tuple[int, str]:
+    """Exit status and output of pytest on test files in a folder that follow the rule about skips."""
+    (folder / "conftest.py").write_text("from skip_policy import *")
+    # A folder of tests in which an absent package skips the collection.
+    (folder / "test_whole.py").write_text("import pytest\npytest.importorskip('a_package_that_is_absent')")
+    (folder / "test_some.py").write_text(SKIPPING)
+    environment = {**os.environ, "CI": ci, "PYTHONPATH": str(ROOT / "tests")}
+    command = [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
+    return done.returncode, done.stdout
+
+
+def test_a_skip_on_ci_is_a_failure_unless_its_reason_is_allowed(tmp_path: Path) -> None:
+    status, output = outcome(tmp_path, "true")
+    assert status != 0
+    assert "skipped on CI, where everything must run: needs a chisel" in output
+    assert "skipped on CI, where everything must run: needs a hammer" in output
+    assert "a_package_that_is_absent" in output
+    # The file that could not be collected stops pytest unless it is told to go on: it counts as an error.
+    assert re.search(r"ERROR .*test_whole|1 error", output)
+
+
+def test_elsewhere_skips_are_skips(tmp_path: Path) -> None:
+    status, output = outcome(tmp_path, "")
+    assert status == 0
+    assert "1 passed, 4 skipped, 1 xfailed" in output
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_files_that_documents_link_to_exist(document: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text())
+    assert [link for link in links if "://" not in link and not (document.parent / link).exists()] == []
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == keyss.__version__
+    assert re.search(r"^## \[?Unreleased\]?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+
+
+def least(requirement: str) -> tuple[str, str] | None:
+    """Name and least version of `name[extras]>=version,<next`."""
+    found = re.match(r"([a-zA-Z0-9_.-]+)(?:\[[^]]*])?>=([^,]+)", requirement)
+    return (found[1].lower(), found[2]) if found else None
+
+
+def test_the_least_versions_are_those_that_are_tested() -> None:
+    """`make test-oldest` installs the least version of everything that the package declares."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    declared = [*project["dependencies"], *extras["clip"], *extras["metrics"], *extras["test"]]
+    lines = (ROOT / "requirements" / "oldest.txt").read_text().splitlines()
+    pinned = dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))
+    different = {
+        name: (version, pinned.get(name))
+        for name, version in filter(None, map(least, declared))
+        if name != "torch" and not (pinned.get(name, "") + ".").startswith(version + ".")
+    }
+    assert different == {}
+
+
+def record(**ratios: float) -> BenchmarkRecord:
+    machine = Machine("a processor", 2, "Linux x86_64", "3.11", {"numpy": "2.0"})
+    return BenchmarkRecord(name="quick", commit="0123456789ab", machine=machine, ratios=ratios)
+
+
+def test_benchmarks_fail_on_what_got_slower_and_on_nothing_else() -> None:
+    baseline = record(draw=2.0, hide=10.0, reveal=1.0)
+    assert regressions(record(draw=2.6, hide=13.4, reveal=0.1), baseline, 0.35) == []
+    slower = regressions(record(draw=2.8, hide=13.4, reveal=1.0), baseline, 0.35)
+    assert slower == [Change("draw", 2.0, 2.8)]
+    assert "1.40 times" in str(slower[0])
+
+
+def test_benchmarks_notice_a_ratio_that_is_gone_or_new() -> None:
+    changes = regressions(record(draw=2.0, other=1.0), record(draw=2.0, hide=1.0), 0.35)
+    assert changes == [Change("hide", 1.0, None), Change("other", None, 1.0)]
+    assert [str(change) for change in changes] == ["hide: no longer measured", "other: not in the baseline"]
+
+
+def test_a_record_comes_back_from_its_file(tmp_path: Path) -> None:
+    written = record(draw=2.0)
+    assert read_record(write_record(written, tmp_path / "new" / "record.json")) == written
+    (tmp_path / "other.json").write_text('{"name": "quick", "ratios": {"draw": "fast"}}')
+    with pytest.raises(msgspec.ValidationError):
+        read_record(tmp_path / "other.json")
+
+
+def test_the_stored_records_can_be_read() -> None:
+    paths = list((ROOT / "benchmarks" / "results").rglob("*.json"))
+    assert ROOT / "benchmarks" / "results" / "quick" / "baseline.json" in paths
+    for path in paths:
+        assert read_record(path).name == path.parent.name
+
+
+def test_numbers_are_taken_from_a_table() -> None:
+    rows = [["guitar", "2", "81.5 (83.0)", "1.20"], ["robot", "2", "7", "1.15"]]
+    assert numbers_of_table(["scene", "threads", "forward", "step / pass"], rows) == {
+        "guitar, 2: forward": 81.5,
+        "guitar, 2: step / pass": 1.2,
+        "robot, 2: forward": 7.0,
+        "robot, 2: step / pass": 1.15,
+    }
