@@ -196,6 +196,10 @@ class _Rasterize(torch.autograd.Function):
         pieces = -(-len(means) // CHUNK)
         camera_gradient = np.zeros((pieces if need_camera else 0, 15))
         viewmats_gradient = torch.zeros_like(viewmats) if need_camera else None
+        arrays, gradient_arrays = (
+            GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
+            for tensors in (gaussians, gradients)
+        )
         for c, drawing in enumerate(ctx.drawings):
             moments, extras = _blend_backward(
                 drawing,
@@ -206,25 +210,11 @@ class _Rasterize(torch.autograd.Function):
                 settings,
             )
             run(
-                projection_backward.project_backward,
-                GaussianArrays(*(tensor.detach().numpy() for tensor in gaussians)),
-                drawing.view,
-                settings.feature_channels,
-                drawing.footprints,
-                drawing.first_slots,
-                drawing.slot_counts,
-                moments,
-                extras,
-                settings.extra_width,
-                c == 0,
-                need_colors,
-                need_camera,
-                settings.absgrad,
-                GaussianArrays(*(gradient.numpy() for gradient in gradients)),
-                means2d_gradient[c].detach().numpy(),
-                absgrad[c].detach().numpy(),
-                camera_gradient,
-            )
+                projection_backward.project_backward, arrays, drawing.view, settings.feature_channels,
+                drawing.footprints, drawing.first_slots, drawing.slot_counts, moments, extras,
+                settings.extra_width, c == 0, need_colors, need_camera, settings.absgrad, gradient_arrays,
+                means2d_gradient[c].detach().numpy(), absgrad[c].detach().numpy(), camera_gradient,
+            )  # fmt: skip
             if viewmats_gradient is not None:
                 viewmats_gradient[c] = _viewmat_gradient(camera_gradient, viewmats[c])
         if settings.absgrad:
@@ -287,49 +277,24 @@ def _draw(
     rows_of_pairs = memory.empty((most_pairs + 1,), np.int16)
     cursors = memory.empty((shares, columns * rows), np.int64)
     run(
-        binning.list_pairs,
-        footprints,
-        order,
-        columns,
-        height,
-        starts,
-        tiles,
-        rows_of_pairs,
-        slot_counts,
+        binning.list_pairs, footprints, order, columns, height, starts, tiles, rows_of_pairs, slot_counts,
         cursors,
-    )
+    )  # fmt: skip
     tile_starts = memory.empty((columns * rows + 1,), np.int64)
     first_slots = memory.empty((count if for_backward else 0,), np.int32)
     pairs = binning.offsets_from_counts(cursors, tile_starts, slot_counts, first_slots)
     entries = memory.empty((pairs,), np.int64)
     entry_slots = memory.empty((pairs if for_backward else 0,), np.int32)
     run(
-        binning.sort_pairs,
-        order,
-        starts,
-        tiles,
-        rows_of_pairs,
-        slot_counts,
-        first_slots,
-        cursors,
-        entries,
+        binning.sort_pairs, order, starts, tiles, rows_of_pairs, slot_counts, first_slots, cursors, entries,
         entry_slots,
-    )
+    )  # fmt: skip
     ends = memory.empty((columns * rows,), np.int64)
     own_colors = features if settings.feature_channels else None
     run(
-        blending.blend,
-        footprints,
-        own_colors,
-        entries,
-        tile_starts,
-        columns,
-        background,
-        image,
-        alpha,
-        transmittance,
-        ends,
-    )
+        blending.blend, footprints, own_colors, entries, tile_starts, columns, background, image, alpha,
+        transmittance, ends,
+    )  # fmt: skip
     return Drawing(
         view, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
     )
@@ -348,23 +313,11 @@ def _blend_backward(
     moments = memory.empty((slots * MOMENTS,), np.float32)
     extras = memory.empty((slots * settings.extra_width,), np.float32)
     run(
-        blending_backward.blend_backward,
-        drawing.footprints,
-        drawing.features,
-        drawing.entries,
-        drawing.entry_slots,
-        drawing.tile_starts,
-        drawing.ends,
-        -(-settings.width // TILE_WIDTH),
-        image,
-        transmittance,
-        image_gradient,
-        alpha_gradient,
-        moments,
-        extras,
-        settings.extra_width,
+        blending_backward.blend_backward, drawing.footprints, drawing.features, drawing.entries,
+        drawing.entry_slots, drawing.tile_starts, drawing.ends, -(-settings.width // TILE_WIDTH), image,
+        transmittance, image_gradient, alpha_gradient, moments, extras, settings.extra_width,
         settings.absgrad,
-    )
+    )  # fmt: skip
     return moments, extras
 
 
