@@ -2,9 +2,9 @@
 
     python benchmarks/fidelity.py --data FOLDER --hide bonsai,fox miku,lego,fox --write docs/fidelity.md
 
-Each `--hide` names folders of `--data`: a cover, then its secrets. Plain models (the bounds) are fitted once
-and kept in `--work`, as is every result: a run that was cut short goes on where it was. Everything is
-measured through the written files, on test photos.
+Each `--hide` names folders of `--data`: a cover, then its secrets. Plain models (the baselines) are fitted
+once and kept in `--work`, and so is every result: a run that was cut short goes on where it was. Everything
+is measured through the written files, on test photos.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def near_keys(key: str) -> list[str]:
     return (others + changed)[:NEAR_KEYS]
 
 
-def bound(data: Path, name: str, work: Path, settings: argparse.Namespace, seed: int) -> Path:
+def baseline(data: Path, name: str, work: Path, settings: argparse.Namespace, seed: int) -> Path:
     """The plain model of a scene, fitted unless it is there."""
     out = work / f"plain-{name}-{seed}"
     if not (out / "model.ply").exists():
@@ -109,7 +109,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
         found: dict[str, Any] = json.loads((out / "fidelity.json").read_text())
         return found
     config = schedule(PRESETS[preset], settings, seed)
-    models = [bound(data, name, work, settings, seed) for name in names]
+    models = [baseline(data, name, work, settings, seed) for name in names]
     keys = [KEY.format(index) for index in range(1, len(names))]
     watch = Watch()
     metrics = keyss.hide(
@@ -228,7 +228,7 @@ def table(results: Iterable[dict[str, Any]]) -> str:
         "preset",
         "cover (loss)",
         "secrets (loss)",
-        f"{WRONG_KEYS} wrong keys: mean, worst, above floor",
+        f"{WRONG_KEYS} wrong keys: mean, worst, above chance level",
         "near keys: the same",
         "near keys refused",
         "step / plain step",
