@@ -83,7 +83,7 @@ def over(workload: str, seconds: dict[str, float]) -> dict[str, float]:
 
 
 def fastest(parts: dict[str, Part], rounds: int) -> dict[str, float]:
-    """Seconds of the processor of each part's fastest round; they take turns, after one round that is not counted."""
+    """Processor seconds of each part's fastest round. They take turns, and the first round does not count."""
     best = dict.fromkeys(parts, float("inf"))
     for repeat in range(rounds + 1):
         for name, part in parts.items():
