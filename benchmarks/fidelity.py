@@ -2,9 +2,9 @@
 
     python benchmarks/fidelity.py --data FOLDER --hide bonsai,fox miku,lego,fox --write docs/fidelity.md
 
-Each `--hide` names folders of `--data`: a cover, then its secrets. Plain models are fitted once, as baselines
-and kept in `--work`, as is every result. A run that was cut short goes on where it was. Everything is
-measured through the written files, on test photos.
+Each `--hide` names folders of `--data`: a cover, then its secrets. Plain models (the baselines) are fitted
+once and kept in `--work`, and so is every result: a run that was cut short goes on where it was. Everything
+is measured through the written files, on test photos.
 """
 
 from __future__ import annotations
