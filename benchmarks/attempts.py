@@ -21,10 +21,11 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import torch
-from keyss.channels.low_bits.container import embed
 
 import keyss
 from channels.low_bits.trained_like import trained_like
+from keyss.channels.base import Payload
+from keyss.channels.low_bits import LOW_BITS
 from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -33,7 +34,7 @@ from keyss.files.models import write_model
 from keyss.keys import generate_key, random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
-from keyss.methods.learned.revealing import open_secret
+from keyss.methods.registry import open_model
 
 
 def main() -> None:
@@ -48,8 +49,9 @@ def main() -> None:
     decoder.prepare(plain, random_embeddings(1, generator)[0])
     anchors = choose_anchors(plain, generator)
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
-    payload = [(right, pack_secret(secret))]
-    stego, sidecar = embed(plain, payload), encrypt_sidecar(payload)
+    packed = pack_secret(secret)
+    stego = LOW_BITS.prepare(plain).embed([(right, Payload("learned", packed))])
+    sidecar = encrypt_sidecar([(right, packed)])
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"
@@ -71,7 +73,7 @@ def main() -> None:
 
 def _attempt(stego: Gaussians, key: str, sidecar: bytes | None) -> None:
     with suppress(WrongKeyError):
-        open_secret(stego, key, sidecar)
+        open_model(stego, key, sidecar=sidecar)
 
 
 def _compare(name: str, attempt: Callable[[str], object], right: str, wrong: str, rounds: int) -> None:

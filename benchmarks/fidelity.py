@@ -2,9 +2,9 @@
 
     python benchmarks/fidelity.py --data FOLDER --hide bonsai,fox miku,lego,fox --write docs/fidelity.md
 
-Each `--hide` names folders of `--data`: a cover, then its secrets. Plain models (the bounds) are fitted once
-and kept in `--work`, as is every result: a run that was cut short goes on where it was. Everything is
-measured through the written files, on test photos.
+Each `--hide` names folders of `--data`: a cover, then its secrets. Plain models (the baselines) are fitted
+once and kept in `--work`, and so is every result: a run that was cut short goes on where it was. Everything
+is measured through the written files, on test photos.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
-from keyss.methods.learned.config import PRESETS, HideConfig
 
 import keyss
 from benchmark_record import make_record, write_record
@@ -35,9 +35,10 @@ from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.plain import PlainRun
 from keyss.keys import DerivedKey, KeyDerivation, random_embeddings
 from keyss.measure.hiding import what_wrong_keys_show
+from keyss.methods import registry
 from keyss.methods.learned.joint import JointRun
+from keyss.methods.learned.options import PRESETS, LearnedOptions
 from keyss.methods.learned.pipeline import training_salt
-from keyss.methods.learned.revealing import open_secret
 from keyss.methods.learned.targets import PlacedScene
 from keyss.progress import reporter
 
@@ -75,7 +76,7 @@ def near_keys(key: str) -> list[str]:
     return (others + changed)[:NEAR_KEYS]
 
 
-def bound(data: Path, name: str, work: Path, settings: argparse.Namespace, seed: int) -> Path:
+def baseline(data: Path, name: str, work: Path, settings: argparse.Namespace, seed: int) -> Path:
     """The plain model of a scene, fitted unless it is there."""
     out = work / f"plain-{name}-{seed}"
     if not (out / "model.ply").exists():
@@ -91,7 +92,7 @@ def bound(data: Path, name: str, work: Path, settings: argparse.Namespace, seed:
     return out / "model.ply"
 
 
-def schedule(config: HideConfig, settings: argparse.Namespace, seed: int) -> HideConfig:
+def schedule(config: LearnedOptions, settings: argparse.Namespace, seed: int) -> LearnedOptions:
     """The preset at the sizes that are asked for."""
     return config.with_fit(
         iterations=settings.iterations,
@@ -108,8 +109,8 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
     if (out / "fidelity.json").exists():
         found: dict[str, Any] = json.loads((out / "fidelity.json").read_text())
         return found
-    config = schedule(PRESETS[preset], settings, seed)
-    models = [bound(data, name, work, settings, seed) for name in names]
+    config = schedule(PRESETS[preset], settings, seed).adapted(sidecar=preset in ("paper", "released"))
+    models = [baseline(data, name, work, settings, seed) for name in names]
     keys = [KEY.format(index) for index in range(1, len(names))]
     watch = Watch()
     metrics = keyss.hide(
@@ -118,10 +119,9 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
             keyss.Secret(data / name, key, model)
             for name, key, model in zip(names[1:], keys, models[1:], strict=True)
         ],
-        config=config,
+        method=config,
         width=settings.width,
         cover_model=models[0],
-        sidecar=preset in ("paper", "released"),
         out=out,
         overwrite=True,
         reporter=watch,
@@ -131,7 +131,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
         "names": list(names),
         "preset": preset,
         "seed": seed,
-        "metrics": metrics,
+        "metrics": msgspec.to_builtins(metrics),
         "history": watch.history,
         "near": near_and_wrong(out, keys, scenes, seed),
         "cost": step_cost(scenes, models, config),
@@ -145,26 +145,26 @@ def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed
     stego = read_model(out / "stego.ply")
     beside = out / "decoder.sealed"
     sidecar = beside.read_bytes() if beside.exists() else None
-    opened = [open_secret(stego, key, sidecar) for key in keys]
+    opened = [registry.open_model(stego, key, sidecar=sidecar) for key in keys]
     derivation = KeyDerivation(salt=training_salt(scenes[0], seed))
     near = [other for key in keys for other in near_keys(key)]
     embeddings = torch.stack([DerivedKey(key, derivation).embedding() for key in near])
     refused = 0
     for key in near:
         try:
-            open_secret(stego, key, sidecar)
+            registry.open_model(stego, key, sidecar=sidecar)
         except WrongKeyError:
             refused += 1
     wrong = random_embeddings(WRONG_KEYS, torch.Generator().manual_seed(seed + 1))
     return {
         "refused": refused,
         "keys": len(near),
-        "near": what_wrong_keys_show(stego, opened, scenes, embeddings),
-        "wrong": what_wrong_keys_show(stego, opened, scenes, wrong),
+        "near": msgspec.to_builtins(what_wrong_keys_show(stego, opened, scenes, embeddings)),
+        "wrong": msgspec.to_builtins(what_wrong_keys_show(stego, opened, scenes, wrong)),
     }
 
 
-def step_cost(scenes: Sequence[Scene], models: Sequence[Path], config: HideConfig) -> float:
+def step_cost(scenes: Sequence[Scene], models: Sequence[Path], config: LearnedOptions) -> float:
     """Time of a hiding step over that of a plain step of the cover, with as many Gaussians, in one run."""
     plains = [read_model(path) for path in models]
     cameras = [view.camera for view in scenes[0].train]
@@ -190,10 +190,10 @@ def step_cost(scenes: Sequence[Scene], models: Sequence[Path], config: HideConfi
 def row(result: dict[str, Any]) -> list[str]:
     """One line of the table."""
     metrics, near = result["metrics"], result["near"]
-    cover = metrics["bound"]["cover"]["psnr"] - metrics["cover"]["psnr"]
+    cover = metrics["baseline"]["cover"]["psnr"] - metrics["cover"]["psnr"]
     secrets = [
-        bound["psnr"] - each["psnr"]
-        for bound, each in zip(metrics["bound"]["secrets"], metrics["secrets"], strict=True)
+        plain["psnr"] - each["psnr"]
+        for plain, each in zip(metrics["baseline"]["secrets"], metrics["secrets"], strict=True)
     ]
 
     def against(which: str) -> str:
@@ -201,7 +201,8 @@ def row(result: dict[str, Any]) -> list[str]:
         mean = metrics["cover"]["psnr"] - shown["vs_cover"]["mean"]
         worst = metrics["cover"]["psnr"] - shown["vs_cover"]["min"]
         above = max(
-            each["max"] - floor for each, floor in zip(shown["vs_secrets"], shown["floor"], strict=True)
+            each["max"] - level
+            for each, level in zip(shown["vs_secrets"], metrics["chance_level"], strict=True)
         )
         return f"{mean:.2f}, {worst:.2f}, {above:.2f}"
 
@@ -228,7 +229,7 @@ def table(results: Iterable[dict[str, Any]]) -> str:
         "preset",
         "cover (loss)",
         "secrets (loss)",
-        f"{WRONG_KEYS} wrong keys: mean, worst, above floor",
+        f"{WRONG_KEYS} wrong keys: mean, worst, above chance level",
         "near keys: the same",
         "near keys refused",
         "step / plain step",

@@ -5,10 +5,10 @@
     python benchmarks/quick.py --baseline  # the record becomes the baseline
 
 Every part takes turns with a fixed workload on one thread: a product of matrices for what computes with
-floats, AES and BLAKE2b over 32 MiB for what encrypts. Each is worth its fastest round, and what is compared
-are ratios, so that a slower or busier machine shows the same. They still differ between kinds of processors
-(another width of vectors): store a baseline of your own before you change something, or believe only large
-changes.
+floats, AES and BLAKE2b over 32 MiB for what encrypts. The fastest round of each counts, in time of the
+processor and not of the clock. Ratios are compared, so that a slower or busier machine shows nearly the same.
+They still differ between kinds of processors (another width of vectors): store a baseline of your own before
+you change something, or believe only large changes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from keyss.rendering import render
 from rasterizer import camera_before, made_up
 
 BASELINE = RESULTS / "quick" / "baseline.json"
-TOLERANCE = 0.35  # share by which a ratio may grow; repeats on a busy machine stayed within 0.2
+TOLERANCE = 0.5  # share by which a ratio may grow; it grew by up to 0.4 when five others used the machine
 WIDTH, HEIGHT, COUNT = 400, 266, 50_000  # of what is drawn
 CARRIED = 20_000  # Gaussians, in as many
 KEY = "the key of the benchmark"
@@ -83,14 +83,14 @@ def over(workload: str, seconds: dict[str, float]) -> dict[str, float]:
 
 
 def fastest(parts: dict[str, Part], rounds: int) -> dict[str, float]:
-    """Seconds of each part's fastest round; they take turns, after one round that is not counted."""
+    """Processor seconds of each part's fastest round. They take turns, and the first round does not count."""
     best = dict.fromkeys(parts, float("inf"))
     for repeat in range(rounds + 1):
         for name, part in parts.items():
-            start = time.perf_counter()
+            start = time.process_time()
             part()
             if repeat:
-                best[name] = min(best[name], time.perf_counter() - start)
+                best[name] = min(best[name], time.process_time() - start)
     return best
 
 

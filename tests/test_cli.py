@@ -6,24 +6,47 @@ import errno
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pytest
+from rich.console import Console
 
 from files.scene_files import photo, save, write_blender, write_colmap, write_nerfstudio
 from keyss import api as verbs
 from keyss.cli import commands, main
+from keyss.cli.tables import print_hiding
 from keyss.files.ply import read_ply
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.learned.options import PRESETS as HIDE_PRESETS
+from keyss.fitting.image_metrics import ImageQuality
+from keyss.measure.hiding import BaselineQuality, PsnrRange, WrongKeys
+from keyss.methods import registry
+from keyss.methods.learned.options import PRESETS as LEARNED_PRESETS
+from keyss.runs.metrics import HideMetrics
+from tiny_scenes import random_gaussians
 
+METRICS = HideMetrics(
+    method="learned",
+    cover=ImageQuality(30.0, 0.5),
+    secrets=(ImageQuality(20.0, 0.25),),
+    baseline=BaselineQuality(ImageQuality(30.5, 0.6), (None,)),
+    wrong_key=None,
+    chance_level=(9.0,),
+    gaussians=1234,
+    secret_gaussians=(567,),
+    iterations=10,
+    seconds=1.0,
+    width=100,
+    seed=0,
+    details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
+)
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
 COMMANDS = [command.__name__ for command in commands.ALL]
 
@@ -104,13 +127,19 @@ class TestHelp:
         assert making + judging == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)
-    def test_shows_an_example_and_the_common_options(self, keyss: Callable[..., Said], command: str) -> None:
+    def test_shows_an_example(self, keyss: Callable[..., Said], command: str) -> None:
         said = keyss(command, "--help")
         assert said.status == 0
         assert f"example: keyss {command}" in said.out
-        assert "--seed" in said.out
-        assert "--device {auto,cpu,cuda}" in said.out
         assert "default: None" not in said.out
+
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
+        out = keyss(command, "--help").out
+        assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "demo"})
+        computing = {"fit", "hide", "reveal", "render", "evaluate", "audit", "demo"}
+        assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
+        assert "nothing here" not in out
 
     @pytest.mark.parametrize("command", ["fit", "hide"])
     def test_shows_the_options_of_training(self, keyss: Callable[..., Said], command: str) -> None:
@@ -118,10 +147,31 @@ class TestHelp:
         for option in ("preset", "iterations", "max-gaussians", "width", "background", "resume", "overwrite"):
             assert f"--{option}" in out
 
-    @pytest.mark.parametrize(("command", "presets"), [("fit", FIT_PRESETS), ("hide", HIDE_PRESETS)])
-    def test_offers_the_presets_there_are(self, command: str, presets: dict[str, Any]) -> None:
-        hint = get_type_hints(getattr(commands, command), include_extras=False)["preset"]
-        assert get_args(hint) == tuple(presets)
+    def test_offers_the_presets_there_are(self, keyss: Callable[..., Said]) -> None:
+        assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
+        for name, method in registry.METHODS.items():
+            said = keyss("hide", "--method", name, "--help").out
+            assert f"--preset {{{','.join(method.presets)}}}" in said
+            assert f"(default: {next(iter(method.presets))})" in said
+
+    @pytest.mark.parametrize("method", ["learned", "carry"])
+    def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:
+        """Names, defaults and sentences of all options; `hide_METHOD_help.txt` is what is meant."""
+        meant = Path(__file__).with_name(f"hide_{method}_help.txt").read_text(encoding="utf-8")
+        said = keyss("hide", "--method", method, "--help").out
+        assert [line.rstrip() for line in said.splitlines()] == meant.splitlines()
+
+    def test_needs_no_method_to_be_loaded(self) -> None:
+        """`keyss --help` answers at once: torch takes seconds."""
+        program = "import sys; from keyss.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+        program += "assert not {'torch', 'keyss.methods'} & set(sys.modules)"
+        subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+
+    def test_an_unknown_method_names_those_there_are(self, keyss: Callable[..., Said]) -> None:
+        said = keyss("hide", "--method", "none", "--cover", "A", "--secret", "B", "-o", "out")
+        assert said.status == 2
+        assert "learned" in said.err
+        assert "carry" in said.err
 
     @pytest.mark.parametrize("arguments", [(), ("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
     def test_wrong_usage_exits_with_2(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:
@@ -153,7 +203,8 @@ class TestKeygen:
         assert_refused(keyss("keygen", "--bits", 0), 2, "--bits")
 
     def test_takes_no_seed(self, keyss: Callable[..., Said]) -> None:
-        assert_refused(keyss("keygen", "--seed", 1), 2, "no secret")
+        """A key that can be drawn again is no secret."""
+        assert keyss("keygen", "--seed", 1).status == 2
 
 
 class TestTheWholePath:
@@ -224,14 +275,65 @@ class TestTheWholePath:
         assert len((tmp_path / "a.ply").read_bytes()) == len((tmp_path / "b.ply").read_bytes())
 
 
+class TestNumbers:
+    """What is printed of a hiding, whatever its method."""
+
+    def table(self, metrics: HideMetrics) -> list[list[str]]:
+        console = Console(file=io.StringIO(), width=120)
+        print_hiding(metrics, console)
+        text: str = console.file.getvalue()  # type: ignore[attr-defined]
+        return [re.split("  +", line.strip()) for line in text.splitlines()]
+
+    def test_a_row_for_each_and_what_the_method_adds(self) -> None:
+        rows = self.table(METRICS)
+        assert rows[:4] == [
+            ["against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians"],
+            ["cover", "30.00", "0.500", "30.50", "0.50", "1,234"],
+            ["secret", "20.00", "0.250", "567"],
+            ["the stego cover, against the secret", "9.00"],
+        ]
+        assert rows[-2:] == [["carriers: 1,000"], ["bits per gaussian: 568, 600"]]
+
+    def test_columns_that_nothing_fills_are_left_out(self) -> None:
+        rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,)), details={}))
+        assert rows[0] == ["against the test photos", "PSNR", "SSIM", "Gaussians"]
+        assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
+
+    def test_wrong_keys_where_there_is_a_decoder(self) -> None:
+        two = replace(
+            METRICS,
+            secrets=METRICS.secrets * 2,
+            baseline=BaselineQuality(None, (None, None)),
+            secret_gaussians=(5, 6),
+            chance_level=(9.0, 8.0),
+            wrong_key=WrongKeys(
+                7, PsnrRange(28.0, 27.0, 29.0), (PsnrRange(8.0, 7.0, 9.5), PsnrRange(6.0, 5.0, 7.5))
+            ),
+        )
+        rows = [row[:2] for row in self.table(two)]
+        assert rows[3:10] == [
+            ["secret 2", "20.00"],
+            ["7 wrong keys, against the cover", "28.00"],
+            ["the worst of them", "27.00"],
+            ["the one nearest to the secret 1", "9.50"],
+            ["the one nearest to the secret 2", "7.50"],
+            ["the stego cover, against the secret 1", "9.00"],
+            ["the stego cover, against the secret 2", "8.00"],
+        ]
+
+
 class TestArguments:
     """What reaches the functions."""
 
     @pytest.fixture
     def hidden(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
         calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
-        monkeypatch.setattr(verbs, "hide", lambda *args, **kwargs: calls.append((args, kwargs)))
-        monkeypatch.setattr("keyss.cli.commands._metrics", lambda out: {"cover": {"psnr": 1.0, "ssim": 0.5}})
+
+        def hide(*args: Any, **kwargs: Any) -> verbs.HideResult:
+            calls.append((args, kwargs))
+            return verbs.HideResult(random_gaussians(1), None, METRICS)
+
+        monkeypatch.setattr(verbs, "hide", hide)
         return calls
 
     def test_secrets_and_keys_pair_up_in_order(
@@ -271,22 +373,18 @@ class TestArguments:
         )
         assert said.status == 0, said.err
         _, options = hidden[0]
-        config = options.pop("config")
+        config = options.pop("method")
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
         assert config.mask == ("sc", "xyz")
         assert config.start == "points"
         assert config.decoder == "network"
-        assert config.fit.evaluate_every == HIDE_PRESETS["quick"].fit.evaluate_every
+        assert (config.iterations, config.max_gaussians) == (7, 80)
+        assert config.fit.evaluate_every == LEARNED_PRESETS["quick"].fit.evaluate_every
         assert options.pop("reporter") is not None
         assert options == {
             "width": 10,
             "background": (1.0, 0.5, 0.0),
             "cover_model": Path("m.ply"),
-            "sidecar": False,
-            "encoder": None,
-            "method": "learned",
-            "thin": False,
-            "dither": False,
             "device": "cpu",
             "out": Path("out"),
             "overwrite": False,
@@ -298,7 +396,21 @@ class TestArguments:
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
-        assert hidden[0][1]["config"] == HIDE_PRESETS["best"]
+        assert hidden[0][1]["method"] == LEARNED_PRESETS["best"]
+        assert keyss("hide", "--method", "carry", "--cover", "A", "--secret", "B", "-o", "out").status == 0
+        assert hidden[1][1]["method"] == registry.get("carry").presets["best"]
+
+    def test_options_of_a_method_reach_it(
+        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("KEYSS_KEY", "k")
+        scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
+        assert keyss(*scenes, "--sidecar", "--key-encoder", "clip", "--clip-model", "C").status == 0
+        learned = hidden[0][1]["method"]
+        assert (learned.sidecar, learned.key_encoder, learned.clip_model) == (True, "clip", "C")
+        assert keyss(*scenes, "--method", "carry", "--thin", "--dither", "--seed", 5).status == 0
+        carry = hidden[1][1]["method"]
+        assert (carry.prune_to_fit, carry.dither, carry.fit.seed) == (True, True, 5)
 
     @pytest.mark.parametrize(
         ("extra", "words"),
@@ -438,7 +550,14 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "file exists": (
         5,
         "--overwrite",
-        lambda f: ["reveal", f / "hidden/stego.ply", "--key-file", f / "key.txt", "-o", f / "key.txt"],
+        lambda f: [
+            "reveal",
+            f / "hidden/stego.ply",
+            "--key-file",
+            f / "key.txt",
+            "-o",
+            f / "hidden/stego.ply",
+        ],
     ),
     "folder of the file missing": (
         5,

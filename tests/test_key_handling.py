@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import base64
-import inspect
 import io
 import logging
 import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -17,9 +17,11 @@ from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels.base import Payload
 from keyss.channels.sidecar import decrypt_sidecar, encrypt_sidecar
 from keyss.cli import commands, main
+from keyss.cli.hiding import hide_with_options
 from keyss.core.errors import KeyssError
 from keyss.fitting.loop import SilentReporter
 from keyss.keys import DerivedKey, KeyDerivation
+from keyss.methods.registry import METHODS
 
 KEY = "q7Rv2LxT9bWm4KzD"
 SPELLINGS = [
@@ -92,10 +94,11 @@ def test_nothing_that_is_written_or_said_holds_the_key(
 
 
 def test_no_command_takes_a_key_as_an_argument() -> None:
-    for command in commands.ALL:
-        for name, parameter in inspect.signature(command).parameters.items():
+    hiding = [hide_with_options(["hide", "--method", name]) for name in METHODS]
+    for command in (*commands.ALL, *hiding):
+        for name, hint in get_type_hints(command, include_extras=False).items():
             if "key" in name and name not in ("wrong_keys", "key_encoder"):
-                assert "Path" in str(parameter.annotation) or parameter.annotation == "KeyFiles", name
+                assert Path in (hint, *get_args(hint)), name
 
 
 def test_errors_and_representations_do_not_show_the_key() -> None:

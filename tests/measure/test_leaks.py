@@ -27,9 +27,9 @@ from keyss.measure.leaks import (
 from keyss.measure.leaks.attacks import THRESHOLDS
 from keyss.methods.learned.attacks import known_remaps as learned_attacks
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.opacity_band import OpacityBand, hidden_logits, opacity_remap
 from keyss.methods.learned.payload import HiddenSecret
 from keyss.methods.learned.revealing import OpenedSecret
-from keyss.methods.learned.start import hidden_logits, opacity_curve
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
 Rows = dict[str, AttackResult]
@@ -101,7 +101,7 @@ def test_those_in_a_band_are_found_as_they_are_by_who_reads_the_source() -> None
 
 
 def test_those_that_left_their_band_are_found_too() -> None:
-    rows = _look(_with_hidden(opacity_curve(0)[0][4] + 0.2))
+    rows = _look(_with_hidden(OpacityBand.of_secret(0).outer_high + 0.2))
     assert rows["by the source"].best == "outside the bands"
     assert rows["by the source"].leak.gradient > 0.3
 
@@ -168,7 +168,7 @@ def _decoder(conditioning: str) -> HiddenSecret:
     decoder = Decoder(DecoderShape(kind=kind, conditioning=conditioning))  # type: ignore[arg-type]
     decoder.prepare(HIDDEN, random_embeddings(1, torch.Generator().manual_seed(3))[0])
     if conditioning == "gate":
-        decoder.set_curve(*opacity_curve(0))
+        decoder.set_remap(*opacity_remap(0))
     return HiddenSecret(decoder.requires_grad_(False), FRAME, HIDDEN.means[:4])
 
 

@@ -21,8 +21,7 @@ from keyss.measure.leaks.opacities import (
     opaque,
     rescaled,
 )
-from keyss.methods.learned.attacks import attacks, by_the_source, outside_the_bands
-from keyss.methods.learned.start import hidden_logits, opacity_curve
+from keyss.methods.learned.attacks import known_remaps
 from keyss.rendering.contributions import contributions
 from tiny_scenes import random_gaussians, ring_cameras
 
@@ -88,27 +87,6 @@ def test_least_contributing_are_those_that_no_camera_sees() -> None:
     assert (shown.means > 50).all()
 
 
-@pytest.mark.parametrize("secret", [0, 1, 2])
-def test_the_source_gives_the_opacities_of_a_band_back_and_hides_the_rest(secret: int) -> None:
-    model = random_gaussians(50)
-    hidden = replace(model, opacity_logits=hidden_logits(model.opacity_logits, secret))
-    shown = by_the_source(Gaussians.cat([model, hidden]), secret)
-    torch.testing.assert_close(
-        shown.opacity_logits[50:], model.opacity_logits.clamp(-4, 6), atol=1e-4, rtol=0
-    )
-    assert (shown.opacities[:50] < 1 / 255).all()
-    assert (by_the_source(hidden, (secret + 1) % 3).opacities < 1 / 255).all()
-
-
-def test_outside_the_bands_is_what_is_not_drawn_and_in_no_band() -> None:
-    bands = [opacity_curve(secret)[0] for secret in range(2)]
-    inside = [(knots[1] + knots[4]) / 2 for knots in bands]
-    stray = [bands[0][4] + 0.1, bands[1][1] - 0.1]
-    logits = torch.tensor([*inside, *stray, -5.0, 2.0])
-    model = replace(random_gaussians(len(logits)), opacity_logits=logits)
-    assert outside_the_bands(model, 2).opacity_logits.tolist() == pytest.approx(stray)
-
-
 def _planted(attribute: Attribute, factor: float) -> Gaussians:
     """The last 40 of 400 have an attribute multiplied."""
     model = random_gaussians(400)
@@ -163,7 +141,7 @@ def test_clusters_part_the_model_and_tell_two_kinds_from_each_other() -> None:
 def test_attacks_show_the_same_labels_of_any_model_and_change_nothing(count: int, sh_degree: int) -> None:
     model, large = random_gaussians(count, sh_degree=sh_degree), random_gaussians(50)
     before = model.map(torch.clone)
-    for attack in [*file_attacks(ring_cameras(2)), source_attack(lambda model: attacks(model, 3))]:
+    for attack in [*file_attacks(ring_cameras(2)), source_attack(lambda model: known_remaps(model, 3))]:
         shown = list(attack.show(model))
         assert [label for label, _ in shown] == [label for label, _ in attack.show(large)]
         assert len({label for label, _ in shown}) == len(shown)

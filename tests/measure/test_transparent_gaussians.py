@@ -44,7 +44,7 @@ def test_the_transparent_gaussians_of_one_file_say_nothing(pair: tuple[list[Scen
 def test_with_a_sidecar_they_show_the_secret_without_a_key(
     pair: tuple[list[Scene], list[Gaussians]],
 ) -> None:
-    """The control, and a limit: what is to survive rounding cannot be scrambled."""
+    """The control, and a limit: what is to survive rounding cannot be encrypted."""
     assert _gain(*pair, sidecar=True) > 20
 
 
@@ -55,12 +55,12 @@ def test_what_is_transparent_in_the_cover_is_scrambled_or_left_out(
     scenes, models = pair
     rates = replace(CONFIG.fit, iterations=40, max_gaussians=2000, opacities_rate=2.0)
     hidden = hide_scenes(scenes, ["a key"], replace(CONFIG, fit=rates), plains=models)
-    scramble = hidden.secrets[0].scramble
-    assert scramble is not None
+    rank_shift = hidden.secrets[0].rank_shift
+    assert rank_shift is not None
     logits = hidden.stego.opacity_logits
-    scrambled = (logits > scramble.band[0]) & (logits < scramble.band[1])
-    assert 0 < int(scrambled.sum()) <= 200
-    assert (scrambled | (hidden.stego.opacities >= 1 / 255)).all()
+    encrypted = (logits > rank_shift.band[0]) & (logits < rank_shift.band[1])
+    assert 0 < int(encrypted.sum()) <= 200
+    assert (encrypted | (hidden.stego.opacities >= 1 / 255)).all()
 
 
 def test_carrying_adds_no_transparent_gaussians() -> None:

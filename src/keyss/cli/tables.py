@@ -135,7 +135,7 @@ def _numbered(name: str, index: int, count: int) -> str:
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     for name, value in facts.items():
-        if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
             value = {str(index): item for index, item in enumerate(value, start=1)}
         if isinstance(value, Mapping):
             rows += _flat(value, f"{prefix}{name}.")

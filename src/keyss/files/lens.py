@@ -117,8 +117,9 @@ def undistortion(lens: Lens, where: str) -> Undistortion:
     """The resampling that takes `lens` to the pinhole with the same principal point and size.
 
     The focal lengths stay as they are, or grow together by the least factor at which every pixel of
-    the new image is seen in the photo: no invented borders, and no upsampling beyond that. Raises
-    InputError, which starts with `where`, when there is no such factor up to 8.
+    the new image is seen in the photo: no invented borders, and no upsampling beyond that. The search is
+    our own because OpenCV's moves the principal point and takes content that a lens shows twice for good.
+    Raises InputError, which starts with `where`, when there is no such factor up to 8.
     """
     if _covers(lens, 1.0):
         zoom = 1.0

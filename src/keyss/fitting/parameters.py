@@ -1,7 +1,7 @@
 """A 3DGS model as optimisers and gsplat's strategies want it: a dict of parameters with an Adam each.
 
-The spelling `means quats scales opacities` (scales and opacities still raw) is gsplat's and stays inside
-`fit` and `hide`. Unlike there, all SH coefficients are one parameter, so that no step copies them.
+The names `means quats scales opacities` (scales and opacities still raw) are gsplat's and are used for
+training only. Unlike in gsplat, all SH coefficients are one parameter, so that no step copies them.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class DerivedKey:
 
     The labels in use: "embedding" (what conditions the decoder), "verifier" (tells keys apart while hiding),
     "seal" (wraps the sidecar's data key), "low-bits/key" (encrypts the data key in a model's low bits),
-    "scramble" (the keyed rank shift), "writer" (what is random for the writer depends on it), "decoy".
+    "rank-shift" (encrypts transparent Gaussians), "writer" (part of the writer's randomness), "decoy".
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:

@@ -70,7 +70,7 @@ def test_the_curve_goes_through_its_knots_and_on_beyond_them() -> None:
     gaussians = replace(random_gaussians(8), opacity_logits=torch.tensor([-9.0, -4, -3, -1, 0, 1, 2, 9]))
     decoder = Decoder(DecoderShape())
     decoder.prepare(gaussians, _embedding())
-    decoder.set_curve([-5, -3, -1, 0, 1, 2], [2, 0, 4, 4, 5, 4])
+    decoder.set_remap([-5, -3, -1, 0, 1, 2], [2, 0, 4, 4, 5, 4])
     decoded = decoder(gaussians, _embedding())
     expected = torch.tensor([-9.0 + 6, -4 + 1, -3, -1 + 4, 4, 1 + 5, 2 + 4, 9 - 3])
     torch.testing.assert_close(decoded.opacity_logits, expected)
@@ -83,7 +83,7 @@ def test_the_gate_lets_one_key_through_and_no_other(kind: Any) -> None:
     if decoder is None:
         decoder = Decoder(DecoderShape())
         decoder.prepare(gaussians, _embedding())
-    decoder.set_curve([-5, -3, -1, 0, 1, 2], [7, 7, 7, 7, 7, 7])
+    decoder.set_remap([-5, -3, -1, 0, 1, 2], [7, 7, 7, 7, 7, 7])
     own = _embedding()
     assert _distance(decoder(gaussians, own), gaussians, "opacity_logits") > 5
     # Half precision of the key is near enough; wrong keys are nowhere near.

@@ -20,7 +20,7 @@ def test_opacities_that_were_rounded_to_zero_are_taken_for_faint_ones() -> None:
     chosen = torch.arange(200) % 3 == 0
     rounded, faint = (
         replace(stego, opacity_logits=stego.opacity_logits.masked_fill(chosen, logit))
-        for logit in (-16.0, secret.decoder.faint_logit)
+        for logit in (-16.0, secret.decoder.nearly_opaque_logit)
     )
     assert torch.equal(
         reveal_gaussians(rounded, secret, force=True).opacity_logits,
@@ -76,5 +76,5 @@ def test_what_is_left_makes_up_for_what_was_lost() -> None:
 @pytest.mark.parametrize("count", [-1, 2**40, 1.5, True, None])
 def test_a_count_out_of_bounds_is_refused(count: object) -> None:
     secret = some_secret(trained_like(100))
-    with pytest.raises(InputError, match="number of Gaussians"):
+    with pytest.raises(InputError, match="count"):
         unpack_secret(pack_secret(replace(secret, count=count)))  # type: ignore[arg-type]

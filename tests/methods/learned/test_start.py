@@ -11,8 +11,9 @@ from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions
-from keyss.methods.learned.start import DRAWN_LOGIT, _shares, hidden_logits, make_start, opacity_curve
+from keyss.methods.learned.start import _shares, make_start
 from keyss.methods.learned.targets import PlacedScene
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -42,11 +43,11 @@ def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
     config = LearnedOptions(fit=FitConfig(max_gaussians=330))
     start = make_start(_placed(3), config, torch.Generator())
     assert len(start.gaussians) == 330
-    assert start.curves is not None
+    assert start.remaps is not None
     decoded = []
-    for curve in start.curves:
+    for curve in start.remaps:
         decoder = Decoder(DecoderShape())
-        decoder.set_curve(*curve)
+        decoder.set_remap(*curve)
         decoded.append(decoder(start.gaussians, decoder.key.fill_(1)).opacities)
     first, second = decoded
     shown = start.gaussians.opacities > 1 / 255
@@ -62,10 +63,10 @@ def test_the_key_brings_back_the_opacities_that_a_warm_start_hides() -> None:
     config = LearnedOptions(fit=FitConfig(max_gaussians=10_000))
     placed = _placed(3)
     start = make_start(placed, config, torch.Generator())
-    assert start.curves is not None
-    for secret, curve in enumerate(start.curves, start=1):
+    assert start.remaps is not None
+    for secret, curve in enumerate(start.remaps, start=1):
         decoder = Decoder(DecoderShape())
-        decoder.set_curve(*curve)
+        decoder.set_remap(*curve)
         revealed = decoder(start.gaussians, decoder.key.fill_(1))
         own = slice(200 * secret, 200 * (secret + 1))  # nothing had to be left out
         torch.testing.assert_close(
@@ -77,12 +78,12 @@ def test_bands_of_secrets_do_not_touch_each_other_or_what_is_drawn() -> None:
     bands = []
     for secret in range(6):
         decoder = Decoder(DecoderShape())
-        decoder.set_curve(*opacity_curve(secret))
+        decoder.set_remap(*opacity_remap(secret))
         bands.append(decoder.band)
         extremes = hidden_logits(torch.tensor([-100.0, 100.0]), secret)
-        assert decoder.band[0] < extremes[0] < extremes[1] < decoder.band[1]
-    assert bands[0][1] < DRAWN_LOGIT
-    assert all(below[1] < above[0] for above, below in pairwise(bands))
+        assert decoder.band.outer_low < extremes[0] < extremes[1] < decoder.band.outer_high
+    assert bands[0].outer_high < DRAWN_LOGIT
+    assert all(below.outer_high < above.outer_low for above, below in pairwise(bands))
 
 
 def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
@@ -101,4 +102,4 @@ def test_start_from_points_divides_the_cap_between_the_scenes() -> None:
     config = LearnedOptions(fit=FitConfig(max_gaussians=100), start="points", decoder="network")
     start = make_start(_placed(2), config, torch.Generator().manual_seed(0))
     assert len(start.gaussians) == 100
-    assert start.curves is None
+    assert start.remaps is None

@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import torch
 
-from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.gaussians import Gaussians
 from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.start import opacity_curve
+from keyss.methods.learned.opacity_band import DRAWN_LOGIT, OpacityBand, opacity_remap
 
 _OPAQUE_LOGIT = math.log(0.99 / 0.01)  # as much as one Gaussian covers in 3DGS
-_DRAWN_LOGIT = math.log(DRAWN_OPACITY / (1 - DRAWN_OPACITY))
 
 
 def known_remaps(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
@@ -23,12 +22,11 @@ def known_remaps(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
     decoder = Decoder(DecoderShape()).to(stego.device)
     decoder.prepare(stego, torch.ones_like(decoder.key))
     logits, shown = stego.opacity_logits, {}
-    stray = logits < _DRAWN_LOGIT
+    stray = logits < DRAWN_LOGIT
     for secret in range(secrets):
-        knots, values = opacity_curve(secret)
-        decoder.set_curve(knots, values)
+        decoder.set_remap(*opacity_remap(secret))
         shown[f"secret {secret + 1}"] = decoder(stego, decoder.key)
-        stray = stray & ~((logits > knots[1]) & (logits < knots[4]))
+        stray = stray & ~OpacityBand.of_secret(secret).contains(logits)
     outside = stego[stray]
     opaque = torch.full_like(outside.opacity_logits, _OPAQUE_LOGIT)
     return {**shown, "outside the bands": replace(outside, opacity_logits=opaque)}

@@ -1,9 +1,10 @@
 """The decoder: turns the cover's Gaussians into a secret's, one Gaussian at a time, for one key.
 
 KeySS, section 3.2 and appendix: attribute* = attribute + residual, on raw attributes. There are two sources
-of residuals. The *curve* looks at a Gaussian's opacity alone: it knows the band of opacities, too small to be
-drawn, in which a secret's Gaussians lie (`keyss.methods.learned.start`). The *network* is the paper's: a
-common branch over all attributes of a Gaussian, then a branch of two layers per updated attribute.
+of residuals. The *opacity remap* looks at a Gaussian's opacity alone: it knows the band of opacities, too
+small to be drawn, in which a secret's Gaussians lie (`keyss.methods.learned.opacity_band`). The *network* is
+the paper's: a common branch over all attributes of a Gaussian, then a branch of two layers per updated
+attribute.
 
 Corrections to the published code: residuals are plain sums of either sign; every input comes from the one
 Gaussian alone, standardised with constants that are fixed at the start and kept with the weights, so that
@@ -25,6 +26,7 @@ from torch import Tensor, nn
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import EMBEDDING_SIZE
 from keyss.methods.learned.mask import Mask
+from keyss.methods.learned.opacity_band import OpacityBand
 
 CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
 # Units of a residual, so that all branches learn at like speed: logits, quaternion components, natural
@@ -44,7 +46,7 @@ class DecoderShape:
     """Kind and sizes of a decoder."""
 
     mask: Mask = ("op",)
-    kind: Literal["curve", "network"] = "curve"  # a network adds to the curve
+    kind: Literal["remap", "network"] = "remap"  # a network adds to the opacity remap
     conditioning: Literal["gate", "bias"] = "gate"  # how the key enters; bias: the paper's
     # What follows is for networks.
     hidden: tuple[Width, Width] = (64, 64)  # widths of the two layers of the common branch
@@ -70,7 +72,7 @@ class Decoder(nn.Module):
     """
 
     key: Tensor  # [64] the embedding that it belongs to
-    knots: Tensor  # [KNOTS] opacity logits, ascending: where the curve's pieces meet
+    knots: Tensor  # [KNOTS] opacity logits, ascending, of the opacity remap
     values: Tensor  # [KNOTS] its residuals there
 
     def __init__(self, shape: DecoderShape) -> None:
@@ -88,20 +90,20 @@ class Decoder(nn.Module):
         if self.network is not None:
             self.network.prepare(gaussians)
 
-    def set_curve(self, knots: Sequence[float], values: Sequence[float]) -> None:
-        """Let the curve go through these points, KNOTS of them; outside it goes on as it ends."""
+    def set_remap(self, knots: Sequence[float], values: Sequence[float]) -> None:
+        """Let the opacity remap go through these points, KNOTS of them; outside it goes on as it ends."""
         self.knots.copy_(torch.tensor(knots))
         self.values.copy_(torch.tensor(values))
 
     @property
-    def band(self) -> tuple[float, float]:
-        """The opacity logits between which the secret's Gaussians lie after a warm start."""
-        return float(self.knots[1]), float(self.knots[4])
+    def band(self) -> OpacityBand:
+        """Where the secret's Gaussians lie after a warm start."""
+        return OpacityBand.of_knots(self.knots)
 
     @property
-    def faint_logit(self) -> float:
-        """A logit at which the curve shows a Gaussian nearly opaque: high between its middle knots."""
-        return float(torch.lerp(self.knots[2], self.knots[3], 0.7))
+    def nearly_opaque_logit(self) -> float:
+        """A logit that the remap shows nearly opaque: high between the inner ends of the band."""
+        return self.band.inner_low + 0.7 * (self.band.inner_high - self.band.inner_low)
 
     def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
@@ -114,13 +116,13 @@ class Decoder(nn.Module):
             extent = self.network.extent
             residuals = self.network(gaussians, embedding, whole or gaussians)
         if "op" in self.shape.mask:
-            curve = self._curve(gaussians.opacity_logits)[:, None]
-            residuals["op"] = curve + residuals["op"] if "op" in residuals else curve
+            remap = self._remap(gaussians.opacity_logits)[:, None]
+            residuals["op"] = remap + residuals["op"] if "op" in residuals else remap
         if gate < 1:
             residuals = {name: gate * residual for name, residual in residuals.items()}
         return add_residuals(gaussians, residuals, extent)
 
-    def _curve(self, logits: Tensor) -> Tensor:
+    def _remap(self, logits: Tensor) -> Tensor:
         right = torch.searchsorted(self.knots, logits.detach()).clamp(1, KNOTS - 1)
         start, end = self.knots[right - 1], self.knots[right]
         return torch.lerp(self.values[right - 1], self.values[right], (logits - start) / (end - start))
@@ -129,8 +131,8 @@ class Decoder(nn.Module):
         """1 for the decoder's own key, 0 for every other, whatever the weights are.
 
         This keeps honest mistakes from showing anything, at no cost. It protects nothing by itself: who holds
-        the decoder holds `key`. What protects is that the decoder is sealed. A decoder conditioned by a bias
-        has learned the difference instead, which the white-box attack (`keyss.measure`) undoes.
+        the decoder holds `key`. What protects is the encryption of the decoder. A decoder conditioned by a
+        bias has learned the difference instead, which the white-box attack (`keyss.measure`) undoes.
         """
         if self.shape.conditioning == "bias":
             return 1.0

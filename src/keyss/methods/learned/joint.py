@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.density import CappedStrategy
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
@@ -17,9 +17,9 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
-from keyss.methods.learned.scramble import LEAST_OPACITY
-from keyss.methods.learned.start import HIDDEN_SLOPE, logit_limits, make_start
+from keyss.methods.learned.start import make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
 from keyss.methods.learned.visibility import possibly_seen
 from keyss.rendering import render_with_meta
@@ -56,13 +56,13 @@ class JointRun:
         self.extent = scenes[0].scene.extent
 
         start = make_start(scenes, config, self.generator)
-        self.warm = start.curves is not None
+        self.warm = start.remaps is not None
         self.parameters = to_parameters(start.gaussians, device)
         self.optimizers = make_optimizers(self.parameters, config.fit, self.extent)
         self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
         if self.warm:
             self.rates = {name: config.warm_rate * rate for name, rate in self.rates.items()}
-            # The hidden opacities are drawn together: what moves them moves the secret's 1 / slope as far.
+            # Hidden logits lie close together: a step of theirs moves the shown ones 1 / HIDDEN_SLOPE as far.
             self.rates["opacities"] *= HIDDEN_SLOPE
             self.logit_limits = logit_limits(self.parameters["opacities"].detach(), len(embeddings))
         self.strategy = CappedStrategy(
@@ -78,8 +78,8 @@ class JointRun:
             self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
         for decoder, embedding in self._keyed_decoders():
             decoder.prepare(self.gaussians(), embedding)
-        for decoder, curve in zip(self.decoders, start.curves or (), strict=False):
-            decoder.set_curve(*curve)
+        for decoder, remap in zip(self.decoders, start.remaps or (), strict=False):
+            decoder.set_remap(*remap)
         self._all_decoders = torch.nn.ModuleList(self.decoders)
         weights = list(self._all_decoders.parameters())  # none for curves
         self.decoder_optimizer = (
@@ -158,7 +158,8 @@ class JointRun:
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
-        # Constant rates leave everything trembling, which a warm start has no growth to make up for.
+        # At constant rates the Gaussians jitter around their optimum. A warm start, which cannot grow more of
+        # them, lets the rates decay over the second half of the run.
         late = LAST_RATE ** max(0.0, 2 * progress - 1) if self.warm else 1.0
         for name, optimizer in self.optimizers.items():
             decay = 0.01**progress if name == "means" else late
@@ -177,7 +178,7 @@ class JointRun:
 
     def drawn(self) -> Tensor:
         """[N] whether a Gaussian is drawn in any scene: what is not would only give away where it lies."""
-        return self._largest_opacity() >= LEAST_OPACITY
+        return self._largest_opacity() >= DRAWN_OPACITY
 
     def _decoded(self, secret: int, gaussians: Gaussians) -> Gaussians:
         decoded: Gaussians = self.decoders[secret](gaussians, self.embeddings[secret])

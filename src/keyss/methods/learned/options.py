@@ -41,7 +41,7 @@ class LearnedOptions(MethodOptions):
             parse=parse_mask,
         ),
     ] = ("op",)
-    decoder: Literal["curve", "network"] = "curve"  # the paper has a network
+    decoder: Literal["remap", "network"] = "remap"  # the paper has a network
     conditioning: Literal["gate", "bias"] = "gate"  # how the key enters the decoder; bias: the paper's
     hidden: tuple[int, int] = (64, 64)  # widths of a network's common branch
     branch: int = 32  # width of its branch per attribute
@@ -88,11 +88,11 @@ class LearnedOptions(MethodOptions):
             )
         if self.start == "warm" and self.conditioning == "bias":
             raise UsageError(
-                "conditioning bias: a warm start's opacity curve is the same for every key and needs a gate"
+                "conditioning bias: a warm start's opacity remap is the same for every key and needs a gate"
             )
-        if self.decoder == "curve" and (self.start != "warm" or self.mask != ("op",)):
+        if self.decoder == "remap" and (self.start != "warm" or self.mask != ("op",)):
             raise UsageError(
-                "decoder curve: knows nothing but opacities from a warm start; "
+                "decoder remap: knows nothing but opacities from a warm start; "
                 f"mask {','.join(self.mask)} with start {self.start} needs a network"
             )
 

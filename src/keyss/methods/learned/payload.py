@@ -25,7 +25,7 @@ from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.mask import parse_mask
-from keyss.methods.learned.scramble import CHANNELS, KEY_BYTES, KNOTS, Scramble
+from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift
 
 FORMAT: Literal["keyss-secret"] = "keyss-secret"
 VERSION: Literal[4] = 4
@@ -83,7 +83,7 @@ class HiddenSecret:
     decoder: Decoder
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
-    scramble: Scramble | None = None  # what the secret's Gaussians are published as, if not as they are
+    rank_shift: RankShift | None = None  # what the secret's Gaussians are published as, if not as they are
     # [M, 7] position, opacity logit and constant colour of all transparent Gaussians: formats round their
     # opacities to nothing, and some drop the colours of what is transparent.
     faint: Tensor | None = None
@@ -94,7 +94,7 @@ class HiddenSecret:
         transparent = stego.opacities < DRAWN_OPACITY
         opacity_logits, sh = stego.opacity_logits.clone(), stego.sh.clone()
         if self.faint is None:
-            opacity_logits[transparent] = self.decoder.faint_logit
+            opacity_logits[transparent] = self.decoder.nearly_opaque_logit
         else:
             tree = cKDTree(self.faint[:, :3].double().numpy())
             _, nearest = tree.query(stego.means[transparent].cpu().double().numpy())
@@ -148,12 +148,12 @@ def pack_secret(secret: HiddenSecret) -> bytes:
     tensors["anchors"] = secret.anchors.contiguous()
     if secret.faint is not None:
         tensors["faint"] = secret.faint.contiguous()
-    if secret.scramble is not None:
+    if secret.rank_shift is not None:
         tensors |= {
-            "scramble.key": torch.frombuffer(bytearray(secret.scramble.key), dtype=torch.uint8),
-            "scramble.band": torch.tensor(secret.scramble.band),
-            "scramble.own": secret.scramble.own,
-            "scramble.shown": secret.scramble.shown,
+            "rank_shift.key": torch.frombuffer(bytearray(secret.rank_shift.key), dtype=torch.uint8),
+            "rank_shift.band": torch.tensor(secret.rank_shift.band),
+            "rank_shift.own": secret.rank_shift.own,
+            "rank_shift.shown": secret.rank_shift.shown,
         }
     return safetensors.torch.save(tensors, {"keyss": msgspec.json.encode(header).decode()})
 
@@ -185,7 +185,9 @@ def _read_header(data: bytes) -> _Header:
 
 
 def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
-    scramble = _scramble({name: tensors.pop(name) for name in list(tensors) if name.startswith("scramble.")})
+    rank_shift = _rank_shift(
+        {name: tensors.pop(name) for name in list(tensors) if name.startswith("rank_shift.")}
+    )
     if not all(
         value.dtype in (torch.float16, torch.float32) and value.isfinite().all() for value in tensors.values()
     ):
@@ -205,13 +207,13 @@ def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
         torch.tensor(header.frame.rotation, dtype=torch.float64),
         torch.tensor(header.frame.translation, dtype=torch.float64),
     )
-    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, scramble, faint, header.count)
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, rank_shift, faint, header.count)
 
 
-def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:
+def _rank_shift(tensors: dict[str, Tensor]) -> RankShift | None:
     if not tensors:
         return None
-    key, band, own, shown = (tensors[f"scramble.{name}"] for name in ("key", "band", "own", "shown"))
+    key, band, own, shown = (tensors[f"rank_shift.{name}"] for name in ("key", "band", "own", "shown"))
     tables = (own, shown)
     if not (
         key.dtype == torch.uint8
@@ -220,5 +222,5 @@ def _scramble(tensors: dict[str, Tensor]) -> Scramble | None:
         and all(table.dtype == torch.float32 and table.shape == (CHANNELS, KNOTS) for table in tables)
         and all(table.isfinite().all() and (table.diff(dim=1) >= 0).all() for table in tables)
     ):
-        raise InputError("scrambled Gaussians: expected a key, a band and two ascending tables")
-    return Scramble(bytes(key.tolist()), (float(band[0]), float(band[1])), own, shown)
+        raise InputError("keyed rank shift: expected a key, a band and two ascending tables")
+    return RankShift(bytes(key.tolist()), (float(band[0]), float(band[1])), own, shown)

@@ -27,14 +27,14 @@ from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.joint import JointRun, decoder_shape
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
-from keyss.methods.learned.revealing import OpenedSecret, decode, is_drawn
-from keyss.methods.learned.scramble import (
+from keyss.methods.learned.rank_shift import (
     CHANNELS,
     KEY_BYTES,
     KNOTS,
-    Scramble,
-    with_lengths_of_the_cover,
+    RankShift,
+    match_quaternion_lengths,
 )
+from keyss.methods.learned.revealing import OpenedSecret, decode, is_drawn
 from keyss.methods.learned.targets import PlacedScene
 
 NAME = "learned"
@@ -85,13 +85,14 @@ def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions,
     decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
     if run.warm:
         stego = stego[run.drawn().cpu()]
-    scrambles: list[Scramble | None] = [None] * len(keys)
-    if run.warm and not options.sidecar:  # which is for files that will be rounded: no scramble survives that
+    rank_shifts: list[RankShift | None] = [None] * len(keys)
+    # A sidecar is for files that will be rounded, and no keyed rank shift survives rounding.
+    if run.warm and not options.sidecar:
         for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
-            if options.decoder == "curve":  # a network would see the difference
-                stego = with_lengths_of_the_cover(stego, decoder.band)
-            scramble = Scramble.of(stego, key.expand("scramble", KEY_BYTES), decoder.band)
-            stego, scrambles[index] = scramble.close(stego), scramble
+            if options.decoder == "remap":  # a network would see the difference
+                stego = match_quaternion_lengths(stego, decoder.band.outer)
+            rank_shift = RankShift.of(stego, key.expand("rank-shift", KEY_BYTES), decoder.band.outer)
+            stego, rank_shifts[index] = rank_shift.encrypt(stego), rank_shift
     anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.seed))
     transparent = stego[~is_drawn(stego)]
     faint = None
@@ -99,8 +100,8 @@ def hide(cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions,
         columns = [transparent.means, transparent.opacity_logits[:, None], transparent.sh[:, 0]]
         faint = torch.cat(columns, dim=1)
     hidden = [
-        HiddenSecret(decoder, frame, anchors, scramble, faint)
-        for decoder, frame, scramble in zip(decoders, frames[1:], scrambles, strict=True)
+        HiddenSecret(decoder, frame, anchors, rank_shift, faint)
+        for decoder, frame, rank_shift in zip(decoders, frames[1:], rank_shifts, strict=True)
     ]
     counts = [int(is_drawn(decode(stego, secret, secret.embedding)).sum()) for secret in hidden]
     packed = [pack_secret(replace(secret, count=count)) for secret, count in zip(hidden, counts, strict=True)]
@@ -147,11 +148,11 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
 def _largest_payload(options: LearnedOptions) -> int:
     """Bytes of a secret whose decoder cannot be compressed."""
     decoder = Decoder(decoder_shape(options))
-    scramble = None
+    rank_shift = None
     if options.start == "warm":
         tables = torch.rand(2, CHANNELS, KNOTS)
-        scramble = Scramble(bytes(KEY_BYTES), (0.0, 1.0), tables[0], tables[1])
-    secret = HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3), scramble)
+        rank_shift = RankShift(bytes(KEY_BYTES), (0.0, 1.0), tables[0], tables[1])
+    secret = HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3), rank_shift)
     return len(pack_secret(secret))
 
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.methods.base import Frame
 from keyss.methods.learned.payload import HiddenSecret, pack_secret
-from keyss.methods.learned.scramble import LEAST_OPACITY
 
 _ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
 
@@ -64,7 +63,7 @@ def reveal_gaussians(
 
 def is_drawn(gaussians: Gaussians) -> Tensor:
     """[N] which Gaussians are opaque enough to be drawn at all."""
-    return gaussians.opacities >= LEAST_OPACITY
+    return gaussians.opacities >= DRAWN_OPACITY
 
 
 def _is_rounded(stego: Gaussians) -> bool:
@@ -77,7 +76,7 @@ def _is_rounded(stego: Gaussians) -> bool:
 def decode(stego: Gaussians, secret: HiddenSecret, embedding: Tensor) -> Gaussians:
     """What the secret's decoder makes of `stego` for an embedding [64], in the cover's frame."""
     decoder = secret.decoder.to(stego.device)
-    if secret.scramble is not None:
-        stego = secret.scramble.open(stego)
+    if secret.rank_shift is not None:
+        stego = secret.rank_shift.decrypt(stego)
     decoded: Gaussians = decoder(stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device))
     return decoded

@@ -6,24 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
+from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.targets import PlacedScene
 from keyss.rendering.contributions import contributions
 
-# Below 1/255 (logit -5.54) a Gaussian is not drawn at all. A secret's Gaussian starts well below, a little
-# higher the more opaque it will be: the cover's opacity tells the decoder the secret's. Every secret has a
-# band of logits of its own, from low - 0.5 to high + 0.5 of `opacity_curve`; bands must not touch.
-DRAWN_LOGIT, UNDRAWN_LOGIT = -5.54, -5.6
-HIDDEN_LOGIT, HIDDEN_STEP = -8.2, -3.7
-HIDDEN_SLOPE = 0.25
-SHOWN_LOGITS = (-4.0, 6.0)
-TRANSPARENT_LOGIT = -8.0
 SELECTION_VIEWS = 64
 
 
@@ -32,8 +24,8 @@ class Start:
     """Initial Gaussians of the published model."""
 
     gaussians: Gaussians
-    # For each secret the knots and values that its decoder's opacity curve starts with, or nothing known yet.
-    curves: tuple[tuple[list[float], list[float]], ...] | None
+    # For each secret the knots and residuals that its opacity remap starts with, or nothing known yet.
+    remaps: tuple[tuple[list[float], list[float]], ...] | None
 
 
 def make_start(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
@@ -71,37 +63,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Start
         replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
         for secret, part in enumerate(chosen[1:])
     ]
-    return Start(Gaussians.cat(parts), tuple(opacity_curve(secret) for secret in range(len(chosen) - 1)))
-
-
-def hidden_logits(logits: Tensor, secret: int) -> Tensor:
-    """[N] what the opacity logits [N] of a secret (0, 1, ...) are in the cover."""
-    return HIDDEN_LOGIT + HIDDEN_STEP * secret + HIDDEN_SLOPE * logits.clamp(*SHOWN_LOGITS)
-
-
-def opacity_curve(secret: int) -> tuple[list[float], list[float]]:
-    """Knots and values of the opacity curve that undoes `hidden_logits` and makes all others transparent."""
-    middle = HIDDEN_LOGIT + HIDDEN_STEP * secret
-    low, high = (middle + HIDDEN_SLOPE * logit for logit in SHOWN_LOGITS)
-    knots = [-40.0, low - 0.5, low - 0.1, high + 0.4, high + 0.5, 40.0]
-    shown = (
-        [TRANSPARENT_LOGIT] * 2 + [(x - middle) / HIDDEN_SLOPE for x in knots[2:4]] + [TRANSPARENT_LOGIT] * 2
-    )
-    return knots, [y - x for x, y in zip(knots, shown, strict=True)]
-
-
-def logit_limits(logits: Tensor, secrets: int) -> tuple[Tensor, Tensor]:
-    """[N] least and [N] largest opacity logits that leave each Gaussian to the scene that it starts with.
-
-    A secret's stays where its opacity curve shows it: one that left the band would be transparent in every
-    scene, where nothing scrambles it. One of the cover's stays above all bands.
-    """
-    low, high = torch.full_like(logits, UNDRAWN_LOGIT), torch.full_like(logits, torch.inf)
-    for secret in range(secrets):
-        knots, _ = opacity_curve(secret)
-        own = (logits > knots[1]) & (logits < knots[4])
-        low[own], high[own] = knots[2], knots[3]
-    return low, high
+    return Start(Gaussians.cat(parts), tuple(opacity_remap(secret) for secret in range(len(chosen) - 1)))
 
 
 def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:

@@ -190,11 +190,13 @@ def _blend_tile(
                         store8(planes, p, multiply_add(weight, blue, load8(planes, p)))
                     else:
                         store8(weights, k, weight)
-                if features is not None:
-                    for channel in range(channels):
-                        value = at(features, g // PACKED * channels + channel)
-                        plane = (1 + channel) * PLANE
-                        for k in range(four, four + 8 * UNROLLED_ROWS, 8):
+            if features is not None:
+                for channel in range(channels):
+                    value = at(features, g // PACKED * channels + channel)
+                    plane = (1 + channel) * PLANE
+                    # Two rows in one go; below the strip the weights are 0.
+                    for two in range(first, after, 16):
+                        for k in range(two, two + 16, 8):
                             p = plane + k
                             store8(planes, p, multiply_add(load8(weights, k), value, load8(planes, p)))
         entry = check

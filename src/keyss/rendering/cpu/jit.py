@@ -53,7 +53,10 @@ def finite_inlined(function: Any) -> Any:
 
 
 def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:
+    # What is inlined borrows the arrays of the kernel: to count references to them would take longer than
+    # some of the arithmetic.
     options = {"fastmath": fastmath, "forceinline": forceinline, "error_model": "numpy", "nogil": True}
+    options["_nrt"] = not forceinline
     folder = cache_folder()
     if folder is None:
         return _numba.njit(**options)(function)

@@ -11,12 +11,13 @@ Gaussians are taken 8 at a time, one in each lane of the vectors.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from keyss.rendering.cpu.jit import inlined, kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
-    BLUE,
     CHANNEL_MAX,
     CHUNK,
     CX,
@@ -24,7 +25,6 @@ from keyss.rendering.cpu.layout import (
     FOV_MARGIN,
     FX,
     FY,
-    GREEN,
     HALF,
     HUGE,
     INVERSE_ALPHA_MIN,
@@ -70,95 +70,122 @@ COLUMN = f32(1 / TILE_WIDTH)
 ROW = f32(1 / TILE_HEIGHT)
 
 
-@inlined
-def rotation_matrix(w, x, y, z):
-    """The 9 entries, row-major, of the rotations by unit quaternions."""
-    return (
-        ONE - (y * y + z * z) * TWO,
-        (x * y - w * z) * TWO,
-        (x * z + w * y) * TWO,
-        (x * y + w * z) * TWO,
-        ONE - (x * x + z * z) * TWO,
-        (y * z - w * x) * TWO,
-        (x * z - w * y) * TWO,
-        (y * z + w * x) * TWO,
-        ONE - (x * x + y * y) * TWO,
-    )
+class Linearised(NamedTuple):
+    """8 Gaussians up to V = J W R S, but for the scales: what both directions need of the projection."""
+
+    point: Any  # x, y and depth of the centre in the camera's frame
+    inverse_depth: Any
+    slopes: Any  # x / z and y / z
+    clamped: Any  # the slopes at which the perspective is linearised
+    jacobian: Any  # its entries xx, xz, yy and yz; the others are 0
+    jw: Any  # rows of J W
+    quaternion: Any  # normalised
+    square: Any  # of the quaternion's length
+    norm: Any  # by which it was multiplied
+    rotation: Any  # rows
+    jwr: Any  # rows of J W R
 
 
 @inlined
-def slope_limits(camera, width, height):
-    """Smallest and largest x/z and y/z at which the perspective is linearised: the image and a margin."""
-    image_width = f32(width)
-    image_height = f32(height)
-    margin_x = FOV_MARGIN * image_width / camera[FX]
-    margin_y = FOV_MARGIN * image_height / camera[FY]
-    return (
-        -(camera[CX] / camera[FX] + margin_x),
-        (image_width - camera[CX]) / camera[FX] + margin_x,
-        -(camera[CY] / camera[FY] + margin_y),
-        (image_height - camera[CY]) / camera[FY] + margin_y,
-    )
-
-
-@inlined
-def camera_coordinates(camera, px, py, pz):
-    """x, y and depth in the camera's frame of points of the world."""
-    return (
-        px * camera[0] + py * camera[1] + pz * camera[2] + camera[TX],
-        px * camera[3] + py * camera[4] + pz * camera[5] + camera[TY],
-        px * camera[6] + py * camera[7] + pz * camera[8] + camera[TZ],
-    )
-
-
-@inlined
-def jacobian_rows(camera, jxx, jxz, jyy, jyz):
-    """The 6 entries of J W."""
-    return (
+def linearised(view, means, quats, ids, start):
+    """`Linearised` of the 8 Gaussians ids[start:]."""
+    camera = view.camera
+    px, py, pz = gather3(means, ids, start, 3, 0)
+    x = px * camera[0] + py * camera[1] + pz * camera[2] + camera[TX]
+    y = px * camera[3] + py * camera[4] + pz * camera[5] + camera[TY]
+    z = px * camera[6] + py * camera[7] + pz * camera[8] + camera[TZ]
+    inverse = divide(ONE, z)
+    u = x * inverse
+    v = y * inverse
+    clamped_u = _within_margin(u, camera[CX], camera[FX], f32(view.width))
+    clamped_v = _within_margin(v, camera[CY], camera[FY], f32(view.height))
+    jxx = inverse * camera[FX]
+    jyy = inverse * camera[FY]
+    jxz = ZERO - jxx * clamped_u
+    jyz = ZERO - jyy * clamped_v
+    a = (
         jxx * camera[0] + jxz * camera[6],
         jxx * camera[1] + jxz * camera[7],
         jxx * camera[2] + jxz * camera[8],
+    )
+    b = (
         jyy * camera[3] + jyz * camera[6],
         jyy * camera[4] + jyz * camera[7],
         jyy * camera[5] + jyz * camera[8],
     )
+    qw, qx, qy, qz = gather4(quats, ids, start, 4, 0)
+    square = qw * qw + qx * qx + qy * qy + qz * qz
+    norm = inverse_length(square)
+    quaternion = (qw * norm, qx * norm, qy * norm, qz * norm)
+    rotation = _rotation_matrix(quaternion)
+    jwr = (_times_matrix(a, rotation), _times_matrix(b, rotation))
+    return Linearised(
+        (x, y, z), inverse, (u, v), (clamped_u, clamped_v), (jxx, jxz, jyy, jyz), (a, b), quaternion, square,
+        norm, rotation, jwr,
+    )  # fmt: skip
+
+
+@inlined
+def _within_margin(slope, centre, focal, size):
+    """Slopes clamped to those that the image and a margin around it have."""
+    margin = FOV_MARGIN * size / focal
+    return minimum(maximum(slope, -(centre / focal + margin)), (size - centre) / focal + margin)
+
+
+@inlined
+def _rotation_matrix(quaternion):
+    """The rows of the rotations by unit quaternions."""
+    w, x, y, z = quaternion
+    return (
+        (ONE - (y * y + z * z) * TWO, (x * y - w * z) * TWO, (x * z + w * y) * TWO),
+        ((x * y + w * z) * TWO, ONE - (x * x + z * z) * TWO, (y * z - w * x) * TWO),
+        ((x * z - w * y) * TWO, (y * z + w * x) * TWO, ONE - (x * x + y * y) * TWO),
+    )
+
+
+@inlined
+def _times_matrix(row, matrix):
+    """A row times a 3x3 matrix, given by its rows."""
+    return (
+        row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
+        row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
+        row[0] * matrix[0][2] + row[1] * matrix[1][2] + row[2] * matrix[2][2],
+    )
+
+
+@inlined
+def times(a, b):
+    """Products of 3 and 3 vectors, one by one."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@inlined
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def squared_area(u, v):
+    """|u x v|^2, which is det(V V^T) by Cauchy-Binet for the rows u and v of V."""
+    x = u[1] * v[2] - u[2] * v[1]
+    y = u[2] * v[0] - u[0] * v[2]
+    z = u[0] * v[1] - u[1] * v[0]
+    return x * x + y * y + z * z
 
 
 @kernel
-def project(
-    counter,
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    sh_count,
-    camera,
-    width,
-    height,
-    near,
-    far,
-    eps2d,
-    radius_clip,
-    antialiased,
-    footprints,
-    features,
-    means2d,
-    depths,
-    radii,
-    tile_bounds,
-):
-    """Fill one row per Gaussian of `footprints` (packed layout), means2d, depths, radii and tile_bounds.
+def project(counter, gaussians, view, projected):
+    """Fill `projected`.
 
-    tile_bounds[i] is a number of tiles that the Gaussian meets at most. What cannot be seen, or has a
-    colour of CHANNEL_MAX or more, gets depth 0, radii 0 and no tiles; its footprint means nothing. sh_count
-    is the number of SH coefficients to use, or 0 where colors[:, 0] is the colour itself. Where `features`
-    has columns, it gets the channels to draw: the colour, of any number of channels, and in one column more
-    the depth.
+    What cannot be seen, or has a colour of CHANNEL_MAX or more, gets depth 0, radii 0 and no tiles; its
+    footprint means nothing.
 
-    With `antialiased` the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that
-    widening a footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
+    When antialiased, the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that widening a
+    footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
     """
+    means, _, _, _, colors = gaussians
+    footprints, features, means2d, depths, radii, tile_bounds = projected
+    camera, sh_count = view.camera, view.sh_count
     count = means.shape[0]
     ids = np.empty(CHUNK + 8, np.int64)
     seen = np.empty(CHUNK + 8, np.int64)
@@ -174,10 +201,7 @@ def project(
             ids[k] = start + min(k, size - 1)
         visible = 0
         for k in range(0, size, 8):
-            _project(
-                means, quats, scales, opacities, camera, width, height, near, far, eps2d, radius_clip,
-                antialiased, footprints, ids, k, results,
-            )  # fmt: skip
+            _project(gaussians, view, footprints, ids, k, results)
             for lane in range(min(8, size - k)):
                 i = start + k + lane
                 put(means2d, 2 * i, at(results, lane))
@@ -203,58 +227,34 @@ def project(
                     store8(results, 0, size_of_color)
                     for lane in range(min(8, visible - k)):
                         if not results[lane] < CHANNEL_MAX:
-                            _hide(seen[k + lane], depths, radii, tile_bounds)
+                            _hide(seen[k + lane], projected)
         else:
-            _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds)
+            _copy_colors(colors, seen, visible, projected)
         if features.shape[1] > 0:
-            _copy_features(sh_count, colors.shape[2], seen, visible, footprints, depths, features)
+            _copy_features(sh_count, colors.shape[2], seen, visible, projected)
 
 
 @inlined
-def _project(
-    means, quats, scales, opacities, camera, width, height, near, far, eps2d, radius_clip, antialiased,
-    footprints, ids, start, results,
-):  # fmt: skip
+def _project(gaussians, view, footprints, ids, start, results):
     """Footprints without colour; results = [mean x | mean y | depth | radius x | radius y | tiles]."""
-    x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
-    fx = camera[FX]
-    fy = camera[FY]
-    opacity = gather1(opacities, ids, start)
-    px, py, pz = gather3(means, ids, start, 3, 0)
-    x, y, z = camera_coordinates(camera, px, py, pz)
+    camera, width, height, near, far, eps2d, radius_clip, antialiased, _ = view
+    opacity = gather1(gaussians.opacities, ids, start)
+    linear = linearised(view, gaussians.means, gaussians.quats, ids, start)
+    z = linear.point[2]
     # `seen` is 1 or 0. Every test is written so that a NaN fails it.
     seen = select_ge(opacity, ALPHA_MIN, ONE, ZERO)
     seen = select_gt(HUGE, opacity, seen, ZERO)
     seen = select_ge(z, near, seen, ZERO)
     seen = select_ge(far, z, seen, ZERO)
-    rz = divide(ONE, z)
-    u = x * rz
-    v = y * rz
-    mean_x = multiply_add(u, fx, splat(camera[CX]))
-    mean_y = multiply_add(v, fy, splat(camera[CY]))
-    u = minimum(maximum(u, x_low), x_high)
-    v = minimum(maximum(v, y_low), y_high)
-    jxx = rz * fx
-    jyy = rz * fy
-    a0, a1, a2, b0, b1, b2 = jacobian_rows(camera, jxx, ZERO - jxx * u, jyy, ZERO - jyy * v)
-    w, i, j, k = gather4(quats, ids, start, 4, 0)
-    norm = inverse_length(w * w + i * i + j * j + k * k)
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(w * norm, i * norm, j * norm, k * norm)
-    s0, s1, s2 = gather3(scales, ids, start, 3, 0)
-    u0 = (a0 * r00 + a1 * r10 + a2 * r20) * s0
-    u1 = (a0 * r01 + a1 * r11 + a2 * r21) * s1
-    u2 = (a0 * r02 + a1 * r12 + a2 * r22) * s2
-    v0 = (b0 * r00 + b1 * r10 + b2 * r20) * s0
-    v1 = (b0 * r01 + b1 * r11 + b2 * r21) * s1
-    v2 = (b0 * r02 + b1 * r12 + b2 * r22) * s2
-    cov_xx = u0 * u0 + u1 * u1 + u2 * u2
-    cov_xy = u0 * v0 + u1 * v1 + u2 * v2
-    cov_yy = v0 * v0 + v1 * v1 + v2 * v2
-    # |u x v|^2 is det(V V^T) by Cauchy-Binet.
-    n0 = u1 * v2 - u2 * v1
-    n1 = u2 * v0 - u0 * v2
-    n2 = u0 * v1 - u1 * v0
-    sharp_det = n0 * n0 + n1 * n1 + n2 * n2
+    mean_x = multiply_add(linear.slopes[0], camera[FX], splat(camera[CX]))
+    mean_y = multiply_add(linear.slopes[1], camera[FY], splat(camera[CY]))
+    scales = gather3(gaussians.scales, ids, start, 3, 0)
+    u = times(linear.jwr[0], scales)
+    v = times(linear.jwr[1], scales)
+    cov_xx = dot(u, u)
+    cov_xy = dot(u, v)
+    cov_yy = dot(v, v)
+    sharp_det = squared_area(u, v)
     det = sharp_det + (cov_xx + cov_yy + eps2d) * eps2d
     seen = select_gt(HUGE, det, seen, ZERO)
     inverse = divide(ONE, det)
@@ -303,38 +303,37 @@ def _tiles(centre, extent, size, per_pixel):
 
 
 @inlined
-def _hide(i, depths, radii, tile_bounds):
-    depths[i] = ZERO
-    radii[i, 0] = 0
-    radii[i, 1] = 0
-    tile_bounds[i] = 0
+def _hide(i, projected):
+    projected.depths[i] = ZERO
+    projected.radii[i, 0] = 0
+    projected.radii[i, 1] = 0
+    projected.tile_bounds[i] = 0
 
 
 @inlined
-def _copy_colors(colors, seen, visible, features, footprints, depths, radii, tile_bounds):
+def _copy_colors(colors, seen, visible, projected):
     """Colours that are no SH: into the footprints where they are drawn from there, else into `features`."""
-    channels = colors.shape[2]
-    to_features = features.shape[1] > 0
+    footprints, features = projected.footprints, projected.features
     for k in range(visible):
         i = seen[k]
-        for channel in range(channels):
+        for channel in range(colors.shape[2]):
             value = colors[i, 0, channel]
-            if to_features:
+            if features.shape[1] > 0:
                 features[i, channel] = value
             else:
                 footprints[i, RED + channel] = value
             if not abs(value) < CHANNEL_MAX:
-                _hide(i, depths, radii, tile_bounds)
+                _hide(i, projected)
 
 
 @inlined
-def _copy_features(sh_count, color_channels, seen, visible, footprints, depths, features):
+def _copy_features(sh_count, color_channels, seen, visible, projected):
     """Colours computed from SH, and depths, into `features`."""
+    footprints, features, depths = projected.footprints, projected.features, projected.depths
     for k in range(visible):
         i = seen[k]
         if sh_count > 0:
-            features[i, 0] = footprints[i, RED]
-            features[i, 1] = footprints[i, GREEN]
-            features[i, 2] = footprints[i, BLUE]
+            for channel in range(3):
+                features[i, channel] = footprints[i, RED + channel]
         if features.shape[1] > color_channels:
             features[i, features.shape[1] - 1] = depths[i]

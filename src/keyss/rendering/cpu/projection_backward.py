@@ -14,8 +14,6 @@ import numpy as np
 from keyss.rendering.cpu.jit import inlined, kernel
 from keyss.rendering.cpu.layout import (
     CHUNK,
-    FX,
-    FY,
     GREEN,
     HALF,
     MOMENTS,
@@ -27,22 +25,15 @@ from keyss.rendering.cpu.layout import (
     ZERO,
     f32,
 )
-from keyss.rendering.cpu.projection import (
-    PREFETCH,
-    camera_coordinates,
-    jacobian_rows,
-    rotation_matrix,
-    slope_limits,
-)
+from keyss.rendering.cpu.projection import PREFETCH, dot, linearised, squared_area, times
 from keyss.rendering.cpu.rows import gather1, gather3, gather4, gather8, load_transposed, scatter
-from keyss.rendering.cpu.shading import inverse_length, prefetch_coefficients, shade_backward
+from keyss.rendering.cpu.shading import prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
     at,
     divide,
     fetch_add,
     load8,
     maximum,
-    minimum,
     put,
     ramp,
     select_ge,
@@ -61,45 +52,20 @@ ALL_SUMS = 96
 
 @kernel
 def project_backward(
-    counter,
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    sh_count,
-    camera,
-    width,
-    height,
-    antialiased,
-    channels,
-    footprints,
-    first_slots,
-    slot_counts,
-    moments,
-    extras,
-    extra_width,
-    first_camera,
-    need_colors,
-    need_camera,
-    absgrad,
-    means_gradient,
-    quats_gradient,
-    scales_gradient,
-    opacities_gradient,
-    colors_gradient,
-    means2d_gradient,
-    means2d_absgrad,
+    counter, gaussians, view, channels, footprints, first_slots, slot_counts, moments, extras, extra_width,
+    first_camera, need_colors, need_camera, absgrad, gradients, means2d_gradient, means2d_absgrad,
     camera_gradient,
-):
-    """Add the gradients through one camera; for the first camera, what was in the outputs is overwritten.
+):  # fmt: skip
+    """Add the gradients through one camera; for the first camera, what was in `gradients` is overwritten.
 
     means2d_gradient and means2d_absgrad are of this camera only. camera_gradient has one row per piece of
     work: the sums over its Gaussians for rotation (9), translation (3) and position (3). With need_colors
-    or need_camera false, colors_gradient or camera_gradient is not touched. `channels` is 0 where colours
+    or need_camera false, gradients.colors or camera_gradient is not touched. `channels` is 0 where colours
     were drawn from the footprints, else the number of channels: those of the colours, and one for the depth
     where there is one more.
     """
+    means, colors, colors_gradient = gaussians.means, gaussians.colors, gradients.colors
+    camera, sh_count = view.camera, view.sh_count
     count = means.shape[0]
     with_depth = channels > colors.shape[2]
     ids = np.empty(CHUNK + 8, np.int64)
@@ -116,8 +82,7 @@ def project_backward(
             camera_sums[k] = 0.0
         drawn = _find_drawn(
             piece * CHUNK, min((piece + 1) * CHUNK, count), sh_count, slot_counts, first_camera, need_colors,
-            absgrad, ids, means_gradient, quats_gradient, scales_gradient, opacities_gradient,
-            colors_gradient, means2d_gradient, means2d_absgrad,
+            absgrad, ids, gradients, means2d_gradient, means2d_absgrad,
         )  # fmt: skip
         for k in range(drawn, drawn + 8):
             ids[k] = ids[max(drawn - 1, 0)]
@@ -131,9 +96,7 @@ def project_backward(
                 with_depth, sh_count, first_camera, need_colors, absgrad, colors_gradient,
                 means2d_absgrad, sums,
             )  # fmt: skip
-            dx = splat(ZERO)
-            dy = dx
-            dz = dx
+            through_color = (splat(ZERO), splat(ZERO), splat(ZERO))
             if sh_count > 0:
                 _, _, _, _, _, _, _, red = gather8(footprints, ids, start, PACKED, RED - RED % 8)
                 green, blue, _, _, _, _, _, _ = gather8(footprints, ids, start, PACKED, GREEN - GREEN % 8)
@@ -141,7 +104,7 @@ def project_backward(
                 red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
                 green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
                 blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
-                dx, dy, dz = shade_backward(
+                through_color = shade_backward(
                     means, colors, sh_count, camera, ids, start, red, green, blue, first_camera,
                     need_colors, basis, coefficients, colors_gradient,
                 )  # fmt: skip
@@ -153,9 +116,8 @@ def project_backward(
                             value += colors_gradient[ids[start + lane], 0, channel]
                         colors_gradient[ids[start + lane], 0, channel] = value
             _gaussian_gradients(
-                means, quats, scales, opacities, footprints, ids, start, size, camera, width, height,
-                antialiased, with_depth, need_camera, first_camera, sums, dx, dy, dz, means_gradient,
-                quats_gradient, scales_gradient, opacities_gradient, means2d_gradient, camera_sums, results,
+                gaussians, view, footprints, ids, start, size, with_depth, need_camera, first_camera, sums,
+                through_color, gradients, means2d_gradient, camera_sums, results,
             )  # fmt: skip
         if need_camera:
             for k in range(15):
@@ -164,10 +126,11 @@ def project_backward(
 
 @inlined
 def _find_drawn(
-    start, end, sh_count, slot_counts, first_camera, need_colors, absgrad, ids, means_gradient,
-    quats_gradient, scales_gradient, opacities_gradient, colors_gradient, means2d_gradient, means2d_absgrad,
+    start, end, sh_count, slot_counts, first_camera, need_colors, absgrad, ids, gradients, means2d_gradient,
+    means2d_absgrad,
 ):  # fmt: skip
     """Fill `ids` with those Gaussians that have pairs; returns how many. Zeros all other gradients."""
+    means_gradient, quats_gradient, scales_gradient, opacities_gradient, colors_gradient = gradients
     channels = colors_gradient.shape[2]
     stride = colors_gradient.shape[1] * channels
     drawn = 0
@@ -243,12 +206,11 @@ def _sum_pairs(
 
 @inlined
 def _gaussian_gradients(
-    means, quats, scales, opacities, footprints, ids, start, size, camera, width, height, antialiased,
-    with_depth, need_camera, first_camera, sums, dx, dy, dz, means_gradient, quats_gradient, scales_gradient,
-    opacities_gradient, means2d_gradient, camera_sums, results,
+    gaussians, view, footprints, ids, start, size, with_depth, need_camera, first_camera, sums, through_color,
+    gradients, means2d_gradient, camera_sums, results,
 ):  # fmt: skip
-    """Through the 2D footprints and the perspective; (dx, dy, dz) is the gradient through the colours."""
-    x_low, x_high, y_low, y_high = slope_limits(camera, width, height)
+    """Through the 2D footprints and the perspective. `through_color`: dL/d(mean) through the directions."""
+    camera = view.camera
     s_1 = load8(sums, SUMS)
     s_x = load8(sums, SUMS + 8)
     s_y = load8(sums, SUMS + 16)
@@ -261,15 +223,15 @@ def _gaussian_gradients(
     conic_yy = conic_yy * -TWO
     mean_x = conic_xx * s_x + conic_xy * s_y
     mean_y = conic_xy * s_x + conic_yy * s_y
-    opacity_gradient = divide(s_1, gather1(opacities, ids, start))
+    opacity_gradient = divide(s_1, gather1(gaussians.opacities, ids, start))
     if not first_camera:
-        opacity_gradient = opacity_gradient + gather1(opacities_gradient, ids, start)
+        opacity_gradient = opacity_gradient + gather1(gradients.opacities, ids, start)
     store8(results, 0, opacity_gradient)
     store8(results, 8, mean_x)
     store8(results, 16, mean_y)
     for lane in range(8):
         i = at(ids, start + lane)
-        put(opacities_gradient, i, at(results, lane))
+        put(gradients.opacities, i, at(results, lane))
         put(means2d_gradient, 2 * i, at(results, 8 + lane))
         put(means2d_gradient, 2 * i + 1, at(results, 16 + lane))
 
@@ -282,134 +244,108 @@ def _gaussian_gradients(
     cov_xy = (t_00 * conic_xy + t_01 * conic_yy) * HALF
     cov_yy = (t_10 * conic_xy + t_11 * conic_yy) * HALF
 
-    # The forward projection again, up to V = J W R S.
-    px, py, pz = gather3(means, ids, start, 3, 0)
-    x, y, z = camera_coordinates(camera, px, py, pz)
-    rz = divide(ONE, z)
-    slope_x = x * rz
-    slope_y = y * rz
-    clamped_x = minimum(maximum(slope_x, x_low), x_high)
-    clamped_y = minimum(maximum(slope_y, y_low), y_high)
-    jxx = rz * camera[FX]
-    jxz = ZERO - jxx * clamped_x
-    jyy = rz * camera[FY]
-    jyz = ZERO - jyy * clamped_y
-    a0, a1, a2, b0, b1, b2 = jacobian_rows(camera, jxx, jxz, jyy, jyz)
-    qw, qx, qy, qz = gather4(quats, ids, start, 4, 0)
-    square = qw * qw + qx * qx + qy * qy + qz * qz
-    norm = inverse_length(square)
-    qw = qw * norm
-    qx = qx * norm
-    qy = qy * norm
-    qz = qz * norm
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qw, qx, qy, qz)
-    s0, s1, s2 = gather3(scales, ids, start, 3, 0)
-    p0 = a0 * r00 + a1 * r10 + a2 * r20
-    p1 = a0 * r01 + a1 * r11 + a2 * r21
-    p2 = a0 * r02 + a1 * r12 + a2 * r22
-    q0 = b0 * r00 + b1 * r10 + b2 * r20
-    q1 = b0 * r01 + b1 * r11 + b2 * r21
-    q2 = b0 * r02 + b1 * r12 + b2 * r22
-
-    if antialiased:
+    linear = linearised(view, gaussians.means, gaussians.quats, ids, start)
+    p, q = linear.jwr
+    scales = gather3(gaussians.scales, ids, start, 3, 0)
+    if view.antialiased:
         # The opacity drawn is opacity sqrt(det(V V^T) / det(covariance)), and s_1 the gradient of its
         # logarithm; d(log det M) = M^-1. Nothing with a vanishing determinant was drawn.
-        u0, u1, u2 = p0 * s0, p1 * s1, p2 * s2
-        v0, v1, v2 = q0 * s0, q1 * s1, q2 * s2
-        n0 = u1 * v2 - u2 * v1
-        n1 = u2 * v0 - u0 * v2
-        n2 = u0 * v1 - u1 * v0
-        inverse = divide(ONE, maximum(n0 * n0 + n1 * n1 + n2 * n2, NORM_MIN))
+        u = times(p, scales)
+        v = times(q, scales)
+        inverse = divide(ONE, maximum(squared_area(u, v), NORM_MIN))
         half = s_1 * HALF
-        cov_xx = cov_xx + half * ((v0 * v0 + v1 * v1 + v2 * v2) * inverse - conic_xx)
-        cov_xy = cov_xy - half * ((u0 * v0 + u1 * v1 + u2 * v2) * inverse + conic_xy)
-        cov_yy = cov_yy + half * ((u0 * u0 + u1 * u1 + u2 * u2) * inverse - conic_yy)
+        cov_xx = cov_xx + half * (dot(v, v) * inverse - conic_xx)
+        cov_xy = cov_xy - half * (dot(u, v) * inverse + conic_xy)
+        cov_yy = cov_yy + half * (dot(u, u) * inverse - conic_yy)
 
     # dL/dV = 2 dL/d(covariance) V, then scales, rotation and the rows of J W.
-    du0 = (cov_xx * p0 + cov_xy * q0) * s0 * TWO
-    du1 = (cov_xx * p1 + cov_xy * q1) * s1 * TWO
-    du2 = (cov_xx * p2 + cov_xy * q2) * s2 * TWO
-    dv0 = (cov_xy * p0 + cov_yy * q0) * s0 * TWO
-    dv1 = (cov_xy * p1 + cov_yy * q1) * s1 * TWO
-    dv2 = (cov_xy * p2 + cov_yy * q2) * s2 * TWO
-    _add3(
-        scales_gradient, ids, start, first_camera,
-        du0 * p0 + dv0 * q0, du1 * p1 + dv1 * q1, du2 * p2 + dv2 * q2,
-    )  # fmt: skip
-    du0 = du0 * s0
-    du1 = du1 * s1
-    du2 = du2 * s2
-    dv0 = dv0 * s0
-    dv1 = dv1 * s1
-    dv2 = dv2 * s2
-    d00 = a0 * du0 + b0 * dv0
-    d01 = a0 * du1 + b0 * dv1
-    d02 = a0 * du2 + b0 * dv2
-    d10 = a1 * du0 + b1 * dv0
-    d11 = a1 * du1 + b1 * dv1
-    d12 = a1 * du2 + b1 * dv2
-    d20 = a2 * du0 + b2 * dv0
-    d21 = a2 * du1 + b2 * dv1
-    d22 = a2 * du2 + b2 * dv2
+    doubled = (scales[0] * TWO, scales[1] * TWO, scales[2] * TWO)
+    du = times(_combined(cov_xx, p, cov_xy, q), doubled)
+    dv = times(_combined(cov_xy, p, cov_yy, q), doubled)
+    u = times(du, p)
+    v = times(dv, q)
+    _add3(gradients.scales, ids, start, first_camera, (u[0] + v[0], u[1] + v[1], u[2] + v[2]))
+    du = times(du, scales)
+    dv = times(dv, scales)
+    a, b = linear.jw
+    d00, d01, d02 = _combined(a[0], du, b[0], dv)
+    d10, d11, d12 = _combined(a[1], du, b[1], dv)
+    d20, d21, d22 = _combined(a[2], du, b[2], dv)
+    qw, qx, qy, qz = linear.quaternion
     ew = (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01)) * TWO
     ex = (qy * (d10 + d01) + qz * (d20 + d02) + qw * (d21 - d12) - qx * (d11 + d22) * TWO) * TWO
     ey = (qx * (d10 + d01) + qz * (d21 + d12) + qw * (d02 - d20) - qy * (d00 + d22) * TWO) * TWO
     ez = (qx * (d20 + d02) + qy * (d21 + d12) + qw * (d10 - d01) - qz * (d00 + d11) * TWO) * TWO
     along = ew * qw + ex * qx + ey * qy + ez * qz
     # A zero quaternion is drawn without a rotation, and stays so.
-    norm = select_gt(square, NORM_MIN, norm, ZERO)
-    _add4(
-        quats_gradient, ids, start, first_camera,
-        (ew - along * qw) * norm, (ex - along * qx) * norm,
-        (ey - along * qy) * norm, (ez - along * qz) * norm,
-    )  # fmt: skip
-    da0 = du0 * r00 + du1 * r01 + du2 * r02
-    da1 = du0 * r10 + du1 * r11 + du2 * r12
-    da2 = du0 * r20 + du1 * r21 + du2 * r22
-    db0 = dv0 * r00 + dv1 * r01 + dv2 * r02
-    db1 = dv0 * r10 + dv1 * r11 + dv2 * r12
-    db2 = dv0 * r20 + dv1 * r21 + dv2 * r22
+    norm = select_gt(linear.square, NORM_MIN, linear.norm, ZERO)
+    quat_gradient = (
+        (ew - along * qw) * norm,
+        (ex - along * qx) * norm,
+        (ey - along * qy) * norm,
+        (ez - along * qz) * norm,
+    )
+    if not first_camera:
+        w, x, y, z = gather4(gradients.quats, ids, start, 4, 0)
+        w_new, x_new, y_new, z_new = quat_gradient
+        quat_gradient = (w_new + w, x_new + x, y_new + y, z_new + z)
+    scatter(gradients.quats, ids, start, 4, 0, quat_gradient)
+    r = linear.rotation
+    da = (dot(du, r[0]), dot(du, r[1]), dot(du, r[2]))
+    db = (dot(dv, r[0]), dot(dv, r[1]), dot(dv, r[2]))
 
     # Through J and the projected centre to the mean in camera space (tx, ty, tz). Where the slope was
     # clamped, J does not depend on it.
-    djxx = da0 * camera[0] + da1 * camera[1] + da2 * camera[2]
-    djxz = (da0 * camera[6] + da1 * camera[7] + da2 * camera[8]) * jxx * rz
-    djyy = db0 * camera[3] + db1 * camera[4] + db2 * camera[5]
-    djyz = (db0 * camera[6] + db1 * camera[7] + db2 * camera[8]) * jyy * rz
-    free_x = _one_where_equal(slope_x, clamped_x)
-    free_y = _one_where_equal(slope_y, clamped_y)
+    jxx, _, jyy, _ = linear.jacobian
+    clamped_x, clamped_y = linear.clamped
+    djxx = da[0] * camera[0] + da[1] * camera[1] + da[2] * camera[2]
+    djxz = (da[0] * camera[6] + da[1] * camera[7] + da[2] * camera[8]) * jxx * linear.inverse_depth
+    djyy = db[0] * camera[3] + db[1] * camera[4] + db[2] * camera[5]
+    djyz = (db[0] * camera[6] + db[1] * camera[7] + db[2] * camera[8]) * jyy * linear.inverse_depth
+    free_x = _one_where_equal(linear.slopes[0], clamped_x)
+    free_y = _one_where_equal(linear.slopes[1], clamped_y)
     mean_x = mean_x * jxx
     mean_y = mean_y * jyy
     tx = mean_x - djxz * free_x
     ty = mean_y - djyz * free_y
-    tz = ZERO - (mean_x * slope_x + mean_y * slope_y) - (djxx * jxx + djyy * jyy) * rz
+    tz = ZERO - (mean_x * linear.slopes[0] + mean_y * linear.slopes[1])
+    tz = tz - (djxx * jxx + djyy * jyy) * linear.inverse_depth
     tz = tz + djxz * clamped_x * (free_x + ONE) + djyz * clamped_y * (free_y + ONE)
     if with_depth:
         tz = tz + load8(sums, DEPTH)
-    _add3(
-        means_gradient, ids, start, first_camera,
+    dx, dy, dz = through_color
+    mean_gradient = (
         tx * camera[0] + ty * camera[3] + tz * camera[6] + dx,
         tx * camera[1] + ty * camera[4] + tz * camera[7] + dy,
         tx * camera[2] + ty * camera[5] + tz * camera[8] + dz,
-    )  # fmt: skip
+    )
+    _add3(gradients.means, ids, start, first_camera, mean_gradient)
     if need_camera:
+        mean = gather3(gaussians.means, ids, start, 3, 0)
         # Lanes that repeat a Gaussian do not count.
         valid = select_gt(f32(size), ramp(ZERO), ONE, ZERO)
-        camera_sums[0] += sum_lanes(valid * (jxx * da0 + tx * px))
-        camera_sums[1] += sum_lanes(valid * (jxx * da1 + tx * py))
-        camera_sums[2] += sum_lanes(valid * (jxx * da2 + tx * pz))
-        camera_sums[3] += sum_lanes(valid * (jyy * db0 + ty * px))
-        camera_sums[4] += sum_lanes(valid * (jyy * db1 + ty * py))
-        camera_sums[5] += sum_lanes(valid * (jyy * db2 + ty * pz))
-        camera_sums[6] += sum_lanes(valid * (jxz * da0 + jyz * db0 + tz * px))
-        camera_sums[7] += sum_lanes(valid * (jxz * da1 + jyz * db1 + tz * py))
-        camera_sums[8] += sum_lanes(valid * (jxz * da2 + jyz * db2 + tz * pz))
-        camera_sums[9] += sum_lanes(valid * tx)
-        camera_sums[10] += sum_lanes(valid * ty)
-        camera_sums[11] += sum_lanes(valid * tz)
-        camera_sums[12] -= sum_lanes(valid * dx)
-        camera_sums[13] -= sum_lanes(valid * dy)
-        camera_sums[14] -= sum_lanes(valid * dz)
+        t, jacobian = (tx, ty, tz), linear.jacobian
+        _add_to_camera(camera_sums, 0, valid, jacobian, da[0], db[0], t, tx, mean[0], dx)
+        _add_to_camera(camera_sums, 1, valid, jacobian, da[1], db[1], t, ty, mean[1], dy)
+        _add_to_camera(camera_sums, 2, valid, jacobian, da[2], db[2], t, tz, mean[2], dz)
+
+
+@inlined
+def _add_to_camera(camera_sums, k, valid, jacobian, da, db, t, t_k, mean, through_color):
+    """Column k of the camera's rotation, row k of its translation and position."""
+    jxx, jxz, jyy, jyz = jacobian
+    tx, ty, tz = t
+    camera_sums[k] += sum_lanes(valid * (jxx * da + tx * mean))
+    camera_sums[3 + k] += sum_lanes(valid * (jyy * db + ty * mean))
+    camera_sums[6 + k] += sum_lanes(valid * (jxz * da + jyz * db + tz * mean))
+    camera_sums[9 + k] += sum_lanes(valid * t_k)
+    camera_sums[12 + k] -= sum_lanes(valid * through_color)
+
+
+@inlined
+def _combined(x, p, y, q):
+    """x p + y q, for vectors x and y and 3 vectors each in p and q."""
+    return x * p[0] + y * q[0], x * p[1] + y * q[1], x * p[2] + y * q[2]
 
 
 @inlined
@@ -418,23 +354,9 @@ def _one_where_equal(a, b):
 
 
 @inlined
-def _add3(array, ids, start, first_camera, x, y, z):
+def _add3(array, ids, start, first_camera, values):
     """Add 3 vectors to the columns of an array [N, 3]; for the first camera, overwrite them."""
     if not first_camera:
-        old_x, old_y, old_z = gather3(array, ids, start, 3, 0)
-        x = x + old_x
-        y = y + old_y
-        z = z + old_z
-    scatter(array, ids, start, 3, 0, (x, y, z))
-
-
-@inlined
-def _add4(array, ids, start, first_camera, w, x, y, z):
-    """`_add3` for arrays [N, 4]."""
-    if not first_camera:
-        old_w, old_x, old_y, old_z = gather4(array, ids, start, 4, 0)
-        w = w + old_w
-        x = x + old_x
-        y = y + old_y
-        z = z + old_z
-    scatter(array, ids, start, 4, 0, (w, x, y, z))
+        x, y, z = gather3(array, ids, start, 3, 0)
+        values = (values[0] + x, values[1] + y, values[2] + z)
+    scatter(array, ids, start, 3, 0, values)

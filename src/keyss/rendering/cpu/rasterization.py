@@ -33,6 +33,7 @@ from keyss.rendering.cpu.layout import (
 )
 from keyss.rendering.cpu.memory import Array
 from keyss.rendering.cpu.parallel import run
+from keyss.rendering.cpu.records import GaussianArrays, ProjectedArrays, ViewSettings
 
 MAX_PAIRS = 2**31 - 1  # places in the lists of tiles are int32
 
@@ -52,6 +53,14 @@ class Settings:
     with_depth: bool  # draw the depth as one more channel
     antialiased: bool
     absgrad: bool
+
+    def view(self, camera: Array) -> ViewSettings:
+        """What kernels need to know of a camera [CAMERA]."""
+        distances = (self.near_plane, self.far_plane, self.eps2d, self.radius_clip)
+        near, far, eps2d, radius_clip = (np.float32(distance) for distance in distances)
+        return ViewSettings(
+            camera, self.width, self.height, near, far, eps2d, radius_clip, self.antialiased, self.sh_count
+        )
 
     @property
     def channels(self) -> int:
@@ -73,7 +82,7 @@ class Settings:
 class Drawing:
     """What the backward pass needs to know of one camera's forward pass."""
 
-    camera: Array  # [CAMERA]
+    view: ViewSettings
     footprints: Array  # [N, PACKED]
     features: Array | None  # [N, feature_channels] channels to draw; None for colours in the footprints
     first_slots: Array  # [N] first slot of each Gaussian's pairs
@@ -134,12 +143,13 @@ class _Rasterize(torch.autograd.Function):
         images = _empty(*shape, settings.channels)
         alphas = _empty(*shape, 1)
         transmittances = _empty(*shape)  # 1 - alphas, without the rounding where alpha is nearly 1
-        gaussians = tuple(tensor.detach().numpy() for tensor in (means, quats, scales, opacities, colors))
+        tensors = (means, quats, scales, opacities, colors)
+        gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
         drawings = []
         for c in range(len(viewmats)):
             drawing = _draw(
                 gaussians,
-                _camera_array(viewmats[c], Ks[c]),
+                settings.view(_camera_array(viewmats[c], Ks[c])),
                 backgrounds[c].detach().numpy(),
                 settings,
                 any(ctx.needs_input_grad),
@@ -186,6 +196,10 @@ class _Rasterize(torch.autograd.Function):
         pieces = -(-len(means) // CHUNK)
         camera_gradient = np.zeros((pieces if need_camera else 0, 15))
         viewmats_gradient = torch.zeros_like(viewmats) if need_camera else None
+        arrays, gradient_arrays = (
+            GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
+            for tensors in (gaussians, gradients)
+        )
         for c, drawing in enumerate(ctx.drawings):
             moments, extras = _blend_backward(
                 drawing,
@@ -196,29 +210,11 @@ class _Rasterize(torch.autograd.Function):
                 settings,
             )
             run(
-                projection_backward.project_backward,
-                *(tensor.detach().numpy() for tensor in gaussians),
-                settings.sh_count,
-                drawing.camera,
-                settings.width,
-                settings.height,
-                settings.antialiased,
-                settings.feature_channels,
-                drawing.footprints,
-                drawing.first_slots,
-                drawing.slot_counts,
-                moments,
-                extras,
-                settings.extra_width,
-                c == 0,
-                need_colors,
-                need_camera,
-                settings.absgrad,
-                *(gradient.numpy() for gradient in gradients),
-                means2d_gradient[c].detach().numpy(),
-                absgrad[c].detach().numpy(),
-                camera_gradient,
-            )
+                projection_backward.project_backward, arrays, drawing.view, settings.feature_channels,
+                drawing.footprints, drawing.first_slots, drawing.slot_counts, moments, extras,
+                settings.extra_width, c == 0, need_colors, need_camera, settings.absgrad, gradient_arrays,
+                means2d_gradient[c].detach().numpy(), absgrad[c].detach().numpy(), camera_gradient,
+            )  # fmt: skip
             if viewmats_gradient is not None:
                 viewmats_gradient[c] = _viewmat_gradient(camera_gradient, viewmats[c])
         if settings.absgrad:
@@ -241,8 +237,8 @@ def _empty(*shape: int, dtype: Any = np.float32) -> Tensor:
 
 
 def _draw(
-    gaussians: tuple[Array, ...],
-    camera: Array,
+    gaussians: GaussianArrays,
+    view: ViewSettings,
     background: Array,
     settings: Settings,
     for_backward: bool,
@@ -254,37 +250,15 @@ def _draw(
     transmittance: Array,
 ) -> Drawing:
     """One camera's forward pass; fills the last six arrays."""
-    means, quats, scales, opacities, colors = gaussians
-    count = len(means)
+    count = len(gaussians.means)
     width, height = settings.width, settings.height
     columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
     footprints = memory.empty((count, PACKED), np.float32)
     features = memory.empty((count, settings.feature_channels), np.float32)
     slot_counts = memory.empty((count,), np.int32)  # at first a bound
-    run(
-        projection.project,
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        settings.sh_count,
-        camera,
-        width,
-        height,
-        np.float32(settings.near_plane),
-        np.float32(settings.far_plane),
-        np.float32(settings.eps2d),
-        np.float32(settings.radius_clip),
-        settings.antialiased,
-        footprints,
-        features,
-        means2d,
-        depths,
-        radii,
-        slot_counts,
-    )
+    projected = ProjectedArrays(footprints, features, means2d, depths, radii, slot_counts)
+    run(projection.project, gaussians, view, projected)
     order, spare_order = (memory.empty((count,), np.int32) for _ in range(2))
     keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
     visible = binning.sort_by_depth(depths, order, spare_order, keys, spare_keys)
@@ -303,51 +277,26 @@ def _draw(
     rows_of_pairs = memory.empty((most_pairs + 1,), np.int16)
     cursors = memory.empty((shares, columns * rows), np.int64)
     run(
-        binning.list_pairs,
-        footprints,
-        order,
-        columns,
-        height,
-        starts,
-        tiles,
-        rows_of_pairs,
-        slot_counts,
+        binning.list_pairs, footprints, order, columns, height, starts, tiles, rows_of_pairs, slot_counts,
         cursors,
-    )
+    )  # fmt: skip
     tile_starts = memory.empty((columns * rows + 1,), np.int64)
     first_slots = memory.empty((count if for_backward else 0,), np.int32)
     pairs = binning.offsets_from_counts(cursors, tile_starts, slot_counts, first_slots)
     entries = memory.empty((pairs,), np.int64)
     entry_slots = memory.empty((pairs if for_backward else 0,), np.int32)
     run(
-        binning.sort_pairs,
-        order,
-        starts,
-        tiles,
-        rows_of_pairs,
-        slot_counts,
-        first_slots,
-        cursors,
-        entries,
+        binning.sort_pairs, order, starts, tiles, rows_of_pairs, slot_counts, first_slots, cursors, entries,
         entry_slots,
-    )
+    )  # fmt: skip
     ends = memory.empty((columns * rows,), np.int64)
     own_colors = features if settings.feature_channels else None
     run(
-        blending.blend,
-        footprints,
-        own_colors,
-        entries,
-        tile_starts,
-        columns,
-        background,
-        image,
-        alpha,
-        transmittance,
-        ends,
-    )
+        blending.blend, footprints, own_colors, entries, tile_starts, columns, background, image, alpha,
+        transmittance, ends,
+    )  # fmt: skip
     return Drawing(
-        camera, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
+        view, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
     )
 
 
@@ -364,23 +313,11 @@ def _blend_backward(
     moments = memory.empty((slots * MOMENTS,), np.float32)
     extras = memory.empty((slots * settings.extra_width,), np.float32)
     run(
-        blending_backward.blend_backward,
-        drawing.footprints,
-        drawing.features,
-        drawing.entries,
-        drawing.entry_slots,
-        drawing.tile_starts,
-        drawing.ends,
-        -(-settings.width // TILE_WIDTH),
-        image,
-        transmittance,
-        image_gradient,
-        alpha_gradient,
-        moments,
-        extras,
-        settings.extra_width,
+        blending_backward.blend_backward, drawing.footprints, drawing.features, drawing.entries,
+        drawing.entry_slots, drawing.tile_starts, drawing.ends, -(-settings.width // TILE_WIDTH), image,
+        transmittance, image_gradient, alpha_gradient, moments, extras, settings.extra_width,
         settings.absgrad,
-    )
+    )  # fmt: skip
     return moments, extras
 
 

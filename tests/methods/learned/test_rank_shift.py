@@ -1,4 +1,4 @@
-"""Scrambled ghosts: put back by their key, in any order, and saying nothing to others."""
+"""The keyed rank shift: undone by its key, in any order, and saying nothing to others."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from scipy.stats import kstest
 
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits.bits import is_random, read_low_bits, write_low_bits
+from keyss.channels.low_bits.bits import read_low_bits, usable_carriers, write_low_bits
 from keyss.core import Gaussians
-from keyss.methods.learned.scramble import Scramble, with_lengths_of_the_cover
+from keyss.methods.learned.rank_shift import RankShift, match_quaternion_lengths
 
 BAND = (-10.0, -6.0)
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -35,14 +35,16 @@ def _hidden(model: Gaussians) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def closed() -> tuple[Scramble, Gaussians, Gaussians]:
+def encrypted() -> tuple[RankShift, Gaussians, Gaussians]:
     stego = _stego()
-    scramble = Scramble.of(stego, b"k" * 32, BAND)
-    return scramble, stego, scramble.close(stego)
+    rank_shift = RankShift.of(stego, b"k" * 32, BAND)
+    return rank_shift, stego, rank_shift.encrypt(stego)
 
 
-def test_only_the_hidden_change_and_they_stay_hidden(closed: tuple[Scramble, Gaussians, Gaussians]) -> None:
-    _, stego, published = closed
+def test_only_the_hidden_change_and_they_stay_hidden(
+    encrypted: tuple[RankShift, Gaussians, Gaussians],
+) -> None:
+    _, stego, published = encrypted
     for name in FIELDS:
         assert torch.equal(getattr(published, name)[:1000], getattr(stego, name)[:1000]), name
     assert len(_hidden(published)) == 1000
@@ -51,31 +53,31 @@ def test_only_the_hidden_change_and_they_stay_hidden(closed: tuple[Scramble, Gau
 
 
 def test_the_key_puts_them_back_whatever_the_order_and_the_low_bits(
-    closed: tuple[Scramble, Gaussians, Gaussians],
+    encrypted: tuple[RankShift, Gaussians, Gaussians],
 ) -> None:
-    scramble, stego, published = closed
-    rows = np.flatnonzero(is_random(published))
+    rank_shift, stego, published = encrypted
+    rows = np.flatnonzero(usable_carriers(published))
     noise = np.random.default_rng(0).integers(0, 256, read_low_bits(published)[rows].shape, dtype=np.uint8)
     order = torch.randperm(2000)[:1500]
-    opened = scramble.open(write_low_bits(published, rows, noise)[order])
+    decrypted = rank_shift.decrypt(write_low_bits(published, rows, noise)[order])
     for name in ("means", "log_scales", "opacity_logits", "sh"):
-        error = (getattr(opened, name) - getattr(stego, name)[order]).abs()
+        error = (getattr(decrypted, name) - getattr(stego, name)[order]).abs()
         assert float(error.quantile(0.99)) < (5e-4 if name == "means" else 2e-3), name
         assert float(error.max()) < 2e-2, name
 
 
-def test_another_key_puts_nothing_back(closed: tuple[Scramble, Gaussians, Gaussians]) -> None:
-    scramble, stego, published = closed
-    opened = replace(scramble, key=b"j" * 32).open(published)
-    distance = (opened.means - stego.means)[1000:].norm(dim=1)
+def test_another_key_puts_nothing_back(encrypted: tuple[RankShift, Gaussians, Gaussians]) -> None:
+    rank_shift, stego, published = encrypted
+    decrypted = replace(rank_shift, key=b"j" * 32).decrypt(published)
+    distance = (decrypted.means - stego.means)[1000:].norm(dim=1)
     chance = (stego.means[1000:][torch.randperm(1000)] - stego.means[1000:]).norm(dim=1)
     assert float(distance.median()) > 0.8 * float(chance.median())
 
 
 def test_what_is_published_is_distributed_as_the_cover_and_independent_of_what_is_hidden(
-    closed: tuple[Scramble, Gaussians, Gaussians],
+    encrypted: tuple[RankShift, Gaussians, Gaussians],
 ) -> None:
-    _, stego, published = closed
+    _, stego, published = encrypted
     for name in ("means", "log_scales"):
         for axis in range(3):
             shown = getattr(published, name)[1000:, axis].numpy()
@@ -90,9 +92,9 @@ def test_what_is_published_is_distributed_as_the_cover_and_independent_of_what_i
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_hidden_gaussians_are_no_special_case(count: int) -> None:
     stego = _stego()[: 1000 + count]
-    scramble = Scramble.of(stego, b"k" * 32, BAND)
-    opened = scramble.open(scramble.close(stego))
-    torch.testing.assert_close(opened.means, stego.means, atol=1e-3, rtol=1e-3)
+    rank_shift = RankShift.of(stego, b"k" * 32, BAND)
+    decrypted = rank_shift.decrypt(rank_shift.encrypt(stego))
+    torch.testing.assert_close(decrypted.means, stego.means, atol=1e-3, rtol=1e-3)
 
 
 def test_round_and_grey_covers_get_round_and_grey_ghosts() -> None:
@@ -105,20 +107,20 @@ def test_round_and_grey_covers_get_round_and_grey_ghosts() -> None:
         sh=torch.cat([noise[:, :, None] + 1e-3 * stego.sh[:, :1], stego.sh[:, 1:]], dim=1),
     )
     cover = Gaussians.cat([round_grey[:1000], stego[1000:]])
-    scramble = Scramble.of(cover, b"k" * 32, BAND)
-    ghosts = scramble.close(cover)[1000:]
-    for values in (ghosts.log_scales, ghosts.sh[:, 0]):
+    rank_shift = RankShift.of(cover, b"k" * 32, BAND)
+    hidden = rank_shift.encrypt(cover)[1000:]
+    for values in (hidden.log_scales, hidden.sh[:, 0]):
         assert float(np.corrcoef(values.numpy().T)[0, 1:].min()) > 0.95
-    opened = scramble.open(scramble.close(cover))
+    decrypted = rank_shift.decrypt(rank_shift.encrypt(cover))
     for name in ("log_scales", "sh"):
-        error = (getattr(opened, name) - getattr(cover, name)).abs()
+        error = (getattr(decrypted, name) - getattr(cover, name)).abs()
         assert float(error.max()) < 2e-2, name
 
 
 def test_quaternions_get_lengths_of_the_cover_and_keep_their_directions() -> None:
     stego = _stego()
     stego = replace(stego, quats=torch.cat([stego.quats[:1000], 3 * stego.quats[1000:]]))
-    changed = with_lengths_of_the_cover(stego, BAND)
+    changed = match_quaternion_lengths(stego, BAND)
     lengths = changed.quats.norm(dim=1)
     torch.testing.assert_close(lengths[1000:].sort().values, stego.quats[:1000].norm(dim=1).sort().values)
     turned = torch.nn.functional.cosine_similarity(changed.quats, stego.quats)

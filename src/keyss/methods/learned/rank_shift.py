@@ -1,11 +1,13 @@
-"""Ghosts that say nothing: what a secret's transparent Gaussians show to those who make them visible.
+"""The keyed rank shift: encryption of what a secret's transparent Gaussians show when made visible.
 
 A Gaussian that the cover never draws need not show where it is. Position, scales, colour and opacity of each
-are published as other values, as frequent as among the cover's visible Gaussians: with u in [0, 1) the rank
-of the true value among the secret's, and r a number that only the key gives for this Gaussian, the value of
-rank u + r mod 1 of the cover. r is uniform, so u + r mod 1 says nothing of u (a one-time pad). What r is
-derived from is the Gaussian's own rotation and higher harmonics, which stay, but for the low bits that other
-things are written to; thus neither order nor loss of others matters, and no format that rounds survives.
+are published as other values, as frequent as among the cover's visible Gaussians. Let u in [0, 1) be the rank
+of the true value among the secret's, and r a number that only the key gives for this Gaussian: published is
+the value of rank u + r mod 1 of the cover. r is uniform, so u + r mod 1 says nothing of u (a one-time pad).
+
+r is derived from the Gaussian's own rotation and higher harmonics, which stay, except for the low bits that
+payloads are written to. Therefore neither order nor loss of others matters, and no format that rounds
+survives.
 Gaussians whose rotation and harmonics are equal (clones that training never moved) share their r.
 """
 
@@ -19,13 +21,12 @@ import numpy.typing as npt
 import torch
 
 from keyss.core.colour import OPPONENT
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 
 KNOTS = 65
 CHANNELS = 10  # means, log scales, constant colour, opacity logit
 KEY_BYTES = 32
-LEAST_OPACITY = 1 / 255
-# Above the bits that sealing writes to: nine of a quaternion, thirteen of a harmonic.
+# Above the bits that payloads are written to: nine of a quaternion, thirteen of a harmonic.
 _QUAT_BITS, _SH_BITS = np.uint32(0xFFFFFE00), np.uint32(0xFFFFE000)
 _RANK_BYTES = 6  # of keyed BLAKE2b for each channel
 # Neighbouring knots of what is published lie so far apart, relative to their size, that float32 resolves
@@ -39,7 +40,7 @@ Table = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scramble:
+class RankShift:
     """What it takes to put the Gaussians of one secret back."""
 
     key: bytes
@@ -48,23 +49,23 @@ class Scramble:
     shown: torch.Tensor  # [CHANNELS, KNOTS] the same of what is published
 
     @staticmethod
-    def of(stego: Gaussians, key: bytes, band: tuple[float, float]) -> Scramble:
+    def of(stego: Gaussians, key: bytes, band: tuple[float, float]) -> RankShift:
         """For the Gaussians of `stego` whose opacity logits lie in `band`; `key` has KEY_BYTES."""
         hidden = _inside(stego, band)
-        visible = stego.opacities >= LEAST_OPACITY
+        visible = stego.opacities >= DRAWN_OPACITY
         own = _quantiles(_channels(stego[hidden]))
         shown = _quantiles(_channels(stego[visible if visible.any() else hidden]))
         shown = _ascending(shown, _least_gaps(shown))
         shown[-1] = np.linspace(own[-1, 0], own[-1, -1], KNOTS)  # as transparent as they are
         tables = (torch.from_numpy(np.ascontiguousarray(table)).float() for table in (own, shown))
-        return Scramble(key, band, *tables)
+        return RankShift(key, band, *tables)
 
-    def close(self, stego: Gaussians) -> Gaussians:
+    def encrypt(self, stego: Gaussians) -> Gaussians:
         """`stego` with this secret's Gaussians as they are published."""
         return self._moved(stego, self.own, self.shown, 1)
 
-    def open(self, stego: Gaussians) -> Gaussians:
-        """What `close` was given, to the precision of float32."""
+    def decrypt(self, stego: Gaussians) -> Gaussians:
+        """What `encrypt` was given, to the precision of float32."""
         return self._moved(stego, self.shown, self.own, -1)
 
     def _moved(self, stego: Gaussians, start: torch.Tensor, end: torch.Tensor, sign: int) -> Gaussians:
@@ -93,7 +94,7 @@ class Scramble:
         rows = np.concatenate([quats, harmonics], axis=1).astype("<u4")
         drawn = b"".join(
             hashlib.blake2b(
-                row.tobytes(), digest_size=CHANNELS * _RANK_BYTES, key=self.key, person=b"keyss/scramble"
+                row.tobytes(), digest_size=CHANNELS * _RANK_BYTES, key=self.key, person=b"keyss/rank-shift"
             ).digest()
             for row in rows
         )
@@ -102,12 +103,12 @@ class Scramble:
         return shifts
 
 
-def with_lengths_of_the_cover(stego: Gaussians, band: tuple[float, float]) -> Gaussians:
+def match_quaternion_lengths(stego: Gaussians, band: tuple[float, float]) -> Gaussians:
     """`stego` with quaternions in `band` as long as those of visible Gaussians: the n-th longest as theirs.
 
     A length changes nothing that is drawn, but training leaves other ones in another scene.
     """
-    hidden, visible = _inside(stego, band), stego.opacities >= LEAST_OPACITY
+    hidden, visible = _inside(stego, band), stego.opacities >= DRAWN_OPACITY
     if not hidden.any() or not visible.any():
         return stego
     lengths = stego.quats.norm(dim=1)
