@@ -9,16 +9,21 @@ With --write the table replaces what lies between the two marker lines of the fi
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from keyss.files.atomic import write_bytes
 from keyss.measure import composite_score
+from keyss.measure.images import ImageComparison
+from keyss.measure.robustness import mean_over_draws
+from keyss.report.verdicts import detector_rocs
+from keyss.runs.audit_record import Audit, read_audit
 
 BEGIN, END = "<!-- audits: begin -->", "<!-- audits: end -->"
-Audit = dict[str, Any]
+Cell = Callable[[Any], str]  # of an `Audit`, whose parts may be None: see `_try`
 
 
 def main() -> None:
@@ -30,7 +35,7 @@ def main() -> None:
     for argument in arguments.runs:
         name, run = argument.split("=", 1)
         names.append(name)
-        audits.append(json.loads((Path(run) / "audit" / "audit.json").read_text()))
+        audits.append(read_audit(Path(run)))
     table = "\n".join([_line(["", *names]), _line(["---"] * (1 + len(names))), *_rows(audits)])
     print(table)
     if arguments.write:
@@ -40,99 +45,86 @@ def main() -> None:
 
 
 def _rows(audits: list[Audit]) -> list[str]:
-    rows: dict[str, Callable[[Audit], str]] = {
-        "cover, dB (loss)": lambda a: _quality(a["images"]["cover"], a["images"]["cover_bound"]),
-        "secret, dB (loss)": lambda a: _quality(a["images"]["secrets"][0], a["images"]["secret_bounds"][0]),
-        "wrong keys against the cover, mean": _wrong_keys,
-        "3D-Sinkhorn as published, sum (null)": _sinkhorn,
+    attributes = ("position", "scale", "rotation", "opacity", "colour", "harmonics", "joint")
+    rows: dict[str, Cell] = {
+        "cover, dB (loss)": lambda a: _quality(a.images.cover, a.images.cover_baseline),
+        "secret, dB (loss)": lambda a: _quality(a.images.secrets[0], a.images.secret_baselines[0]),
+        "wrong keys against the cover, mean": lambda a: f"{a.wrong_key.shown.vs_cover.mean:.2f}",
+        "3D-Sinkhorn as published, sum (controls)": _sinkhorn,
         "composite score (eq. 10)": _score,
         **{
-            f"distance over null: {name} (the plain model's)": lambda a, name=name: _ratio(a, name)  # type: ignore[misc]
-            for name in ("position", "scale", "rotation", "opacity", "colour", "harmonics", "joint")
+            f"distance over seed-to-seed variation: {name} (the plain model's)": partial(_ratio, name=name)
+            for name in attributes
         },
-        "classifier, AUC (null)": _classifier,
-        "StegExpose, AUC (null)": lambda a: _auc(a, "stegexpose"),
-        "sealwatch SPA, AUC (null)": lambda a: _auc(a, "sealwatch", "spa"),
-        "sealwatch SPAM, AUC (null)": lambda a: _auc(a, "sealwatch", "spam"),
-        "largest leak above null, dB": lambda a: _leak(a, "psnr", 2),
-        "largest leak above null, SSIM": lambda a: _leak(a, "ssim", 3),
+        "classifier, AUC (controls)": _classifier,
+        "StegExpose, AUC (controls)": lambda a: _auc(a, "StegExpose"),
+        "sealwatch SPA, AUC (controls)": lambda a: _auc(a, "sealwatch SPA"),
+        "sealwatch SPAM, AUC (controls)": lambda a: _auc(a, "sealwatch SPAM"),
+        "largest leak above controls, dB": lambda a: _leak(a, "psnr", 2),
+        "largest leak above controls, SSIM": lambda a: _leak(a, "ssim", 3),
         "the same after the best fit of colours, dB": lambda a: _leak(a, "psnr_fitted", 2),
         "the same after the best fit of colours, SSIM": lambda a: _leak(a, "ssim_fitted", 3),
-        "largest leak above null, correlation of gradients": lambda a: _leak(a, "gradient", 3),
+        "largest leak above controls, correlation of gradients": lambda a: _leak(a, "gradient", 3),
         "25 % removed at random: cover, secret": _pruned,
-        "secret dies later than the cover, or neither": lambda a: _fates(a, ("later", "neither")),
-        "together": lambda a: _fates(a, ("together",)),
-        "secret dies sooner": lambda a: _fates(a, ("sooner",)),
+        "secret breaks down after the cover, or neither does": lambda a: _attacks(a, ("cover", "neither")),
+        "both break down at the same strength": lambda a: _attacks(a, ("both",)),
+        "secret breaks down before the cover": lambda a: _attacks(a, ("secret",)),
         "rendering, over plain: published, revealed": _rendering,
-        "reveal, s": lambda a: f"{a['speed']['reveal_seconds']:.1f}",
-        "audit, min": lambda a: f"{a['seconds'] / 60:.1f}",
+        "reveal, s": lambda a: f"{max(a.speed.reveal_seconds):.1f}",
+        "audit, min": lambda a: f"{a.seconds / 60:.1f}",
     }
     cells = [[name, *(_try(row, audit) for audit in audits)] for name, row in rows.items()]
     return [_line(row) for row in cells if any(row[1:])]
 
 
-def _quality(found: Audit, bound: Audit | None) -> str:
-    psnr = found["mean"]["psnr"]
-    return f"{psnr:.2f}" + (f" ({bound['mean']['psnr'] - psnr:+.2f})" if bound else "")
+def _quality(found: ImageComparison, baseline: ImageComparison | None) -> str:
+    psnr = found.mean.psnr
+    return f"{psnr:.2f}" + (f" ({baseline.mean.psnr - psnr:+.2f})" if baseline else "")
 
 
-def _wrong_keys(audit: Audit) -> str:
-    return f"{audit['wrong_key']['vs_cover']['mean']:.2f}"
+def _sinkhorn(audit: Any) -> str:
+    found = audit.parameters.sinkhorn
+    return f"{found.stego.sum:.3f} ({fmean(each.sum for each in found.control):.3f})"
 
 
-def _sinkhorn(audit: Audit) -> str:
-    nulls = [each["sum"] for each in audit["sinkhorn"]["null"]]
-    return f"{audit['sinkhorn']['stego']['sum']:.3f} ({sum(nulls) / len(nulls):.3f})"
+def _score(audit: Any) -> str:
+    secret = fmean(each.mean.psnr for each in audit.images.secrets)
+    distance = audit.parameters.sinkhorn.stego.sum
+    return f"{composite_score(audit.images.cover.mean.psnr, secret, distance):.1f}"
 
 
-def _score(audit: Audit) -> str:
-    secrets = [each["mean"]["psnr"] for each in audit["images"]["secrets"]]
-    cover, distance = audit["images"]["cover"]["mean"]["psnr"], audit["sinkhorn"]["stego"]["sum"]
-    return f"{composite_score(cover, sum(secrets) / len(secrets), distance):.1f}"
+def _ratio(audit: Any, name: str) -> str:
+    found = audit.parameters.distances[name]
+    return f"{found.ratio:.2f}" + (f" ({found.original:.2f})" if found.original is not None else "")
 
 
-def _ratio(audit: Audit, name: str) -> str:
-    found = f"{audit['distances']['attributes'][name]['ratio']:.2f}"
-    original = audit["distances"].get("original")
-    return f"{found} ({original[name]['ratio']:.2f})" if original else found
+def _classifier(audit: Any) -> str:
+    found = audit.parameters.two_sample
+    stego, control = (fmean(each.auc for each in aucs) for aucs in (found.stego, found.control))
+    return f"{stego:.3f} ({control:.3f})"
 
 
-def _classifier(audit: Audit) -> str:
-    stego, null = ([each["auc"] for each in audit["two_sample"][which]] for which in ("stego", "null"))
-    return f"{sum(stego) / len(stego):.3f} ({sum(null) / len(null):.3f})"
+def _auc(audit: Audit, detector: str) -> str:
+    rocs = [each for program in ("StegExpose", "sealwatch") for each in detector_rocs(audit, program)]
+    found = next((each for each in rocs if each.name == detector), None)
+    return f"{found.published.auc:.2f} ({found.control.auc:.2f})" if found and found.control else ""
 
 
-def _auc(audit: Audit, program: str, *path: str) -> str:
-    values = []
-    for key in (program, f"{program}_null"):
-        found = audit[key]
-        for each in path:
-            found = found[each]
-        values.append(found["roc"]["auc"])
-    return f"{values[0]:.2f} ({values[1]:.2f})"
+def _leak(audit: Any, score: str, digits: int) -> str:
+    leaks = [(getattr(row.leak, score), row.attack) for row in audit.leaks.secrets[0] if not row.with_key]
+    leak, attack = max(leaks)
+    return f"{leak:+.{digits}f} ({attack})"
 
 
-def _leak(audit: Audit, score: str, digits: int) -> str:
-    attacks = [row for row in audit["leaks"][0] if not row["control"]]
-    worst = max(attacks, key=lambda row: row["leak"][score])
-    return f"{worst['leak'][score]:+.{digits}f} ({worst['attack']})"
+def _pruned(audit: Any) -> str:
+    changes = mean_over_draws(audit.robustness.changes)
+    pruned = next(each for each in changes if (each.attack, each.strength) == ("random pruning", 0.25))
+    return f"{-pruned.cover.loss:+.2f}, {-pruned.secrets[0].loss:+.2f}"
 
 
-def _pruned(audit: Audit) -> str:
-    rows = [r for r in audit["robustness"] if (r["attack"], r["strength"]) == ("random pruning", 0.25)]
-    losses = [
-        -sum(each[-1] for each in part) / len(part)
-        for part in (
-            [(row["cover"]["loss"],) for row in rows],
-            [(row["secrets"][0]["loss"],) for row in rows],
-        )
-    ]
-    return f"{losses[0]:+.2f}, {losses[1]:+.2f}"
-
-
-def _fates(audit: Audit, chosen: tuple[str, ...]) -> str:
-    """Attacks with one of these verdicts; what begins alike is named together."""
-    names = [row["attack"] for row in audit["survival"] if row["verdict"] in chosen]
+def _attacks(audit: Any, first: tuple[str, ...]) -> str:
+    """Attacks under which these break down first; what begins alike is named together."""
+    names = [point.attack for point in audit.robustness.breakdown_points if point.first in first]
     parts = []
     for start in ("noise on ", "conversion to "):
         own = [name.removeprefix(start) for name in names if name.startswith(start)]
@@ -141,15 +133,15 @@ def _fates(audit: Audit, chosen: tuple[str, ...]) -> str:
     return "; ".join(names + parts)
 
 
-def _rendering(audit: Audit) -> str:
-    return ", ".join(f"{each['ratio']:.2f}" for each in audit["speed"]["render"])
+def _rendering(audit: Any) -> str:
+    return ", ".join(f"{each.ratio:.2f}" for each in audit.speed.render)
 
 
-def _try(row: Callable[[Audit], str], audit: Audit) -> str:
+def _try(row: Cell, audit: Audit) -> str:
     """The cell; empty where the audit has nothing of it."""
     try:
         return row(audit)
-    except (KeyError, IndexError, TypeError, ZeroDivisionError):
+    except (AttributeError, KeyError, IndexError, TypeError, StopIteration, ValueError):
         return ""
 
 

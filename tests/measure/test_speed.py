@@ -65,10 +65,12 @@ def test_the_ratio_is_that_of_the_times_whatever_else_the_machine_does(
     assert {tuple(drawn[i : i + 2]) for i in range(0, len(drawn), 2)} == {(30, 20), (20, 30)}
 
 
-def test_a_model_takes_as_long_as_itself_and_longer_than_a_small_one() -> None:
+def test_a_model_takes_longer_than_a_hundredth_of_it() -> None:
+    """Really drawn; three thousand Gaussians against thirty, so that no other work makes up for it."""
     scene, model = tiny_scene(), random_gaussians(3000)
-    assert 0.5 < render_time("m", model, model, scene).ratio < 2
-    assert render_time("m", model, model[:3], scene).ratio > 1.5
+    found = render_time("m", model, model[:30], scene)
+    assert found.ratio > 1
+    assert 0 < found.plain_seconds < found.seconds
 
 
 def test_revealing_is_timed_from_file_to_file(clock: Clock, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def audited_run(root: Path) -> Path:
     keyss.hide(
         scenes[0],
         secrets,
-        config=CONFIG.with_fit(max_gaussians=1100, iterations=20),
+        method=CONFIG.with_fit(max_gaussians=1100, iterations=20),
         width=40,
         cover_model=random_gaussians(1000, seed=0),  # with room for decoders
         out=root / "run",

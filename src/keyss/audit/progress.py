@@ -38,22 +38,16 @@ class _FinishedPart(Generic[T]):
     pictures: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Inputs:
-    version: int = 1
-    digest: str
-
-
 class FinishedParts:
     """Finished parts in a folder; `inputs` is what must be the same for them to mean the same."""
 
     def __init__(self, folder: Path, inputs: dict[str, object]) -> None:
         self.folder = folder
-        now = _Inputs(digest=hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).hexdigest())
-        path = folder / "inputs.json"
+        digest = hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).digest()
+        path = folder / "inputs.sha256"
         if not path.exists():
-            write_record(path, now)
-        elif read_record(path, _Inputs) != now:
+            write_bytes(path, digest)
+        elif read_file(path, len(digest)) != digest:
             raise InputError(
                 f"{folder}: belongs to an audit with other settings or inputs; "
                 "give the same ones, or start anew with --overwrite"

@@ -126,6 +126,8 @@ def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
 
     Both are 0 where there is one constant in both.
     """
+    from ot import wasserstein_1d  # slow to import
+
     one, two = np.sort(reference, axis=1), np.sort(other, axis=1)
     last = one.shape[1] - 1
     span = np.maximum(one[:, -1], two[:, -1]) - np.minimum(one[:, 0], two[:, 0])
@@ -134,25 +136,14 @@ def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
     )
     units = one[:, round(0.95 * last)] - one[:, round(0.05 * last)]
     units = np.where(units > least, units, np.where(span > least, span, 0))
-    return _in_units(_wasserstein(one, two), units), units
+    if one.shape == two.shape:
+        areas: Floats = np.abs(one - two).mean(axis=1)
+    else:
+        areas = wasserstein_1d(one.T.astype(np.float64), two.T.astype(np.float64), require_sort=False)
+    return _in_units(areas, units), units
 
 
 def _in_units(values: Floats, units: Floats) -> Floats:
     """`values` divided by units that broadcast to them, 0 where the unit is."""
     divisors: Floats = np.where(units > 0, units, np.inf)
     return values / divisors
-
-
-def _wasserstein(one: Floats, two: Floats) -> Floats:
-    """[D] exact 1-D Wasserstein distances of samples sorted along the rows of [D, N] and [D, M].
-
-    The area between their quantile functions, which are steps of 1 / N and of 1 / M, counted in 1 / (N M).
-    """
-    n, m = one.shape[1], two.shape[1]
-    if n == m:
-        means: Floats = np.abs(one - two).mean(axis=1)
-        return means
-    ends = np.union1d(np.arange(1, n + 1) * m, np.arange(1, m + 1) * n)
-    widths = np.diff(ends, prepend=0) / (n * m)
-    areas: Floats = np.abs(one[:, (ends - 1) // m] - two[:, (ends - 1) // n]) @ widths.astype(np.float32)
-    return areas

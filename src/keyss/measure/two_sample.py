@@ -51,7 +51,7 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> AucInterval:
     The mean over five folds, and its 95 % confidence interval by DeLong's method (1988). Trees see
     `keyss.measure.features.features`, of as many Gaussians of one model as of the other: random subsets (by
     `seed`) of at most 10,000. Folds are made of cells of space. Were they made of single Gaussians, a
-    model against itself would score far below 0.5, for the trees would have learnt from the twin of each
+    model against itself would score far below 0.5, for the trees would have learnt from the equal of each
     Gaussian held out, with the other label. Raises UsageError for a model of fewer than 100 Gaussians, or
     whose Gaussians lie in so few places that there are no five folds.
     """

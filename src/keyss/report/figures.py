@@ -11,7 +11,8 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from importlib.resources import as_file, files
 
 import matplotlib
 from markupsafe import Markup
@@ -41,34 +42,6 @@ _VARIABLES = {
     **{color: f"--line-{index}" for index, color in enumerate(_LINES, start=1)},
 }
 _MARKERS = "osD^vPX*"
-_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "text.parse_math": False,  # names are other people's: a $ is a $
-    "font.sans-serif": ["DejaVu Sans"],  # what room is left for text; page.css has the page's font instead
-    "font.size": 9,
-    "text.color": _INK,
-    "axes.edgecolor": _MUTED,
-    "axes.facecolor": "none",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.labelcolor": _MUTED,
-    "axes.labelsize": 9,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.unicode_minus": True,
-    "grid.color": _GRID,
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.5,
-    "lines.markersize": 5,
-    "xtick.color": _MUTED,
-    "ytick.color": _MUTED,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "figure.facecolor": "none",
-    "savefig.facecolor": "none",
-}
 _LONGEST_NAME = 28
 _WIDTH = 4.2  # inches; on a phone's width text is then about as large as it is here
 
@@ -245,7 +218,7 @@ def _figure(
     with matplotlib.rc_context(), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of glyphs that its font lacks: the browser's has them
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
+        matplotlib.rcParams.update(_style())
         matplotlib.rcParams["svg.hashsalt"] = name
         figure = Figure(figsize=(width, height), layout="constrained")
         draw(figure.add_subplot())
@@ -254,6 +227,12 @@ def _figure(
         figure.savefig(written, format="svg", metadata=nothing)
     figure_of = Markup('<div class="plot" role="img" aria-label="{}">{}</div>')
     return figure_of.format(clean(description), _for_a_page(written.getvalue()))
+
+
+@cache
+def _style() -> matplotlib.RcParams:
+    with as_file(files("keyss.report") / "assets" / "figures.mplstyle") as path:
+        return matplotlib.rc_params_from_file(path, use_default_template=False)
 
 
 def _for_a_page(svg: str) -> Markup:
