@@ -72,9 +72,11 @@ def _is_rounded(stego: Gaussians) -> bool:
     return len(logits.unique()) < _ROUNDED_SHARE * len(logits)
 
 
-@torch.no_grad()
 def decode(stego: Gaussians, secret: HiddenSecret, embedding: Tensor) -> Gaussians:
-    """What the secret's decoder makes of `stego` for an embedding [64], in the cover's frame."""
+    """What the secret's decoder makes of `stego` for an embedding [64], in the cover's frame.
+
+    Differentiable in the embedding where the decoder is: the white-box attack searches by that gradient.
+    """
     decoder = secret.decoder.to(stego.device)
     if secret.rank_shift is not None:
         stego = secret.rank_shift.decrypt(stego)
