@@ -23,18 +23,18 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from keyss.methods.carry.plan import Size, room
-
 from channels.low_bits.trained_like import trained_like
 from keyss import read_model, write_model
+from keyss.channels.low_bits.bits import usable_carriers
+from keyss.channels.low_bits.layout import record_capacity
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.methods.carry import embed, extract
-from keyss.methods.carry.carrying import usable_carriers
+from keyss.methods.carry.carrying import record_request
 from keyss.methods.carry.dither import cost
 from keyss.rendering import render
+from methods.carry.carried import embed, extract
 
 KEY = "the key of the benchmark"
 REMOVED = 0.25
@@ -63,7 +63,7 @@ def main() -> None:
 def _capacities() -> None:
     print("Gaussians that fit in 100,000 carriers, by SH degree of the secret (0, 1, 2, 3):")
     for degree in range(4):
-        fits = [room([Size(1, other)], 100_000, degree) for other in range(4)]
+        fits = [record_capacity([record_request(1, other)], 100_000, degree) for other in range(4)]
         print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
 
 

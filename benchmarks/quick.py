@@ -34,8 +34,8 @@ from channels.low_bits.trained_like import trained_like
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
-from keyss.methods.carry import embed, extract
 from keyss.rendering import render
+from methods.carry.carried import embed, extract
 from rasterizer import camera_before, made_up
 
 BASELINE = RESULTS / "quick" / "baseline.json"

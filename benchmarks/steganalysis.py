@@ -20,13 +20,12 @@ from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from keyss.channels.low_bits.byte_plan import SALTS
-from keyss.channels.low_bits.container import embed_derived
-
+from channels.low_bits.payloads import embed_derived
 from channels.low_bits.steganalysis import features, held_out_scores, parts, standard_error
+from keyss.channels.low_bits.layout import SALTS
 from keyss.files.models import read_model
 from keyss.keys import DerivedKey
-from keyss.methods.carry import carrying
+from methods.carry import carried as carrying
 
 Labels = npt.NDArray[np.int64]
 

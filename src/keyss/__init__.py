@@ -16,14 +16,11 @@ from keyss._version import __version__
 
 if TYPE_CHECKING:
     from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal
-    from keyss.audit import audit
     from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
     from keyss.files import load_scene, read_model, write_model
     from keyss.fitting import FitConfig
     from keyss.keys import generate_key
-    from keyss.methods.carry.options import CarryOptions
-    from keyss.methods.learned.options import LearnedOptions
-    from keyss.report import write_report as report
+    from keyss.methods.registry import CarryOptions, LearnedOptions
     from keyss.runs.describe import info
 
 __all__ = [
@@ -39,7 +36,6 @@ __all__ = [
     "View",
     "WrongKeyError",
     "__version__",
-    "audit",
     "evaluate",
     "fit",
     "generate_key",
@@ -48,7 +44,6 @@ __all__ = [
     "load_scene",
     "read_model",
     "render",
-    "report",
     "reveal",
     "write_model",
 ]
@@ -59,17 +54,13 @@ _HOMES = {
     "keyss.files": ("load_scene", "read_model", "write_model"),
     "keyss.fitting": ("FitConfig",),
     "keyss.keys": ("generate_key",),
-    "keyss.methods.carry.options": ("CarryOptions",),
-    "keyss.methods.learned.options": ("LearnedOptions",),
+    "keyss.methods.registry": ("CarryOptions", "LearnedOptions"),
     "keyss.runs.describe": ("info",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-_PACKAGES = ("audit", "report")  # that can be called
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PACKAGES:
-        return importlib.import_module(f"keyss.{name}")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'keyss' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOME_OF[name]), name)

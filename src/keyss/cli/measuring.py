@@ -110,13 +110,13 @@ def audit(
 
     example: keyss audit runs/hidden --key-file key.txt
     """
-    from keyss.audit import audit as judge
+    from keyss import api
     from keyss.cli.keys import keys
     from keyss.cli.tables import print_files, print_verdicts
     from keyss.progress import reporter
 
     chosen = keys(key_file, len(key_file) or 1)
-    judge(
+    api.audit(
         run,
         chosen,
         original=original,
@@ -145,10 +145,10 @@ def report(
 
     example: keyss report runs/hidden
     """
+    from keyss import api
     from keyss.cli.tables import print_files, print_verdicts
-    from keyss.report import write_report
 
-    path = write_report(run)
+    path = api.write_report(run)
     print_verdicts(run)
     print_files(path.parent, {path.name: "open it in a browser; it shows the secret"})
 

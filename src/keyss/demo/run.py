@@ -23,7 +23,7 @@ from keyss.files.output import OutputFolder
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
-from keyss.methods.learned.options import LearnedOptions
+from keyss.methods.registry import LearnedOptions
 from keyss.rendering import Backend
 from keyss.runs import files as results
 from keyss.runs.files import METRICS, PRIVATE, SIDECAR, STEGO

@@ -10,8 +10,10 @@ from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
+from keyss.methods.carry.options import CarryOptions as CarryOptions
 from keyss.methods.decoy import Decoy
 from keyss.methods.learned.method import LearnedMethod
+from keyss.methods.learned.options import LearnedOptions as LearnedOptions
 
 METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod())}
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
@@ -49,26 +47,3 @@ def png_writer(image: Tensor) -> Callable[[Path], None]:
 def record_writer(record: Any) -> Callable[[Path], None]:
     """For `OutputFolder.fill`: writes a record."""
     return lambda path: write_record(path, record)
-
-
-def json_writer(data: dict[str, Any]) -> Callable[[Path], None]:
-    """For `OutputFolder.fill`: writes an object as JSON."""
-    return lambda path: write_bytes(path, json_bytes(data))
-
-
-def json_bytes(data: dict[str, Any]) -> bytes:
-    """JSON for people and programs."""
-    return (json.dumps(data, indent=2) + "\n").encode()
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises InputError."""
-    try:
-        data = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing; is this a folder that keyss made?") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object")
-    return data
