@@ -23,7 +23,7 @@ def search_embeddings(
     *,
     restarts: int = 8,
     steps: int = 150,
-    most: int = 20_000,
+    most: int = 4000,
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
@@ -32,8 +32,9 @@ def search_embeddings(
     Gradient ascent from random starts on the mean change of the opacities, less `balance` times the change of
     their mean: what makes some visible and as much of others invisible is a scene in place of a scene, while
     what only adds or only removes is not. With 0 all change counts, which finds a secret that needs more
-    Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded. Where the
-    decoded opacities have no gradient in the embedding, the random starts come back.
+    Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded: a decoder that
+    divides opacities by their norm over the model sees larger ones then, which are small all the same. Where
+    the decoded opacities have no gradient in the embedding, the random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
     part = stego.detach()

@@ -83,7 +83,8 @@ class Opened(Protocol):
     def decode(self) -> Callable[[Gaussians, Tensor], Gaussians] | None:
         """From a stego model and an embedding [64] to what a decoder makes of them, in the cover's frame.
 
-        None where keys condition no decoder, so that a wrong key shows nothing at all.
+        Differentiable in the embedding where the decoder is: the white-box attack goes by that gradient. None
+        where keys condition no decoder, so that a wrong key shows nothing at all.
         """
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:

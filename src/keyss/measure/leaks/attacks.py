@@ -29,6 +29,7 @@ THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing
 DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
+SEARCH_SAMPLE = 1000  # Gaussians that embeddings are searched on; more find no other
 
 Shown = Iterator[tuple[str, Gaussians]]
 Decode = Callable[[Gaussians, Tensor], Gaussians]
@@ -113,7 +114,13 @@ def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed:
         found = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
             found[name] = search_embeddings(
-                decode, model, restarts=restarts, steps=steps, balance=balance, seed=seed
+                decode,
+                model,
+                restarts=restarts,
+                steps=steps,
+                most=SEARCH_SAMPLE,
+                balance=balance,
+                seed=seed,
             )
         for name, embeddings in found.items():
             for index, embedding in enumerate(embeddings, start=1):
