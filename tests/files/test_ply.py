@@ -220,7 +220,7 @@ BROKEN = {
     "unknown type": (header_of("element vertex 1", "property half x"), "makes no sense"),
     "list in vertex": (header_of(*XYZ, "property list uchar int f"), "list property"),
     "list before": (header_of("element a 1", "property list uchar int f", *XYZ), "list property"),
-    "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: rot_0"),
+    "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: f_dc_0"),
     "compressed": (header_of("element vertex 1", "property uint packed_position"), "compressed"),
     "no model": (header_of("element vertex 1", "property float u"), "not a 3DGS model.*missing: x, y, z"),
     "odd f_rest": (header_of(*XYZ, "property float f_rest_0"), "0, 9, 24 or 45"),

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path, PureWindowsPath
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,7 @@ from keyss.files.lens import Lens, make_lens
 from keyss.files.reading import read_file, read_text
 
 _T = TypeVar("_T")
+_Image = tuple[str, int, NDArray[np.float64]]  # name, id of its camera, [4, 4] world to camera
 
 # Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
 _PARAMETERS = {
@@ -46,14 +46,6 @@ _MODEL_NAMES = (
 )
 
 
-class _Image(NamedTuple):
-    """A posed image; its 2-D observations are not kept."""
-
-    name: str
-    camera_id: int
-    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
-
-
 def read_colmap(folder: Path) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
 
@@ -67,30 +59,26 @@ def read_colmap(folder: Path) -> SceneLayout:
     if model is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
     if (model / "cameras.bin").is_file():
-        cameras, images = list(_cameras_bin(model / "cameras.bin")), list(_images_bin(model / "images.bin"))
+        cameras, images = _cameras_bin(model / "cameras.bin"), _images_bin(model / "images.bin")
         points = _points_bin(model / "points3D.bin")
     else:
-        cameras, images = list(_cameras_txt(model / "cameras.txt")), list(_images_txt(model / "images.txt"))
+        cameras, images = _cameras_txt(model / "cameras.txt"), _images_txt(model / "images.txt")
         points = _points_txt(model / "points3D.txt")
-    lenses = dict(cameras)
-    if len(lenses) < len(cameras):
-        camera_id, _ = Counter(camera_id for camera_id, _ in cameras).most_common(1)[0]
-        raise InputError(f"{model}: expected every camera once, found id {camera_id} twice")
+    lenses: dict[int, Lens] = {}
+    for camera_id, lens in cameras:
+        if camera_id in lenses:
+            raise InputError(f"{model}: expected every camera once, found id {camera_id} twice")
+        lenses[camera_id] = lens
     photos = []
     for name, camera_id, viewmat in images:
+        inside = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
+        if not name.isprintable() or not inside.parts or inside.anchor or ".." in inside.parts:
+            raise InputError(f"{model}: expected image names inside images/, found {name!r}")
         if camera_id not in lenses:
             raise InputError(f"{model}: image {name!r} refers to camera {camera_id}, which does not exist")
-        path = folder / "images" / _inside(model, name)
-        photos.append(Photo(path, name, viewmat, lenses[camera_id]))
+        photos.append(Photo(folder / "images" / name, name, viewmat, lenses[camera_id]))
     refuse_duplicates(model, photos)
     return SceneLayout(*hold_out(model, photos), points)
-
-
-def _inside(model_folder: Path, name: str) -> str:
-    windows = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
-    if not name.isprintable() or not windows.parts or windows.anchor or ".." in windows.parts:
-        raise InputError(f"{model_folder}: expected image names inside images/, found {name!r}")
-    return name
 
 
 def colmap_model_folder(folder: Path) -> Path | None:
@@ -139,18 +127,15 @@ class _Records:
             )
         self.offset += size
 
-    def doubles(self, count: int) -> tuple[float, ...]:
-        return self.take(f"<{count}d", "camera parameters")
-
     def count(self, record_size: int, what: str) -> int:
         """A count of records of at least `record_size` bytes each, which the rest of the file must hold."""
         (count,) = self.take("<Q", f"the number of {what}")
-        if count * record_size > self.left:
-            raise InputError(
-                f"{self.path}: expected {count} {what} of at least {record_size} bytes, "
-                f"but only {self.left} bytes are left: the file is truncated or damaged"
-            )
+        self.skip(count * record_size, f"{count} {what} of at least {record_size} bytes")
+        self.offset -= count * record_size
         return int(count)
+
+    def doubles(self, count: int) -> tuple[float, ...]:
+        return self.take(f"<{count}d", "camera parameters")
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset, self.offset + 4096)
@@ -170,8 +155,8 @@ class _Records:
             )
 
 
-def _image(where: str, name: str, camera_id: int, pose: Sequence[float]) -> _Image:
-    """`pose`: a quaternion wxyz of any length, then a translation, both from world to camera."""
+def _viewmat(where: str, pose: Sequence[float]) -> NDArray[np.float64]:
+    """[4, 4] from a quaternion wxyz of any length and a translation, both from world to camera."""
     *quaternion, x, y, z = pose
     if not 1e-8 < math.hypot(*quaternion) < math.inf:
         raise InputError(f"{where}: expected a rotation quaternion, found {quaternion}")
@@ -180,7 +165,7 @@ def _image(where: str, name: str, camera_id: int, pose: Sequence[float]) -> _Ima
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # scipy's order is xyzw
     viewmat[:3, 3] = x, y, z
-    return _Image(name, camera_id, viewmat)
+    return viewmat
 
 
 def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -196,7 +181,7 @@ def _images_bin(path: Path) -> Iterator[_Image]:
     records = _Records(path)
     for _ in range(records.count(73, "images")):
         image_id, *pose, camera_id = records.take("<I7dI", "an image")
-        yield _image(f"{path}: image {image_id}", records.name(), camera_id, pose)
+        yield records.name(), camera_id, _viewmat(f"{path}: image {image_id}", pose)
         records.skip(24 * records.count(24, "observations"), "observations")
     records.end()
 
@@ -207,24 +192,27 @@ def _points_bin(path: Path) -> PointCloud:
     count = records.count(51, "points")
     offsets = np.empty(count, dtype=np.int64)
     offset, track_length = records.offset, struct.Struct("<Q").unpack_from
-    for i in range(count):  # bare offsets: scenes have millions of points, each with a track to skip
-        if offset + 51 > end:
-            raise InputError(
-                f"{path}: expected {count} points, but the file ends in point {i + 1}: it is truncated"
-            )
-        offsets[i] = offset
-        offset += 51 + 8 * track_length(data, offset + 43)[0]
+    try:
+        for i in range(count):  # bare offsets: scenes have millions of points, each with a track to skip
+            offsets[i] = offset
+            offset += 51 + 8 * track_length(data, offset + 43)[0]
+    except (struct.error, OverflowError):
+        offset = end + 1
     if offset > end:
         raise InputError(
-            f"{path}: expected the track of point {count}, but the file ends in it: it is truncated"
+            f"{path}: expected {count} points, but the file ends in one of them: it is truncated"
         )
     records.offset = offset
     records.end()
     fields = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
     raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
     points = raw.view(fields)[:, 0]
-    points = points[np.argsort(points["id"], kind="stable")]
-    return PointCloud.checked(path, points["xyz"].astype(np.float64), np.ascontiguousarray(points["rgb"]))
+    return _points(path, points["id"], points["xyz"], points["rgb"])
+
+
+def _points(path: Path, ids: NDArray[Any], xyz: NDArray[Any], rgb: NDArray[Any]) -> PointCloud:
+    order = np.argsort(ids, kind="stable")
+    return PointCloud.checked(path, xyz[order].astype(np.float64), rgb[order].astype(np.uint8))
 
 
 def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -235,7 +223,7 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
 
 def _images_txt(path: Path) -> Iterator[_Image]:
     for where, words in _rows(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", lines=2):
-        yield _image(where, words[9], _number(int, where, words[8]), _floats(where, words[1:8], 7))
+        yield words[9], _number(int, where, words[8]), _viewmat(where, _floats(where, words[1:8], 7))
 
 
 def _points_txt(path: Path) -> PointCloud:
@@ -246,9 +234,7 @@ def _points_txt(path: Path) -> PointCloud:
         rgb.append([_number(int, where, word) for word in words[4:7]])
         if not all(0 <= c <= 255 for c in rgb[-1]):
             raise InputError(f"{where}: expected colours of 0 to 255, found {rgb[-1]}")
-    order = sorted(range(len(ids)), key=ids.__getitem__)
-    positions = np.array(xyz, dtype=np.float64).reshape(-1, 3)[order]
-    return PointCloud.checked(path, positions, np.array(rgb, dtype=np.uint8).reshape(-1, 3)[order])
+    return _points(path, np.array(ids, dtype=object), np.reshape(xyz, (-1, 3)), np.reshape(rgb, (-1, 3)))
 
 
 def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:

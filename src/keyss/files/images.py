@@ -46,8 +46,7 @@ def probe_image(path: Path) -> tuple[int, int, bool]:
     EXIF orientation is ignored, as COLMAP does. Raises InputError as `open_image` does.
     """
     with open_image(path) as image:
-        transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-        return image.width, image.height, transparent
+        return image.width, image.height, image.has_transparency_data
 
 
 def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -85,7 +84,7 @@ def _to_rgb(image: Image.Image, background: NDArray[np.float32]) -> NDArray[np.u
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip instead of scale
         grey = np.asarray(image, dtype=np.float64).clip(0, 65535)
         return np.repeat(np.rint(grey / 257).astype(np.uint8)[:, :, None], 3, axis=2)
-    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+    if image.has_transparency_data:
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32)
         alpha = rgba[:, :, 3:] / 255
         mixed = rgba[:, :, :3] * alpha + 255 * background * (1 - alpha)

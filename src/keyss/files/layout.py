@@ -27,14 +27,10 @@ class Photo:
 
 @dataclass(frozen=True)
 class PointCloud:
-    """A point cloud."""
+    """Positions and sRGB colours."""
 
     xyz: NDArray[np.float32]  # [P, 3]
     rgb: NDArray[np.uint8]  # [P, 3]
-
-    @staticmethod
-    def none() -> PointCloud:
-        return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
 
     @staticmethod
     def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> PointCloud:
@@ -48,13 +44,16 @@ class PointCloud:
         return PointCloud(xyz.astype(np.float32), rgb)
 
 
+NO_POINTS = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+
+
 @dataclass(frozen=True)
 class SceneLayout:
     """The photos of a scene, split into training and test, and its points."""
 
     train: tuple[Photo, ...]
     test: tuple[Photo, ...]
-    points: PointCloud
+    points: PointCloud = NO_POINTS
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:

@@ -45,13 +45,6 @@ class Lens:
         """[3, 3] pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
-    def resized(self, width: int, height: int) -> Lens:
-        """The same lens on another pixel grid; distortion coefficients do not depend on it."""
-        x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
-        )
-
     def on_image(self, width: int, height: int) -> Lens | None:
         """The lens for an image of this size: the lens's own, or that size divided by a whole number.
 
@@ -63,7 +56,12 @@ class Lens:
             return self
         factor = round(self.width / width)
         near = abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
-        return self.resized(width, height) if factor > 1 and near else None
+        if factor < 2 or not near:
+            return None
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+        )
 
 
 def make_lens(
@@ -138,9 +136,7 @@ def undistortion(lens: Lens, where: str) -> Undistortion:
 
 
 def _opencv_K(lens: Lens) -> NDArray[np.float64]:
-    K = lens.K
-    K[:2, 2] -= 0.5
-    return K
+    return lens.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
 
 
 def _source_coordinates(
@@ -166,8 +162,7 @@ def _covers(lens: Lens, zoom: float) -> bool:
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         return False
     edge = 0.5 + 1e-3
-    inside = (x >= -edge) & (x <= lens.width - 1 + edge) & (y >= -edge) & (y <= lens.height - 1 + edge)
-    if not inside.all():
+    if min(x.min(), y.min()) < -edge or x.max() > lens.width - 1 + edge or y.max() > lens.height - 1 + edge:
         return False
     across_x, across_y = np.diff(x, axis=1)[:-1], np.diff(y, axis=1)[:-1]
     down_x, down_y = np.diff(x, axis=0)[:, :-1], np.diff(y, axis=0)[:, :-1]

@@ -53,8 +53,7 @@ def read_model(path: Path | str) -> Gaussians:
     Raises InputError for a file that is missing, of no known format, named as one of another format, or not
     a whole and finite model.
     """
-    path = Path(path)
-    return _by_content(path).read(path)
+    return _by_content(Path(path)).read(Path(path))
 
 
 def write_model(path: Path | str, model: Gaussians) -> None:
@@ -110,10 +109,10 @@ def _by_content(path: Path) -> ModelFormat:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     found = next((each for each in FORMATS if start.startswith(each.magic)), None)
-    named = _by_suffix(path)
     if found is None:
         raise InputError(f"{path}: expected a 3DGS model ({_known()}), but it begins with {start!r}")
-    if named is not None and named is not found:
+    named = _by_suffix(path) or found
+    if named is not found:
         raise InputError(
             f"{path}: the name says {named.name}, but the content is {found.name}; "
             f"rename it to end in {found.suffixes[0]}"

@@ -28,14 +28,10 @@ class OutputFolder:
             if not self.path.is_dir():
                 raise OutputError(f"{self.path} exists and is not a folder")
             names = {entry.name for entry in self.path.iterdir()}
-            if names == {CHECKPOINTS} and not (overwrite or resume):
-                raise OutputError(
-                    f"{self.path} holds an interrupted run: --resume continues it, --overwrite drops it"
-                )
             if names and not (overwrite or resume):
-                raise OutputError(
-                    f"{self.path} exists: choose another folder, or --overwrite to replace its results"
-                )
+                interrupted = "holds an interrupted run: --resume continues it, --overwrite drops it"
+                taken = "exists: choose another folder, or --overwrite to replace its results"
+                raise OutputError(f"{self.path} {interrupted if names == {CHECKPOINTS} else taken}")
         self._drop_checkpoints = overwrite
 
     def checkpoints(self) -> Path:

@@ -23,12 +23,6 @@ from keyss.files.ply_table import read_vertices
 # bound would not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
 OPACITY_LOGIT_BOUND = 16.0
 
-_MEANS = ["x", "y", "z"]
-_NORMALS = ["nx", "ny", "nz"]
-_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
-_SCALES = ["scale_0", "scale_1", "scale_2"]
-_QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
-
 
 def write_ply(path: Path | str, gaussians: Gaussians) -> None:
     """Atomically write `gaussians` to `path` as little-endian float32 in the Inria layout.
@@ -38,21 +32,15 @@ def write_ply(path: Path | str, gaussians: Gaussians) -> None:
     system refuses.
     """
     n, k = gaussians.sh.shape[:2]
-    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(k), "opacity", *_SCALES, *_QUATS]
+    names = _model_names(k)
+    names[3:3] = ["nx", "ny", "nz"]
     flat = gaussians.detach().to("cpu")
-    rows = np.concatenate(
-        [
-            flat.means.numpy(),
-            np.zeros((n, 3)),
-            flat.sh[:, 0].numpy(),
-            flat.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1)).numpy(),
-            flat.opacity_logits[:, None].numpy(),
-            flat.log_scales.numpy(),
-            flat.quats.numpy(),
-        ],
-        axis=1,
-        dtype="<f4",
+    rest = flat.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1))
+    parts = (
+        *(flat.means, torch.zeros(n, 3), flat.sh[:, 0], rest),
+        *(flat.opacity_logits[:, None], flat.log_scales, flat.quats),
     )
+    rows = np.concatenate(parts, axis=1, dtype="<f4")
     problem = _settle(rows, names)
     if problem:
         raise OutputError(f"cannot write {path}: {problem}")
@@ -75,19 +63,26 @@ def read_ply(path: Path | str) -> Gaussians:
     problem = _settle(rows, names)
     if problem:
         raise InputError(f"{path}: {problem}")
-    return _gaussians(rows)
+    values = torch.from_numpy(rows)
+    rest = values[:, 6:-8].reshape(len(values), 3, -1).transpose(1, 2)  # [N, K - 1, 3]
+    return Gaussians(
+        means=values[:, 0:3].contiguous(),
+        quats=values[:, -4:].contiguous(),
+        log_scales=values[:, -7:-4].contiguous(),
+        opacity_logits=values[:, -8].contiguous(),
+        sh=torch.cat([values[:, None, 3:6], rest], dim=1),
+    )
 
 
 def _model_properties(found: Set[str], path: Path | str) -> list[str]:
-    """Names of the properties that make a `Gaussians`, in its order. Raises InputError if any is missing."""
+    """Names of the properties that make a model. Raises InputError if any is missing."""
     rest = {name for name in found if re.fullmatch(r"f_rest_[0-9]+", name)}
-    k = len(rest) // 3 + 1
-    if len(rest) not in (0, 9, 24, 45) or rest != set(_rest_names(k)):
+    names = _model_names(len(rest) // 3 + 1)
+    if len(rest) not in (0, 9, 24, 45) or not rest <= set(names):
         raise InputError(
             f"{path}: expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ... (SH degree 0 to 3), "
             f"got {len(rest)}"
         )
-    names = [*_MEANS, *_QUATS, *_SCALES, "opacity", *_DC, *_rest_names(k)]
     missing = [name for name in names if name not in found]
     if not missing:
         return names
@@ -115,20 +110,8 @@ def _settle(rows: npt.NDArray[np.float32], names: list[str]) -> str | None:
     return f"NaN or infinite values among {len(rows):,} Gaussians: {', '.join(wrong[:5])}{more}"
 
 
-def _gaussians(rows: npt.NDArray[np.float32]) -> Gaussians:
-    """`Gaussians` of rows whose columns are in the order of `_model_properties`."""
-    values = torch.from_numpy(rows)
-    n = len(values)
-    rest = values[:, 14:].reshape(n, 3, -1).transpose(1, 2)  # [N, K - 1, 3]
-    return Gaussians(
-        means=values[:, 0:3].contiguous(),
-        quats=values[:, 3:7].contiguous(),
-        log_scales=values[:, 7:10].contiguous(),
-        opacity_logits=values[:, 10].contiguous(),
-        sh=torch.cat([values[:, None, 11:14], rest], dim=1),
-    )
-
-
-def _rest_names(k: int) -> list[str]:
-    """Names of the SH coefficients above the constant one, for `k` basis functions."""
-    return [f"f_rest_{i}" for i in range(3 * (k - 1))]
+def _model_names(k: int) -> list[str]:
+    """The layout's properties in order, without the normals, for `k` SH basis functions."""
+    colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(3 * (k - 1)))]
+    shape = [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    return ["x", "y", "z", *colors, "opacity", *shape]

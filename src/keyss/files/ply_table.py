@@ -1,4 +1,4 @@
-"""The vertices of any PLY file as a table of numbers: what 3DGS models and point clouds have in common.
+"""The vertices of any PLY file as a table of numbers, which 3DGS models are made of, and as a point cloud.
 
 The reader is our own because files come from strangers and the part of PLY in use is small: every length
 is checked against the file's size before anything is allocated, and whatever is wrong comes out as
@@ -18,10 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from keyss.core.errors import InputError
+from keyss.files.layout import PointCloud
 
 _MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
+_GREY = 128  # for points without colours
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -47,9 +49,9 @@ def read_vertices(
         raise InputError(f"{path}: expected a .ply file, but there is no such file")
     try:
         with path.open("rb") as file:
-            header = _read_header(file, path)
-            names = choose(header.vertex.properties)
-            return names, _read_rows(file, header, names, path)
+            byte_order, before, vertex = _read_header(file, path)
+            names = choose(vertex.properties)
+            return names, _read_rows(file, byte_order, before, vertex, names, path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
@@ -67,27 +69,19 @@ class _Element:
         return sum(int(code[1]) for code in self.properties.values())
 
 
-@dataclass(frozen=True)
-class _Header:
-    byte_order: str | None  # "<", ">" or None for ascii
-    before: list[_Element]  # elements whose data precede the vertices
-    vertex: _Element
-
-
-def _read_header(file: BinaryIO, path: Path) -> _Header:
-    """Parse up to and including end_header; the file is then at the first byte of the data."""
+def _read_header(file: BinaryIO, path: Path) -> tuple[str | None, list[_Element], _Element]:
+    """(byte order or None for ascii, elements before the vertices, the vertices); the data come next."""
     lines = _header_lines(file, path)
     if lines[0] != "ply":
         raise InputError(f"{path}: expected a .ply file, but it does not begin with a line 'ply'")
-    byte_order: str | None = None
-    format_seen = False
+    formats: list[str | None] = []
     elements: list[_Element] = []
     for number, line in enumerate(lines[1:], start=2):
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 pass
-            case ["format", name, "1.0"] if name in _BYTE_ORDERS and not format_seen:
-                byte_order, format_seen = _BYTE_ORDERS[name], True
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS and not formats:
+                formats.append(_BYTE_ORDERS[name])
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
                 elements.append(_Element(name, int(count), {}))
             case ["property", "list", size, item, _] if elements and {size, item} <= _SCALARS.keys():
@@ -99,18 +93,18 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             case _:
                 raise InputError(f"{path}: line {number} of the PLY header makes no sense: {line[:80]!r}")
     positions = [i for i, element in enumerate(elements) if element.name == "vertex"]
-    if not format_seen or len(positions) != 1:
+    if not formats or len(positions) != 1:
         raise InputError(
             f"{path}: expected one 'format' line and one 'element vertex' in the PLY header, "
-            f"got {int(format_seen)} and {len(positions)}"
+            f"got {len(formats)} and {len(positions)}"
         )
-    before, vertex = elements[: positions[0]], elements[positions[0]]
+    *before, vertex = elements[: positions[0] + 1]
     for element in [*before, vertex]:
         if element.has_list:
             raise InputError(
                 f"{path}: element {element.name!r} has a list property, which cannot be read here"
             )
-    return _Header(byte_order, before, vertex)
+    return formats[0], before, vertex
 
 
 def _header_lines(file: BinaryIO, path: Path) -> list[str]:
@@ -133,26 +127,32 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
     )
 
 
-def _read_rows(file: BinaryIO, header: _Header, names: list[str], path: Path) -> npt.NDArray[np.float32]:
+def _read_rows(
+    file: BinaryIO,
+    byte_order: str | None,
+    before: list[_Element],
+    vertex: _Element,
+    names: list[str],
+    path: Path,
+) -> npt.NDArray[np.float32]:
     """[N, len(names)] values of the vertices. Raises InputError when the file is too short for them."""
-    vertex = header.vertex
     left = os.fstat(file.fileno()).st_size - file.tell()
-    if header.byte_order is None:
+    if byte_order is None:
         # Every value takes a digit and a separator; the file's last separator may be missing.
-        skipped = sum(element.count * len(element.properties) for element in header.before)
+        skipped = sum(element.count * len(element.properties) for element in before)
         needed = 2 * (skipped + vertex.count * len(vertex.properties)) - 1
     else:
-        skipped = sum(element.count * element.stride for element in header.before)
+        skipped = sum(element.count * element.stride for element in before)
         needed = skipped + vertex.count * vertex.stride
     if needed > left:
         raise InputError(
             f"{path}: not a whole .ply file: the header announces {vertex.count:,} vertices, which take at "
             f"least {needed:,} bytes, but only {left:,} follow it"
         )
-    if header.byte_order is None:
+    if byte_order is None:
         return _read_ascii(file, skipped, vertex, names, path)
     file.seek(skipped, os.SEEK_CUR)
-    return _read_binary(file, header.byte_order, vertex, names, path)
+    return _read_binary(file, byte_order, vertex, names, path)
 
 
 def _read_binary(
@@ -189,3 +189,27 @@ def _read_ascii(
     columns = [list(vertex.properties).index(name) for name in names]
     with np.errstate(over="ignore"):
         return values.reshape(vertex.count, width)[:, columns].astype(np.float32)
+
+
+def read_point_cloud(path: Path) -> PointCloud:
+    """The `x y z` and, where there are any, `red green blue` (uchar) of a PLY's vertices.
+
+    Raises InputError when the file is no such PLY, is truncated or holds coordinates that are not finite.
+    """
+
+    def choose(found: dict[str, str]) -> list[str]:
+        missing = {"x", "y", "z"} - found.keys()
+        if missing:
+            raise InputError(
+                f"{path}: expected vertices with x, y and z, found no {', '.join(sorted(missing))}"
+            )
+        colors = {name: found[name] for name in ("red", "green", "blue") if name in found}
+        if list(colors.values()) not in ([], ["u1"] * 3):
+            raise InputError(f"{path}: expected red, green and blue of type uchar, found {colors}")
+        return ["x", "y", "z", *colors]
+
+    names, rows = read_vertices(path, choose)
+    colors = rows[:, 3:] if len(names) > 3 else np.full((len(rows), 3), _GREY)
+    if not ((colors >= 0) & (colors <= 255)).all():  # possible in ascii
+        raise InputError(f"{path}: expected colours of 0 to 255, found others")
+    return PointCloud.checked(path, rows[:, :3].astype(np.float64), colors.astype(np.uint8))

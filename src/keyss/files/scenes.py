@@ -16,22 +16,15 @@ from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.scene import Camera, Scene, View
-from keyss.files.blender import read_blender
 from keyss.files.colmap import colmap_model_folder, read_colmap
 from keyss.files.images import probe_image, read_image, shrink
 from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
-from keyss.files.nerfstudio import read_nerfstudio
+from keyss.files.transforms import read_blender, read_nerfstudio
 
-# In the order they are tried: a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it.
-_LAYOUTS: tuple[tuple[str, Callable[[Path], object], Callable[[Path], SceneLayout]], ...] = (
-    ("COLMAP (sparse/0/cameras.bin or .txt, images/)", colmap_model_folder, read_colmap),
-    (
-        "Blender / NeRF-synthetic (transforms_train.json)",
-        lambda folder: (folder / "transforms_train.json").is_file(),
-        read_blender,
-    ),
-    ("Nerfstudio (transforms.json)", lambda folder: (folder / "transforms.json").is_file(), read_nerfstudio),
+_KNOWN = (
+    "COLMAP (sparse/0/cameras.bin or .txt, images/); Blender / NeRF-synthetic (transforms_train.json); "
+    "Nerfstudio (transforms.json)"
 )
 
 
@@ -59,71 +52,65 @@ def load_scene(
     """
     if width is not None and width < 1:
         raise UsageError(f"expected a width of at least 1 pixel, got {width}")
-    chosen = None if background is None else _checked_background(background)
+    behind = None if background is None else _checked_background(background)
     folder = Path(path)
     layout = _read_layout(folder)
-    for views, purpose in ((layout.train, "to train on"), (layout.test, "to test on")):
-        if not views:
+    for part, purpose in ((layout.train, "to train on"), (layout.test, "to test on")):
+        if not part:
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
 
-    transparent = False
-    lenses = []
-    for photo in layout.train + layout.test:
-        image_width, image_height, has_alpha = probe_image(photo.path)
-        transparent |= has_alpha
-        lens = photo.lens.on_image(image_width, image_height)
-        if lens is None:
-            raise InputError(
-                f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height} "
-                f"(or that divided by a whole number), found {image_width}x{image_height}"
-            )
-        lenses.append(lens)
-    if chosen is None:
-        chosen = torch.full((3,), 1.0 if transparent else 0.0)
-
+    photos = layout.train + layout.test
+    transparent = [
+        probe_image(photo.path)[2] for photo in photos
+    ]  # all, so that a missing photo is found now
+    if behind is None:
+        behind = torch.full((3,), float(any(transparent)))
     # Most scenes have one lens; only the last few maps are kept because each is as large as a photo.
     undistortions = functools.lru_cache(maxsize=2)(undistortion)
-    behind = chosen.numpy()
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        decode = functools.partial(_view, width=width, background=behind, undistortions=undistortions)
-        decoded = tuple(pool.map(decode, layout.train + layout.test, lenses))
+        decode = functools.partial(_view, width=width, background=behind.numpy(), undistortions=undistortions)
+        views = tuple(pool.map(decode, photos))
     return Scene(
         name=folder.resolve().name,
-        train=decoded[: len(layout.train)],
-        test=decoded[len(layout.train) :],
+        train=views[: len(layout.train)],
+        test=views[len(layout.train) :],
         points=torch.from_numpy(layout.points.xyz),
         colors=torch.from_numpy(layout.points.rgb),
-        background=chosen,
+        background=behind,
     )
 
 
 def _read_layout(folder: Path) -> SceneLayout:
-    known = "; ".join(name for name, _, _ in _LAYOUTS)
     try:
         if not folder.is_dir():
             found = "a file" if folder.exists() else "nothing there"
-            raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {known}")
-        for _, matches, read in _LAYOUTS:
-            if matches(folder):
-                return read(folder)
+            raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {_KNOWN}")
+        # In this order, since a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it.
+        if colmap_model_folder(folder) is not None:
+            return read_colmap(folder)
+        if (folder / "transforms_train.json").is_file():
+            return read_blender(folder)
+        if (folder / "transforms.json").is_file():
+            return read_nerfstudio(folder)
         entries = sorted(entry.name for entry in folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
     found = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
-    raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {known}")
+    raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {_KNOWN}")
 
 
 def _view(
     photo: Photo,
-    lens: Lens,
     width: int | None,
     background: NDArray[np.float32],
     undistortions: Callable[[Lens, str], Undistortion],
 ) -> View:
     pixels = read_image(photo.path, background)
-    if pixels.shape[:2] != (lens.height, lens.width):
+    lens = photo.lens.on_image(pixels.shape[1], pixels.shape[0])
+    if lens is None:
         raise InputError(
-            f"{photo.path}: expected {lens.width}x{lens.height} pixels, but it changed while being read"
+            f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height} "
+            f"(or that divided by a whole number), found {pixels.shape[1]}x{pixels.shape[0]}"
         )
     if not lens.is_pinhole:
         straighten = undistortions(lens, str(photo.path.parent))

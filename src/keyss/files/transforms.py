@@ -1,20 +1,21 @@
-"""Posed frames in `transforms*.json`, which the NeRF-synthetic and the Nerfstudio layout share."""
+"""Scenes whose posed frames are in JSON: the layouts of NeRF-synthetic and of Nerfstudio."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from keyss.core.errors import InputError
 from keyss.files.images import probe_image
-from keyss.files.layout import MAX_COORDINATE, Photo, refuse_duplicates
+from keyss.files.layout import MAX_COORDINATE, Photo, SceneLayout, hold_out, refuse_duplicates
 from keyss.files.lens import Lens, make_lens
+from keyss.files.ply_table import read_point_cloud
 from keyss.files.reading import read_text
 
 _MAX_JSON_BYTES = 256 * 2**20
@@ -22,52 +23,124 @@ _EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
+_Row = tuple[float, float, float, float]
 
-def read_transforms(path: Path) -> tuple[dict[str, Any], tuple[Photo, ...]]:
-    """(the whole JSON object, its frames as photos in file order).
+
+class _Intrinsics(msgspec.Struct):
+    """What may stand in the file for all frames and in a frame for itself; pixels and radians."""
+
+    camera_model: str | None = None
+    is_fisheye: bool | None = None
+    w: float | None = None
+    h: float | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+
+class _Frame(_Intrinsics, kw_only=True):
+    file_path: str
+    transform_matrix: Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
+
+
+class _Transforms(_Intrinsics, kw_only=True):
+    frames: Annotated[list[_Frame], msgspec.Meta(min_length=1)]
+    ply_file_path: str | None = None
+    train_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+
+
+def read_blender(folder: Path) -> SceneLayout:
+    """The photos of `transforms_train.json` and `transforms_test.json`; there are no points.
+
+    Without a test file the validation file takes its place, and without that every 8th training photo.
+    Raises InputError, also when one photo is in both files.
+    """
+    _, train = _read(folder / "transforms_train.json")
+    for split in ("test", "val"):
+        path = folder / f"transforms_{split}.json"
+        if path.is_file():
+            _, test = _read(path)
+            refuse_duplicates(path, train + test)
+            return SceneLayout(train, test)
+    return SceneLayout(*hold_out(folder, train))
+
+
+def read_nerfstudio(folder: Path) -> SceneLayout:
+    """The photos of a `transforms.json` (instant-ngp's too), and the points of its `ply_file_path` if any.
+
+    `train_filenames` and `test_filenames` (or `val_filenames`) make the split; with only one of the two,
+    the other photos are the other half; with neither, every 8th photo is for testing. Poses and points
+    are both taken as stored: `applied_transform` says how they once were, and both have it. Raises
+    InputError.
+    """
+    path = folder / "transforms.json"
+    meta, photos = _read(path)
+    layout = SceneLayout(*_split(path, meta, photos))
+    if meta.ply_file_path is None:
+        return layout
+    return SceneLayout(
+        layout.train, layout.test, read_point_cloud(folder / _inside(path, meta.ply_file_path))
+    )
+
+
+def _read(path: Path) -> tuple[_Transforms, tuple[Photo, ...]]:
+    """(what the file says, its frames as photos in file order).
 
     A frame's own intrinsics go before those of the file. `file_path` is relative to the file's folder,
     may lack its extension, and must stay inside that folder or its parent. Raises InputError.
     """
-    meta = read_json(path)
-    frames = meta.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: expected a list `frames` with at least one frame, found {_shown(frames)}")
+    try:
+        meta = msgspec.json.decode(read_text(path, _MAX_JSON_BYTES), type=_Transforms)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
     photos = []
-    for i, frame in enumerate(frames):
+    for i, frame in enumerate(meta.frames):
         where = f"{path}: frame {i}"
-        if not isinstance(frame, dict):
-            raise InputError(f"{where}: expected an object, found {_shown(frame)}")
-        name = inside(path, frame.get("file_path"))
-        image = find_image(path.parent, name)
-        viewmat = _viewmat(where, frame.get("transform_matrix"))
-        photos.append(
-            Photo(path.parent / image, image, viewmat, _lens(where, {**meta, **frame}, path.parent / image))
-        )
+        name = _find_image(path, frame.file_path)
+        viewmat = _viewmat(where, np.array(frame.transform_matrix))
+        photos.append(Photo(path.parent / name, name, viewmat, _lens(where, meta, frame, path.parent / name)))
     refuse_duplicates(path, photos)
     return meta, tuple(photos)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file of up to 256 MiB. Raises InputError."""
-    try:
-        value = json.loads(read_text(path, _MAX_JSON_BYTES))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: expected a JSON object, found {_shown(value)}")
-    return value
+def _split(
+    path: Path, meta: _Transforms, photos: tuple[Photo, ...]
+) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    names = {photo.name for photo in photos}
+    train, test = (
+        {_find_image(path, each) for each in listed or ()}
+        for listed in (meta.train_filenames, meta.test_filenames or meta.val_filenames)
+    )
+    if unknown := (train | test) - names:
+        raise InputError(f"{path}: expected lists of frames, found {min(unknown)!r}, which is none")
+    if not train and not test:
+        return hold_out(path, photos)
+    train, test = train or names - test, test or names - train
+    if both := train & test:
+        raise InputError(f"{path}: expected training and test images apart, found {min(both)!r} in both")
+    return tuple(p for p in photos if p.name in train), tuple(p for p in photos if p.name in test)
 
 
-def inside(path: Path, file_path: object) -> str:
+def _inside(path: Path, file_path: str) -> str:
     """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent."""
-    if not isinstance(file_path, str) or not file_path or not file_path.isprintable():
-        raise InputError(f"{path}: expected a relative `file_path`, found {_shown(file_path)}")
     name = os.path.normpath(file_path.replace("\\", "/")).replace(os.sep, "/")
+    parts = name.split("/")
     if (
-        os.path.isabs(name)
-        or ":" in name.split("/")[0]
-        or name.split("/")[:2] == ["..", ".."]
+        not file_path.isprintable()
+        or os.path.isabs(name)
+        or ":" in parts[0]
+        or parts[:2] == ["..", ".."]
         or name in (".", "..")
     ):
         raise InputError(
@@ -76,22 +149,19 @@ def inside(path: Path, file_path: object) -> str:
     return name
 
 
-def find_image(folder: Path, name: str) -> str:
-    """`name`, or `name` with the extension it lacks. Raises InputError when there is no such file."""
+def _find_image(path: Path, file_path: str) -> str:
+    """The name of an image beside a JSON file, with the extension that it may lack there."""
+    name = _inside(path, file_path)
     for extension in ("", *_EXTENSIONS):
-        if os.path.isfile(folder / (name + extension)):
+        if os.path.isfile(path.parent / (name + extension)):
             return name + extension
     raise InputError(
-        f"{folder / name}: expected an image (the extension may be left out), but there is no such file"
+        f"{path.parent / name}: expected an image (the extension may be left out), but there is no such file"
     )
 
 
-def _viewmat(where: str, matrix: object) -> NDArray[np.float64]:
-    """[4, 4] world to camera in OpenCV axes from an OpenGL camera-to-world matrix."""
-    rows = matrix if isinstance(matrix, list) else []
-    if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise InputError(f"{where}: expected a 4x4 `transform_matrix`, found {_shown(matrix)}")
-    values = np.array([[_number(where, "transform_matrix", v) for v in row] for row in rows])
+def _viewmat(where: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 4] world to camera in OpenCV axes from an OpenGL camera-to-world matrix [3 or 4, 4]."""
     if len(values) == 4 and not np.allclose(values[3], [0, 0, 0, 1], atol=1e-4):
         raise InputError(
             f"{where}: expected a `transform_matrix` that ends in 0 0 0 1, found {values[3].tolist()}"
@@ -113,68 +183,43 @@ def _viewmat(where: str, matrix: object) -> NDArray[np.float64]:
     return viewmat
 
 
-def _lens(where: str, meta: dict[str, Any], image: Path) -> Lens:
-    """The lens of one frame; `meta` holds its own keys over those of the file."""
+def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Lens:
+    meta: dict[str, Any] = {
+        name: value
+        for given in (file, frame)
+        for name in _Intrinsics.__struct_fields__
+        if (value := getattr(given, name)) is not None
+    }
     model = meta.get("camera_model", "OPENCV")
-    fisheye = model == "OPENCV_FISHEYE" or meta.get("is_fisheye") is True
+    fisheye = model == "OPENCV_FISHEYE" or meta.get("is_fisheye", False)
     if not fisheye and model not in _PERSPECTIVE:
         known = ", ".join((*_PERSPECTIVE, "OPENCV_FISHEYE"))
-        raise InputError(f"{where}: camera_model {_shown(model)} is not supported (known: {known})")
+        raise InputError(f"{where}: camera_model {model[:80]!r} is not supported (known: {known})")
     if "w" in meta and "h" in meta:
-        width, height = (_whole(where, key, meta[key]) for key in ("w", "h"))
+        width, height = int(meta["w"]), int(meta["h"])
+        if (width, height) != (meta["w"], meta["h"]):
+            raise InputError(
+                f"{where}: expected whole numbers as `w` and `h`, found {meta['w']} and {meta['h']}"
+            )
     else:
         width, height, _ = probe_image(image)
     fx = _focal(where, meta, "fl_x", "camera_angle_x", width)
     fy = _focal(where, meta, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(f"{where}: expected `fl_x` or `camera_angle_x`, found neither")
-    values = {key: _number(where, key, meta[key]) for key in _COEFFICIENTS if key in meta}
+    values = {key: meta[key] for key in _COEFFICIENTS if key in meta}
     if not fisheye and values.pop("k4", 0.0) != 0.0:
         # Its meaning differs: Nerfstudio's is a 4th radial term, OpenCV's the first of a denominator.
         raise InputError(f"{where}: expected k4 = 0 for a lens that is not a fisheye, found {meta['k4']}")
-    values["fx"] = fx if fx is not None else fy or 0.0
-    values["fy"] = fy if fy is not None else fx or 0.0
-    values["cx"] = _number(where, "cx", meta.get("cx", width / 2))
-    values["cy"] = _number(where, "cy", meta.get("cy", height / 2))
+    values["fx"], values["fy"] = fx if fx is not None else fy, fy if fy is not None else fx
+    values["cx"], values["cy"] = meta.get("cx", width / 2), meta.get("cy", height / 2)
     return make_lens(where, width, height, values, fisheye=fisheye)
 
 
 def _focal(where: str, meta: dict[str, Any], focal: str, angle: str, side: int) -> float | None:
-    if focal in meta:
-        return _number(where, focal, meta[focal])
-    if angle not in meta:
-        return None
-    radians = _number(where, angle, meta[angle])
+    radians = meta.get(angle)
+    if focal in meta or radians is None:
+        return meta.get(focal)
     if not 0 < radians < math.pi:
         raise InputError(f"{where}: expected {angle} between 0 and pi, found {radians:g}")
-    return side / 2 / math.tan(radians / 2)
-
-
-def _number(where: str, key: str, value: object) -> float:
-    """A finite JSON number."""
-    try:
-        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise InputError(f"{where}: expected a finite number as `{key}`, found {_shown(value)}")
-    return number
-
-
-def _whole(where: str, key: str, value: object) -> int:
-    number = _number(where, key, value)
-    if number != int(number):
-        raise InputError(f"{where}: expected a whole number as `{key}`, found {_shown(value)}")
-    return int(number)
-
-
-def _shown(value: object) -> str:
-    """A JSON value for an error message: short, or only its type."""
-    if value is None:
-        return "nothing"
-    if isinstance(value, list | dict):
-        return f"a {type(value).__name__} of {len(value)}"
-    try:
-        return repr(value)[:80]
-    except ValueError:  # an integer of more digits than Python prints
-        return f"a huge {type(value).__name__}"
+    return float(side / 2 / math.tan(radians / 2))
