@@ -98,10 +98,9 @@ class RowAdam(torch.optim.Adam):
             rates *= group["lr_scale"]
         assert parameter.grad is not None
         tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], rates)
+        flat = (each.reshape(-1).numpy() for each in tensors)
         constants = (1 - beta1, 1 - beta2, (1 - beta2**step) ** -0.5, group["eps"])
-        parallel.run(
-            _adam, *(each.reshape(-1).numpy() for each in tensors), tuple(np.float32(c) for c in constants)
-        )
+        parallel.run(_adam, *flat, tuple(np.float32(each) for each in constants))
 
 
 def _for_kernel(group: dict[str, Any]) -> bool:

@@ -30,13 +30,10 @@ Optimizers = dict[str, RowAdam]
 
 def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
     """Leaf parameters holding a copy of the Gaussians on `device`."""
-    copy = (
-        gaussians.detach().to(device).map(lambda tensor: tensor.clone(memory_format=torch.contiguous_format))
-    )
-    return {
-        name: torch.nn.Parameter(getattr(copy, field.name))
-        for name, field in zip(_NAMES, fields(copy), strict=True)
-    }
+    contiguous = torch.contiguous_format
+    copy = gaussians.detach().to(device).map(lambda tensor: tensor.clone(memory_format=contiguous))
+    tensors = (getattr(copy, field.name) for field in fields(copy))
+    return {name: torch.nn.Parameter(tensor) for name, tensor in zip(_NAMES, tensors, strict=True)}
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:
