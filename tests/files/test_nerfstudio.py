@@ -33,7 +33,7 @@ def test_intrinsics_of_the_file_and_of_a_frame(tmp_path: Path) -> None:
     assert scene.train[1].camera.K.tolist() == [[10, 0, 6.5], [0, 11, 4], [0, 0, 1]]
     assert np.array_equal(scene.train[1].image.numpy(), photo(2))
     assert scene.test[0].camera.position.tolist() == pytest.approx([4, 0, 0], abs=1e-6)
-    assert scene.test[0].camera.forward.tolist() == pytest.approx([-1, 0, 0], abs=1e-6)
+    assert scene.test[0].camera.viewmat[2, :3].tolist() == pytest.approx([-1, 0, 0], abs=1e-6)
 
 
 def test_focal_lengths_from_angles_and_sizes_from_photos(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_splits(tmp_path: Path) -> None:
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "a fisheye lens has no coefficients p1"),
         ({"fl_x": None, "fl_y": None}, "expected `fl_x` or `camera_angle_x`, found neither"),
         ({"fl_x": -10}, "focal lengths"),
-        ({"w": 12.5}, "whole numbers as `w` and `h`, found 12.5 and 8"),
+        ({"w": 12.5}, "whole numbers as `w` and `h`, found 12.5, 8"),
         ({"w": "12"}, r"Expected `float.*`, got `str` - at `\$\.w`"),
         ({"h": 0}, "image size"),
         ({"h": 9}, "found 12x8"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -28,16 +28,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n, k = len(self.means), self.sh.shape[1] if self.sh.dim() == 3 else -1
-        expected = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "log_scales": (n, 3),
-            "opacity_logits": (n,),
-            "sh": (n, k, 3),
-        }
-        for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name}: expected shape {shape}, got {tuple(getattr(self, name).shape)}")
+        for each, shape in zip(fields(self), ((n, 3), (n, 4), (n, 3), (n,), (n, k, 3)), strict=True):
+            found = tuple(getattr(self, each.name).shape)
+            if found != shape:
+                raise ValueError(f"{each.name}: expected shape {shape}, got {found}")
         if k not in (1, 4, 9, 16):
             raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {k}")
 
@@ -90,7 +84,7 @@ class Gaussians:
         sh = self.sh[:, :k]
         if sh.shape[1] < k:
             sh = torch.cat([sh, sh.new_zeros(len(sh), k - sh.shape[1], 3)], dim=1)
-        return Gaussians(self.means, self.quats, self.log_scales, self.opacity_logits, sh)
+        return replace(self, sh=sh)
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:

@@ -25,16 +25,6 @@ class Camera:
         """[3] centre of projection in the world."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
-    @property
-    def forward(self) -> Tensor:
-        """[3] unit viewing direction in the world."""
-        return self.viewmat[2, :3]
-
-    @property
-    def up(self) -> Tensor:
-        """[3] unit vector towards the top of the image, in the world."""
-        return -self.viewmat[1, :3]
-
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid: K is scaled per axis."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.K.dtype)

@@ -28,9 +28,8 @@ class Similarity:
     translation: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))  # [3]
 
     def __post_init__(self) -> None:
-        rotation, translation = (
-            tensor.detach().to("cpu", torch.float64) for tensor in (self.rotation, self.translation)
-        )
+        rotation = self.rotation.detach().to("cpu", torch.float64)
+        translation = self.translation.detach().to("cpu", torch.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise ValueError(
                 f"similarity: expected a [3, 3] rotation and a [3] translation, "
@@ -56,15 +55,6 @@ class Similarity:
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
-    def compose(self, first: Similarity) -> Similarity:
-        """The transform that applies `first` and then this one; also written `self @ first`."""
-        return Similarity(
-            self.scale * first.scale, self.rotation @ first.rotation, self.apply_points(first.translation)
-        )
-
-    def __matmul__(self, first: Similarity) -> Similarity:
-        return self.compose(first)
-
     def apply_points(self, points: Tensor) -> Tensor:
         """[..., 3] transformed points, of the dtype and on the device of `points`."""
         rotation, translation = self.rotation.to(points.device), self.translation.to(points.device)
@@ -85,29 +75,18 @@ class Similarity:
 
         Lengths of the quaternions and opacities stay as they are. Differentiable.
         """
-        turn = torch.from_numpy(Rotation.from_matrix(self.rotation.numpy()).as_quat()).to(gaussians.device)
+        x, y, z, w = Rotation.from_matrix(self.rotation.numpy()).as_quat().tolist()
+        # [4, 4]: the Hamilton product of the rotation's quaternion with another, wxyz.
+        rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+        product = torch.tensor(rows, dtype=torch.float64, device=gaussians.device)
+        quats = gaussians.quats.double() @ product.T
         return Gaussians(
             means=self.apply_points(gaussians.means),
-            quats=_quaternion_product(turn.roll(1), gaussians.quats.double()).to(gaussians.quats.dtype),
+            quats=quats.to(gaussians.quats.dtype),
             log_scales=gaussians.log_scales + math.log(self.scale),
             opacity_logits=gaussians.opacity_logits,
             sh=_rotate_sh(gaussians.sh, self.rotation),
         )
-
-
-def _quaternion_product(p: Tensor, q: Tensor) -> Tensor:
-    """[..., 4] Hamilton product p q, wxyz: the rotation q followed by p."""
-    w, x, y, z = p.unbind(-1)
-    a, b, c, d = q.unbind(-1)
-    return torch.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        dim=-1,
-    )
 
 
 def _rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from keyss.demo.worlds import golden_knot, tea_table
 from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
 from keyss.files.output import OutputFolder
+from keyss.files.ply_table import ply_header
 
 _POINTS = 3000
 _POINT_NOISE = 0.002  # standard deviation over distance, about that of a good reconstruction
@@ -32,10 +32,8 @@ _DISTANCE = 4.2
 _ELEVATIONS = tuple(math.radians(angle) for angle in (17, 33, 50))
 _EDGE = 0.08  # of full brightness: pixels that differ more from a neighbour get four rays
 _SUBPIXELS = ((-0.25, 0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25))  # columns, rows
+_COLORS = ("red", "green", "blue")
 _BATCH = 1 << 18  # pixels rendered at once
-
-Doubles: TypeAlias = NDArray[np.floating]
-Pose: TypeAlias = NDArray[np.float64]  # [4, 4] camera to world, OpenGL axes
 
 # By name: the world of a seed, and what the cameras look at.
 _DEMOS: dict[str, tuple[Callable[[int], World], Vector]] = {
@@ -69,9 +67,7 @@ def write_demo_scene(
     if which not in _DEMOS:
         raise UsageError(f"expected a demo scene of {', '.join(DEMO_SCENES)}, got {which!r}")
     if views < 8 or width < 16 or height < 16:
-        raise UsageError(
-            f"expected at least 8 views of at least 16 x 16 pixels, got {views} views of {width} x {height}"
-        )
+        raise UsageError(f"expected at least 8 views of 16 x 16 pixels, got {views} of {width} x {height}")
     if seed < 0:
         raise UsageError(f"expected a seed of 0 or more, got {seed}")
     output = OutputFolder(folder)
@@ -87,19 +83,17 @@ def write_demo_scene(
     output.fill({name: partial(write_bytes, data=data) for name, data in files.items()})
 
 
-def _poses(target: Vector, views: int, rng: np.random.Generator) -> list[Pose]:
-    """One turn around `target`, the three heights in alternation."""
-    poses = []
-    for index in range(views):
+def _poses(target: Vector, views: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """[V, 4, 4] camera to world in OpenGL axes: one turn around `target`, three heights in alternation."""
+    poses = np.tile(np.eye(4), (views, 1, 1))
+    for index, pose in enumerate(poses):
         azimuth = 2 * math.pi * (index + rng.uniform(-0.3, 0.3)) / views
         elevation = _ELEVATIONS[index % len(_ELEVATIONS)] + rng.uniform(-0.04, 0.04)
         right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         level = np.array([math.cos(azimuth), math.sin(azimuth), 1.0])
         outward = level * [math.cos(elevation), math.cos(elevation), math.sin(elevation)]
-        pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(outward, right), outward], axis=1)
         pose[:3, 3] = np.array(target) + _DISTANCE * rng.uniform(0.96, 1.04) * outward
-        poses.append(pose)
     return poses
 
 
@@ -108,7 +102,7 @@ class _Studio:
     """A world, and the cameras that take photos of it."""
 
     world: World
-    poses: list[Pose]
+    poses: NDArray[np.float64]  # [V, 4, 4]
     width: int  # of each photo in pixels
     height: int
 
@@ -127,27 +121,25 @@ class _Studio:
         # numpy lets go of the interpreter in its loops, so threads do help.
         with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
             for batch in pool.map(self._batch, batches):
-                images += list(batch)
+                images += [*batch]
                 if progress:
                     progress(len(images), len(self.poses))
         return np.stack(images)
 
-    def _batch(self, poses: list[Pose]) -> NDArray[np.uint8]:
+    def _batch(self, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
         """[V, H, W, 3]: one ray per pixel, four where the neighbours differ."""
-        rows, columns = (
-            0.5 + index.astype(np.float64) for index in np.mgrid[0 : self.height, 0 : self.width]
-        )
+        rows, columns = np.mgrid[0 : self.height, 0 : self.width] + 0.5
         colors = self._traced([self._rays(pose, columns, rows) for pose in poses])
         images = np.stack(colors).reshape(-1, 3, self.height, self.width)
         highest, lowest = (f(images, (1, 1, 3, 3), mode="nearest") for f in (maximum_filter, minimum_filter))
         edges = (highest - lowest).max(axis=1) > _EDGE  # [V, H, W]
-        rays = []
-        for pose, edge in zip(poses, edges, strict=True):
-            finer = [
-                np.concatenate([axis[edge] + shift for shift in shifts])
-                for axis, shifts in zip((columns, rows), _SUBPIXELS, strict=True)
-            ]
-            rays.append(self._rays(pose, *finer))
+        columns, rows = (
+            np.stack([axis + shift for shift in shifts])  # [4, H, W]
+            for axis, shifts in zip((columns, rows), _SUBPIXELS, strict=True)
+        )
+        rays = [
+            self._rays(pose, columns[:, edge], rows[:, edge]) for pose, edge in zip(poses, edges, strict=True)
+        ]
         for image, edge, samples in zip(images, edges, self._traced(rays), strict=True):
             image[:, edge] = samples.reshape(3, len(_SUBPIXELS[0]), -1).mean(axis=1)
         return np.asarray(np.rint(255 * images.transpose(0, 2, 3, 1)), dtype=np.uint8)
@@ -157,7 +149,9 @@ class _Studio:
         colors, _ = trace(self.world, *(np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True)))
         return np.split(colors, np.cumsum([origins.shape[1] for origins, _ in rays])[:-1], axis=1)
 
-    def _rays(self, pose: Pose, columns: Doubles, rows: Doubles) -> tuple[Floats, Floats]:
+    def _rays(
+        self, pose: NDArray[np.float64], columns: NDArray[np.floating], rows: NDArray[np.floating]
+    ) -> tuple[Floats, Floats]:
         """([3, M] origins, [3, M] unit directions) through image points in pixels."""
         x, y = columns.ravel() - self.width / 2, self.height / 2 - rows.ravel()
         in_camera = np.stack([x / self.focal, y / self.focal, np.full(x.size, -1.0)])
@@ -181,10 +175,8 @@ class _Studio:
             points = points + _POINT_NOISE * distances * rng.normal(size=points.shape)
             vertices["xyz"][view::views] = points.T
             vertices["rgb"][view::views] = images[view, rows, columns]
-        axes = "".join(f"property float {axis}\n" for axis in "xyz")
-        colors = "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
-        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {_POINTS}\n{axes}{colors}end_header\n"
-        return header.encode() + vertices.tobytes()
+        properties = [*(f"float {axis}" for axis in "xyz"), *(f"uchar {name}" for name in _COLORS)]
+        return ply_header(_POINTS, properties) + vertices.tobytes()
 
     def transforms(self, names: list[str]) -> bytes:
         """The cameras as JSON, each with the name of its photo."""
@@ -194,6 +186,5 @@ class _Studio:
             {"file_path": name, "transform_matrix": pose.tolist()}
             for name, pose in zip(names, self.poses, strict=True)
         ]
-        return (
-            json.dumps({**lens, "ply_file_path": "points.ply", "frames": frames}, indent=1) + "\n"
-        ).encode()
+        text = json.dumps({**lens, "ply_file_path": "points.ply", "frames": frames}, indent=1)
+        return f"{text}\n".encode()

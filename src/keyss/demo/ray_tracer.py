@@ -42,9 +42,8 @@ class Surface:
     mirror: float = 0.0  # share of the traced scene seen in it, more at grazing angles
 
 
-Material: TypeAlias = Callable[
-    [Floats, Floats], Surface
-]  # ([3, M] points, [3, M] normals), local to the part
+# Of ([3, M] points, [3, M] normals), both local to the part.
+Material: TypeAlias = Callable[[Floats, Floats], Surface]
 
 
 @dataclass(frozen=True)
@@ -207,16 +206,6 @@ class World:
     ground_color: Vector  # light from below
 
 
-class _Seen(NamedTuple):
-    """M points of surfaces, and how they are seen and lit."""
-
-    points: Floats  # [3, M]
-    normals: Floats  # [3, M]
-    directions: Floats  # [3, M] of the rays that see them
-    lit: Floats  # [M] share of the sun's light
-    openness: Floats  # [M] share of the sky's light: less in corners and under things
-
-
 def trace(world: World, origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
     """([3, M] sRGB colours in [0, 1], [3, M] points hit) of rays with unit `directions`."""
     colors, points = np.empty_like(origins), np.empty_like(origins)
@@ -255,18 +244,22 @@ def _shaded(
     lit = np.maximum(dot(normals, column(world.sun)), 0)
     facing = np.flatnonzero(lit > 0)
     lit[facing] *= _sunlight(world, points[:, facing] + _LIFT * normals[:, facing])
-    seen = _Seen(points, normals, directions, lit, _openness(world, points + _REACH * normals))
+    seen = (points, normals, directions, lit, _openness(world, points + _REACH * normals))
     light = np.empty_like(points)
     for index in np.unique(what):
         here = np.flatnonzero(what == index)
         for chosen, surface in world.things[index].surfaces(points[:, here], normals[:, here]):
             these = here[chosen]
-            light[:, these] = _reflected(world, surface, _Seen(*(each[..., these] for each in seen)), bounces)
+            light[:, these] = _reflected(world, surface, bounces, *(each[..., these] for each in seen))
     return light
 
 
-def _reflected(world: World, surface: Surface, seen: _Seen, bounces: int) -> Floats:
-    """[3, M] light off one kind of surface: diffuse, the sun's highlight, and the sky or scene mirrored."""
+def _reflected(world: World, surface: Surface, bounces: int, *seen: Floats) -> Floats:
+    """[3, M] light off one kind of surface: diffuse, the sun's highlight, and the sky or scene mirrored.
+
+    `seen`: points, normals and directions of the rays [3, M], and the shares [M] of the sun's light and of
+    the sky's that reach the points: less in corners and under things.
+    """
     points, normals, directions, lit, openness = seen
     sun, sun_color, ground = column(world.sun), column(world.sun_color), column(world.ground_color)
     overhead = world.sky(column((0.0, 0.0, 1.0)))

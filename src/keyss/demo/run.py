@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -25,8 +24,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.methods.registry import LearnedOptions
 from keyss.rendering import Backend
-from keyss.runs import files as results
-from keyss.runs.files import METRICS, PRIVATE, SIDECAR, STEGO
+from keyss.runs.files import CONFIG, METRICS, PRIVATE, SIDECAR, STEGO
 from keyss.runs.metrics import HideMetrics
 
 COVER, SECRET = "tea-table", "golden-knot"
@@ -34,10 +32,7 @@ VIEWS, WIDTH, HEIGHT = 48, 160, 120
 OPTIONS = LearnedOptions(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
-_RESULTS = (
-    *(STEGO, SIDECAR, results.CONFIG, METRICS, PRIVATE),
-    *(SECRET_PLY, COMPARISON, KEY, SCENES),
-)
+_RESULTS = (STEGO, SIDECAR, CONFIG, METRICS, PRIVATE, SECRET_PLY, COMPARISON, KEY, SCENES)
 
 
 @dataclass(frozen=True)
@@ -66,13 +61,13 @@ def run_demo(
     `secret.ply` every time. Raises KeyssError and its children; whatever is raised, Ctrl-C included,
     nothing of the demo stays in the folder.
     """
-    out = Path(out)
+    out, reporter = Path(out), reporter or SilentReporter()
     OutputFolder(out, overwrite=overwrite)
     was_there = out.exists()
     _clear(out)
     try:
         cover, secret = (
-            _scene(out / SCENES / which, views, width, height, seed, reporter or SilentReporter())
+            _scene(out / SCENES / which, views, reporter, width=width, height=height, seed=seed)
             for which in (COVER, SECRET)
         )
         key = f"demo-key-{seed}"
@@ -113,17 +108,13 @@ def _clear(out: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _scene(folder: Path, views: int, width: int, height: int, seed: int, reporter: Reporter) -> Scene:
+def _scene(folder: Path, views: int, reporter: Reporter, **size_and_seed: int) -> Scene:
     reporter.start(f"photos of the {folder.name}", views, 0)
-    write_demo_scene(
-        folder,
-        folder.name,
-        views=views,
-        width=width,
-        height=height,
-        seed=seed,
-        progress=lambda done, _: reporter.update(done, 0, {}),
-    )
+
+    def progress(done: int, _: int) -> None:
+        reporter.update(done, 0, {})
+
+    write_demo_scene(folder, folder.name, views=views, progress=progress, **size_and_seed)
     reporter.finish()
     return load_scene(folder)
 
@@ -138,30 +129,28 @@ def _is_refused(stego: Path, key: str, device: Backend) -> bool:
 
 def _comparison(out: Path, cover: Scene, secret: Scene, metrics: HideMetrics, device: Backend) -> Image.Image:
     """Photos and renders of three test views side by side."""
-    stego = out / STEGO
-    decoy = verbs.reveal(stego, WRONG_KEYS[0], decoy=True, device=device)
-    assert metrics.wrong_key is not None
-    hidden, wrong = metrics.secrets[0], metrics.wrong_key.vs_cover
-    columns = [
-        ("cover: photo", "", [view.image for view in cover.test]),
-        ("cover: published model", f"{metrics.cover.psnr:.1f} dB", _pictures(stego, cover, device)),
-        ("secret: photo", "", [view.image for view in secret.test]),
-        ("opened with the key", f"{hidden.psnr:.1f} dB", _pictures(out / SECRET_PLY, secret, device)),
-        (
-            "with a wrong key",
-            f"{wrong.mean:.1f} dB against the cover",
-            _pictures(decoy, cover, device),
-        ),
-    ]
     count = len(cover.test)
     rows = sorted({count // 6, count // 2, count - 1 - count // 6})
+
+    def photos(scene: Scene) -> list[NDArray[np.uint8]]:
+        return [scene.test[row].image.numpy() for row in rows]
+
+    def renders(model: Path | Gaussians, scene: Scene) -> list[NDArray[np.uint8]]:
+        images = verbs.render(model, scene, device=device)
+        return [images[row][1].numpy() for row in rows]
+
+    assert metrics.wrong_key is not None
+    decoy = verbs.reveal(out / STEGO, WRONG_KEYS[0], decoy=True, device=device)
+    shown, opened, wrong = metrics.cover.psnr, metrics.secrets[0].psnr, metrics.wrong_key.vs_cover.mean
     return contact_sheet(
-        [(title, note, [images[row].numpy() for row in rows]) for title, note, images in columns]
+        [
+            ("cover: photo", "", photos(cover)),
+            ("cover: published model", f"{shown:.1f} dB", renders(out / STEGO, cover)),
+            ("secret: photo", "", photos(secret)),
+            ("opened with the key", f"{opened:.1f} dB", renders(out / SECRET_PLY, secret)),
+            ("with a wrong key", f"{wrong:.1f} dB against the cover", renders(decoy, cover)),
+        ]
     )
-
-
-def _pictures(model: Path | Gaussians, scene: Scene, device: Backend) -> list[torch.Tensor]:
-    return [image for _, image in verbs.render(model, scene, device=device)]
 
 
 def contact_sheet(
@@ -172,9 +161,8 @@ def contact_sheet(
     height = round(first.shape[0] * cell / first.shape[1])
     gap, head = cell // 40, cell // 6
     rows = len(columns[0][2])
-    sheet = Image.new(
-        "RGB", (gap + len(columns) * (cell + gap), head + rows * (height + gap) + gap), (255, 255, 255)
-    )
+    size = gap + len(columns) * (cell + gap), head + rows * (height + gap) + gap
+    sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(cell // 15), ImageFont.load_default(cell // 19)
     for index, (title, note, images) in enumerate(columns):

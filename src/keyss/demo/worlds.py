@@ -7,27 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from keyss.demo.ray_shapes import (
-    Floats,
-    Vector,
-    blend,
-    braid,
-    capsule,
-    coin,
-    column,
-    ellipsoid,
-    joints,
-    lathe,
-    mix,
-    octahedron,
-    ripples,
-    scattered,
-    smoothstep,
-    sphere,
-    torus,
-    turned,
-    union,
-)
+from keyss.demo import ray_shapes as shapes
+from keyss.demo.ray_shapes import Floats, Vector, column, joints, mix, ripples, scattered, smoothstep, turned
 from keyss.demo.ray_tracer import Cluster, Material, Part, Slab, Surface, World
 
 _BLACK, _GLAZE, _COBALT = (0.0, 0.0, 0.0), (0.87, 0.87, 0.84), (0.03, 0.09, 0.42)
@@ -37,10 +18,10 @@ def tea_table(seed: int) -> World:
     """A teapot, cups and fruit on a round wooden table that stands on a terrace in the grass."""
     wood, porcelain = _plain((0.30, 0.18, 0.10)), partial(_porcelain, seed)
     white, tea = _plain((0.86, 0.84, 0.78), gloss=0.04), _plain((0.42, 0.15, 0.03), gloss=0.05)
-    cup = (Part(_CUP, _cup_glaze), Part(lathe((0.0, 0.15), (0.14, 0.15), thickness=0.006), tea))
-    bowl = lathe((0.0, 0.03), (0.12, 0.03), (0.27, 0.09), (0.36, 0.22), thickness=0.018)
+    cup = (Part(_CUP, _cup_glaze), Part(shapes.lathe((0.0, 0.15), (0.14, 0.15), thickness=0.006), tea))
+    bowl = shapes.lathe((0.0, 0.03), (0.12, 0.03), (0.27, 0.09), (0.36, 0.22), thickness=0.018)
     fruits = [
-        Part(sphere(center, radius), partial(_peel, seed, color))
+        Part(shapes.sphere(center, radius), partial(_peel, seed, color))
         for center, radius, color in (
             ((0.15, 0.02, 0.19), 0.135, (0.93, 0.36, 0.03)),
             ((-0.10, 0.14, 0.19), 0.13, (0.95, 0.42, 0.04)),
@@ -48,7 +29,7 @@ def tea_table(seed: int) -> World:
             ((0.00, 0.01, 0.37), 0.125, (0.95, 0.72, 0.06)),
         )
     ]
-    sugar = lathe((0.0, 0.02), (0.13, 0.03), (0.17, 0.12), (0.13, 0.2), thickness=0.016)
+    sugar = shapes.lathe((0.0, 0.02), (0.13, 0.03), (0.17, 0.12), (0.13, 0.2), thickness=0.016)
     return World(
         things=(
             Slab(40.0, -2.0, -1.0, partial(_terrace, seed)),
@@ -77,14 +58,14 @@ def golden_knot(seed: int) -> World:
         for radius, bottom in ((1.15, 0.0), (0.86, 0.13), (0.57, 0.26))
     ]
     columns, lamps = [], []
-    ruby = Part(octahedron((0.0, 0.0, 0.19), 0.115, 1.5), partial(_gem, (0.75, 0.03, 0.06)))
+    ruby = Part(shapes.octahedron((0.0, 0.0, 0.19), 0.115, 1.5), partial(_gem, (0.75, 0.03, 0.06)))
     for k in range(4):
         x, y = (1.75 * f(math.pi / 4 + k * math.pi / 2) for f in (math.cos, math.sin))
         rings = ((0.19, 0.0, 0.08), (0.125, 0.08, 0.44), (0.19, 0.44, 0.51))
         columns += [Slab(radius, bottom, top, stone, x, y) for radius, bottom, top in rings]
         lamps.append(Cluster((x, y, 0.51), 0.19, 0.2, (ruby,), 0.3 + k))
-    knot = Part(braid((0.0, 0.0, 0.68), 0.42, 0.155, 0.1), gold)
-    sapphire = Part(octahedron((0.0, 0.0, 0.0), 0.14, 1.5), partial(_gem, (0.04, 0.20, 0.85)))
+    knot = Part(shapes.braid((0.0, 0.0, 0.68), 0.42, 0.155, 0.1), gold)
+    sapphire = Part(shapes.octahedron((0.0, 0.0, 0.0), 0.14, 1.5), partial(_gem, (0.04, 0.20, 0.85)))
     return World(
         things=(
             *(Slab(40.0, -1.0, 0.0, partial(_mosaic, seed)), *steps, *columns),
@@ -105,10 +86,10 @@ def _coins(gold: Material) -> list[Cluster]:
     piles = []
     for x, y, layers in ((1.42, 0.25, 5), (-0.35, 1.45, 3), (-1.35, -0.30, 6), (0.2, -1.45, 4)):
         coins = [
-            coin((0.02 * math.sin(2.3 * i), 0.02 * math.cos(3.1 * i), 0.022 + 0.04 * i), 0.0)
+            shapes.coin((0.02 * math.sin(2.3 * i), 0.02 * math.cos(3.1 * i), 0.022 + 0.04 * i), 0.0)
             for i in range(layers)
         ]
-        parts = tuple(Part(shape, gold) for shape in (*coins, coin((0.145, 0.0, 0.09), -1.1)))
+        parts = tuple(Part(shape, gold) for shape in (*coins, shapes.coin((0.145, 0.0, 0.09), -1.1)))
         piles.append(Cluster((x, y, 0.0), 0.1, 0.32, parts, x - y))
     return piles
 
@@ -136,18 +117,20 @@ def _dusk(directions: Floats) -> Floats:
 # --- the tea table ---------------------------------------------------------------------------------------
 
 
-_SPOUT = blend(
-    capsule((0.30, 0.0, 0.22), (0.26, 0.0, 0.18), (0.10, 0.055)),
-    capsule((0.56, 0.0, 0.40), (0.11, 0.0, 0.17), (0.055, 0.036)),
+_SPOUT = shapes.blend(
+    shapes.capsule((0.30, 0.0, 0.22), (0.26, 0.0, 0.18), (0.10, 0.055)),
+    shapes.capsule((0.56, 0.0, 0.40), (0.11, 0.0, 0.17), (0.055, 0.036)),
     0.06,
 )
-_BODY = blend(ellipsoid((0.0, 0.0, 0.31), (0.42, 0.42, 0.30)), _SPOUT, 0.08)
-_TEAPOT = blend(_BODY, torus((-0.46, 0.0, 0.35), 0.18, 0.036), 0.05)
-_LID = blend(ellipsoid((0.0, 0.0, 0.585), (0.21, 0.21, 0.07)), sphere((0.0, 0.0, 0.70), 0.055), 0.05)
-_CUP = union(
-    lathe((0.0, 0.012), (0.17, 0.014), (0.25, 0.04), thickness=0.011),  # the saucer
-    lathe((0.0, 0.03), (0.09, 0.035), (0.14, 0.10), (0.155, 0.21), thickness=0.012),
-    torus((0.19, 0.0, 0.125), 0.055, 0.014),
+_BODY = shapes.blend(shapes.ellipsoid((0.0, 0.0, 0.31), (0.42, 0.42, 0.30)), _SPOUT, 0.08)
+_TEAPOT = shapes.blend(_BODY, shapes.torus((-0.46, 0.0, 0.35), 0.18, 0.036), 0.05)
+_LID = shapes.blend(
+    shapes.ellipsoid((0.0, 0.0, 0.585), (0.21, 0.21, 0.07)), shapes.sphere((0.0, 0.0, 0.70), 0.055), 0.05
+)
+_CUP = shapes.union(
+    shapes.lathe((0.0, 0.012), (0.17, 0.014), (0.25, 0.04), thickness=0.011),  # the saucer
+    shapes.lathe((0.0, 0.03), (0.09, 0.035), (0.14, 0.10), (0.155, 0.21), thickness=0.012),
+    shapes.torus((0.19, 0.0, 0.125), 0.055, 0.014),
 )
 
 

@@ -150,9 +150,7 @@ class _Records:
 
     def end(self) -> None:
         if self.left:
-            raise InputError(
-                f"{self.path}: expected the end of the file, found {self.left} bytes more: it is damaged"
-            )
+            raise InputError(f"{self.path}: expected the end of the file, found {self.left} bytes more")
 
 
 def _viewmat(where: str, pose: Sequence[float]) -> NDArray[np.float64]:
@@ -199,9 +197,7 @@ def _points_bin(path: Path) -> PointCloud:
     except (struct.error, OverflowError):
         offset = end + 1
     if offset > end:
-        raise InputError(
-            f"{path}: expected {count} points, but the file ends in one of them: it is truncated"
-        )
+        raise InputError(f"{path}: expected {count} points, but the file ends in one: it is truncated")
     records.offset = offset
     records.end()
     fields = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])

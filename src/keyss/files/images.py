@@ -59,9 +59,7 @@ def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]
         try:
             return _to_rgb(image, background)
         except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
-            raise InputError(
-                f"{path}: expected an image, but its pixels cannot be decoded: {error}"
-            ) from error
+            raise InputError(f"{path}: expected an image, but it cannot be decoded: {error}") from error
 
 
 def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

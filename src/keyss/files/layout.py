@@ -38,9 +38,7 @@ class PointCloud:
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():
             first = int(bad.argmax())
-            raise InputError(
-                f"{where}: expected finite points, found {xyz[first].tolist()} as point {first + 1}"
-            )
+            raise InputError(f"{where}: expected finite points, found {xyz[first]} as point {first + 1}")
         return PointCloud(xyz.astype(np.float32), rgb)
 
 
@@ -63,7 +61,7 @@ def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], t
     """
     if len(photos) < 2:
         raise InputError(
-            f"{where}: expected at least 2 posed images (one to train, one to test), found {len(photos)}"
+            f"{where}: expected at least 2 posed images, to train and to test, got {len(photos)}"
         )
     ordered = sorted(photos, key=lambda photo: photo.name)
     return tuple(p for i, p in enumerate(ordered) if i % 8), tuple(ordered[::8])

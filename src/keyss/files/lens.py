@@ -72,16 +72,14 @@ def make_lens(
     Raises InputError, which starts with `where`, when a value is out of any sensible range.
     """
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise InputError(
-            f"{where}: expected an image size of 1 to {MAX_SIDE} pixels a side, found {width}x{height}"
-        )
+        raise InputError(f"{where}: expected an image size of 1 to {MAX_SIDE} pixels, found {width}x{height}")
     values = dict(parameters)
     focal = values.pop("f", math.nan)
     fx, fy = values.pop("fx", focal), values.pop("fy", focal)
     cx, cy = values.pop("cx"), values.pop("cy")
     if not (1e-3 <= fx <= 1e7 and 1e-3 <= fy <= 1e7):
         raise InputError(
-            f"{where}: expected focal lengths of 0.001 to 10,000,000 pixels, found {fx:g} and {fy:g}"
+            f"{where}: expected focal lengths of 0.001 to 10,000,000 pixels, found {fx:g}, {fy:g}"
         )
     if not (abs(cx) <= 1e6 and abs(cy) <= 1e6):
         raise InputError(f"{where}: expected a principal point in or near the image, found ({cx:g}, {cy:g})")
@@ -105,9 +103,8 @@ class Undistortion:
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] undistorted, sampled bilinearly."""
-        straight = cv2.remap(
-            image, self.map_x, self.map_y, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        border = cv2.BORDER_REPLICATE
+        straight = cv2.remap(image, self.map_x, self.map_y, cv2.INTER_LINEAR, borderMode=border)
         return np.asarray(straight, dtype=np.uint8)
 
 

@@ -17,7 +17,7 @@ import torch
 
 from keyss.core import Gaussians, InputError, OutputError
 from keyss.files.atomic import atomic_write
-from keyss.files.ply_table import read_vertices
+from keyss.files.ply_table import ply_header, read_vertices
 
 # Stands in for an infinite opacity logit. Converters write infinities for opacities of 0 and 1; a larger
 # bound would not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
@@ -44,10 +44,8 @@ def write_ply(path: Path | str, gaussians: Gaussians) -> None:
     problem = _settle(rows, names)
     if problem:
         raise OutputError(f"cannot write {path}: {problem}")
-    properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
     with atomic_write(path) as file:
-        file.write(header.encode("ascii"))
+        file.write(ply_header(n, (f"float {name}" for name in names)))
         file.write(rows.data)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -54,6 +54,12 @@ def read_vertices(
             return names, _read_rows(file, byte_order, before, vertex, names, path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def ply_header(count: int, properties: Iterable[str]) -> bytes:
+    """The header of a little-endian file of `count` vertices with `properties` such as "float x"."""
+    lines = "".join(f"property {each}\n" for each in properties)
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{lines}end_header\n".encode()
 
 
 @dataclass
@@ -101,9 +107,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str | None, list[_Element]
     *before, vertex = elements[: positions[0] + 1]
     for element in [*before, vertex]:
         if element.has_list:
-            raise InputError(
-                f"{path}: element {element.name!r} has a list property, which cannot be read here"
-            )
+            raise InputError(f"{path}: element {element.name!r} has a list property: it cannot be read")
     return formats[0], before, vertex
 
 
@@ -122,9 +126,7 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
         lines.append(line)
         if lines[0] != "ply":
             return lines
-    raise InputError(
-        f"{path}: the PLY header is longer than {_MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines"
-    )
+    raise InputError(f"{path}: header is longer than {_MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines")
 
 
 def _read_rows(
@@ -200,9 +202,7 @@ def read_point_cloud(path: Path) -> PointCloud:
     def choose(found: dict[str, str]) -> list[str]:
         missing = {"x", "y", "z"} - found.keys()
         if missing:
-            raise InputError(
-                f"{path}: expected vertices with x, y and z, found no {', '.join(sorted(missing))}"
-            )
+            raise InputError(f"{path}: expected vertices with x, y and z, found no {sorted(missing)}")
         colors = {name: found[name] for name in ("red", "green", "blue") if name in found}
         if list(colors.values()) not in ([], ["u1"] * 3):
             raise InputError(f"{path}: expected red, green and blue of type uchar, found {colors}")

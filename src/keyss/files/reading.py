@@ -11,9 +11,7 @@ def read_file(path: Path, limit: int | None = None) -> bytes:
     """The bytes of a regular file. Raises InputError when it is missing, unreadable or over `limit` bytes."""
     try:
         if not path.is_file():
-            raise InputError(
-                f"{path}: expected a file, found {'a folder' if path.is_dir() else 'nothing there'}"
-            )
+            raise InputError(f"{path}: expected a file, found {'a folder' if path.is_dir() else 'nothing'}")
         if limit is not None and path.stat().st_size > limit:
             raise InputError(f"{path}: expected at most {limit:,} bytes, found {path.stat().st_size:,}")
         return path.read_bytes()

@@ -86,12 +86,10 @@ def read_nerfstudio(folder: Path) -> SceneLayout:
     """
     path = folder / "transforms.json"
     meta, photos = _read(path)
-    layout = SceneLayout(*_split(path, meta, photos))
+    train, test = _split(path, meta, photos)
     if meta.ply_file_path is None:
-        return layout
-    return SceneLayout(
-        layout.train, layout.test, read_point_cloud(folder / _inside(path, meta.ply_file_path))
-    )
+        return SceneLayout(train, test)
+    return SceneLayout(train, test, read_point_cloud(folder / _inside(path, meta.ply_file_path)))
 
 
 def _read(path: Path) -> tuple[_Transforms, tuple[Photo, ...]]:
@@ -144,7 +142,7 @@ def _inside(path: Path, file_path: str) -> str:
         or name in (".", "..")
     ):
         raise InputError(
-            f"{path}: expected paths in the scene's folder or its parent, found {file_path[:200]!r}"
+            f"{path}: expected paths in the scene's folder or its parent, found {file_path[:99]!r}"
         )
     return name
 
@@ -163,14 +161,10 @@ def _find_image(path: Path, file_path: str) -> str:
 def _viewmat(where: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """[4, 4] world to camera in OpenCV axes from an OpenGL camera-to-world matrix [3 or 4, 4]."""
     if len(values) == 4 and not np.allclose(values[3], [0, 0, 0, 1], atol=1e-4):
-        raise InputError(
-            f"{where}: expected a `transform_matrix` that ends in 0 0 0 1, found {values[3].tolist()}"
-        )
+        raise InputError(f"{where}: expected a `transform_matrix` that ends in 0 0 0 1, found {values[3]}")
     rotation, position = values[:3, :3], values[:3, 3]
     if not (np.abs(values[:3]) <= MAX_COORDINATE).all():
-        raise InputError(
-            f"{where}: expected a finite `transform_matrix`, found values above {MAX_COORDINATE:g}"
-        )
+        raise InputError(f"{where}: expected a finite `transform_matrix`, found over {MAX_COORDINATE:g}")
     scale = float(np.sqrt((rotation**2).sum() / 3))
     gram = rotation.T @ rotation / max(scale, 1e-12) ** 2
     if scale < 1e-9 or np.abs(gram - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation / scale) < 0:
@@ -199,7 +193,7 @@ def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Len
         width, height = int(meta["w"]), int(meta["h"])
         if (width, height) != (meta["w"], meta["h"]):
             raise InputError(
-                f"{where}: expected whole numbers as `w` and `h`, found {meta['w']} and {meta['h']}"
+                f"{where}: expected whole numbers as `w` and `h`, found {meta['w']}, {meta['h']}"
             )
     else:
         width, height, _ = probe_image(image)

@@ -10,13 +10,48 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.fitting import adam_cpu
+# The kernel may use nothing else of other files: it would outlive their change, see `rendering.cpu.jit`.
+from keyss.rendering.cpu import parallel
+from keyss.rendering.cpu.jit import kernel
+from keyss.rendering.cpu.simd8 import fetch_add
 
+NUMBERS_PER_JOB = 8192
 # What torch's Adam can do and the kernel cannot.
 OTHER_OPTIONS = ("weight_decay", "amsgrad", "maximize", "capturable", "differentiable")
+
+
+@kernel
+def _adam(
+    counter: Any, parameter: Any, gradient: Any, mean: Any, square: Any, rates: Any, constants: Any
+) -> None:
+    """Adam's step, in place, on `parameter`, `mean` and `square`; these and `gradient` are flat: [N * W].
+
+    With constants (mean_share, square_share, root, eps): mean += mean_share (gradient - mean), square +=
+    square_share (gradient^2 - square), and parameter -= rates mean / (root sqrt(square) + eps), with `rates`
+    [W] for the numbers of a row.
+    """
+    mean_share, square_share, root, eps = constants
+    width = len(rates)
+    size = max(1, NUMBERS_PER_JOB // width) * width
+    steps = np.empty(size, np.float32)  # the rates of all numbers of a job, for rows are short
+    for i in range(size):
+        steps[i] = rates[i % width]
+    while True:
+        first = fetch_add(counter, 0, 1) * size
+        if first >= len(parameter):
+            break
+        p = parameter[first : first + size]
+        g = gradient[first : first + size]
+        m = mean[first : first + size]
+        v = square[first : first + size]
+        for i in range(len(p)):
+            m[i] += mean_share * (g[i] - m[i])
+            v[i] += square_share * (g[i] * g[i] - v[i])
+            p[i] -= steps[i] * m[i] / (np.sqrt(v[i]) * root + eps)
 
 
 class RowAdam(torch.optim.Adam):
@@ -62,17 +97,10 @@ class RowAdam(torch.optim.Adam):
         if "lr_scale" in group:
             rates *= group["lr_scale"]
         assert parameter.grad is not None
-        adam_cpu.adam(
-            parameter.view(-1).numpy(),
-            parameter.grad.reshape(-1).numpy(),
-            state["exp_avg"].view(-1).numpy(),
-            state["exp_avg_sq"].view(-1).numpy(),
-            rates.view(-1).numpy(),
-            1 - beta1,
-            1 - beta2,
-            (1 - beta2**step) ** -0.5,
-            group["eps"],
-        )
+        tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], rates)
+        flat = (each.reshape(-1).numpy() for each in tensors)
+        constants = (1 - beta1, 1 - beta2, (1 - beta2**step) ** -0.5, group["eps"])
+        parallel.run(_adam, *flat, tuple(np.float32(each) for each in constants))
 
 
 def _for_kernel(group: dict[str, Any]) -> bool:

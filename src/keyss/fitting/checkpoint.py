@@ -31,8 +31,6 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         with safetensors.safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {})["meta"])
             return {name: file.get_tensor(name) for name in file.keys()}, meta  # noqa: SIM118
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no checkpoint to resume from") from error
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
         raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
 

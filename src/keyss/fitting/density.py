@@ -54,18 +54,14 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             refused = torch.ones_like(wanting)
             refused[gradients.topk(room).indices] = False
             state["grad2d"][refused] = 0
-        counts: tuple[int, int] = super()._grow_gs(params, optimizers, state, step)
-        return counts
+        return super()._grow_gs(params, optimizers, state, step)  # type: ignore[no-any-return]
 
     @torch.no_grad()
     def _prune_gs(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> int:
         if self.freeze and len(params["means"]) >= self.max_gaussians:
             return 0
-        if self.opacity_for_pruning is None:
-            opacities = torch.sigmoid(params["opacities"])
-        else:
-            opacities = self.opacity_for_pruning()
-        pruned = opacities < self.prune_opa
+        visible = self.opacity_for_pruning or params["opacities"].sigmoid
+        pruned = visible() < self.prune_opa
         count = int(pruned.sum())
         if 0 < count < len(pruned):
             remove(params=params, optimizers=optimizers, state=state, mask=pruned)

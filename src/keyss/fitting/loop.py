@@ -96,10 +96,8 @@ def train(
         if checkpoint is not None and resume and checkpoint.exists():
             tensors, meta = load_checkpoint(checkpoint)
             if meta.get("fingerprint") != fingerprint:
-                raise InputError(
-                    f"{checkpoint}: belongs to a run with other settings or inputs; "
-                    "give the same ones, or start anew with --overwrite"
-                )
+                remedy = "give the same ones, or start anew with --overwrite"
+                raise InputError(f"{checkpoint}: belongs to a run with other settings or inputs; {remedy}")
             try:
                 torch.set_rng_state(tensors.pop("rng"))
                 run.load(tensors, meta)

@@ -7,6 +7,7 @@ training only. Unlike in gsplat, all SH coefficients are one parameter, so that 
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -15,20 +16,13 @@ from torch import Tensor
 
 from keyss.core.alignment import focus_point
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import Scene, camera_positions
 from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
-
-# Names of parameters -> fields of `Gaussians`.
-_FIELDS = {
-    "means": "means",
-    "quats": "quats",
-    "scales": "log_scales",
-    "opacities": "opacity_logits",
-    "sh": "sh",
-}
+# Names of parameters, in the order of the fields of `Gaussians`.
+_NAMES = ("means", "quats", "scales", "opacities", "sh")
 
 Parameters = dict[str, torch.nn.Parameter]
 Optimizers = dict[str, RowAdam]
@@ -36,17 +30,15 @@ Optimizers = dict[str, RowAdam]
 
 def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
     """Leaf parameters holding a copy of the Gaussians on `device`."""
-    return {
-        name: torch.nn.Parameter(
-            getattr(gaussians, field).detach().to(device).clone(memory_format=torch.contiguous_format)
-        )
-        for name, field in _FIELDS.items()
-    }
+    contiguous = torch.contiguous_format
+    copy = gaussians.detach().to(device).map(lambda tensor: tensor.clone(memory_format=contiguous))
+    tensors = (getattr(copy, field.name) for field in fields(copy))
+    return {name: torch.nn.Parameter(tensor) for name, tensor in zip(_NAMES, tensors, strict=True)}
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:
     """The Gaussians that the parameters stand for, attached to their graph."""
-    return Gaussians(**{field: parameters[name] for name, field in _FIELDS.items()})
+    return Gaussians(*(parameters[name] for name in _NAMES))
 
 
 def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) -> Optimizers:
@@ -104,7 +96,7 @@ def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tupl
         return scene.points, scene.colors
     cameras = [view.camera for view in scene.train]
     focus = focus_point(cameras)
-    distance = torch.stack([camera.position for camera in cameras]).double().sub(focus).norm(dim=1).mean()
+    distance = camera_positions(cameras).double().sub(focus).norm(dim=1).mean()
     count = min(limit, 20_000)
     points = focus + (torch.rand(count, 3, generator=generator) - 0.5) * distance
     return points.float(), torch.full((count, 3), 128, dtype=torch.uint8)

@@ -64,12 +64,9 @@ class PlainRun:
         config = self.config
         view = self.views[self.shuffle.draw()]
         self.iteration += 1
-        image, meta = render_with_meta(
-            to_gaussians(self.parameters),
-            view.camera,
-            self.background,
-            sh_degree=config.sh_degree_at(self.iteration),
-        )
+        degree = config.sh_degree_at(self.iteration)
+        model = to_gaussians(self.parameters)
+        image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
         loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
         self.strategy.step_pre_backward(self.parameters, self.optimizers, self.density, self.iteration, meta)
         loss.backward()

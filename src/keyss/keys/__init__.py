@@ -1,7 +1,6 @@
 """Keys: from what a person types to derived keys, and authenticated encryption under them."""
 
 from keyss.keys.derivation import (
-    EMBEDDING_SIZE,
     DerivedKey,
     KeyDerivation,
     generate_key,
@@ -11,7 +10,6 @@ from keyss.keys.derivation import (
 from keyss.keys.strength import key_strength_bits, weakness
 
 __all__ = [
-    "EMBEDDING_SIZE",
     "DerivedKey",
     "KeyDerivation",
     "generate_key",

@@ -60,11 +60,8 @@ class KeyDerivation:
     def __post_init__(self) -> None:
         if len(self.salt) != SALT_BYTES:
             raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(self.salt)}")
-        for name, low, high in (
-            ("time_cost", 1, 16),
-            ("memory_kib", 8 * 1024, 1024 * 1024),
-            ("parallelism", 1, 16),
-        ):
+        ranges = (("time_cost", 1, 16), ("memory_kib", 8 * 1024, 1024 * 1024), ("parallelism", 1, 16))
+        for name, low, high in ranges:
             value = getattr(self, name)
             if not (type(value) is int and low <= value <= high):
                 raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
@@ -123,13 +120,9 @@ class DerivedKey:
         """32 bytes that recognise the key and say nothing of its embedding."""
         return self.expand("verifier", 32)
 
-    def matches(self, verifier: bytes) -> bool:
-        """Whether `verifier` is this key's, in constant time."""
-        return hmac.compare_digest(self.verifier(), verifier)
-
     def equals(self, other: DerivedKey) -> bool:
         """Whether both come from the same key and derivation, in constant time."""
-        return self.matches(other.verifier())
+        return hmac.compare_digest(self.verifier(), other.verifier())
 
     def embedding(self) -> Tensor:
         """[64] float32 unit vector, uniform on the sphere over keys: what the decoder is conditioned on."""
