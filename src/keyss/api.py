@@ -164,8 +164,8 @@ def hide(
     models = [cover_model, *(secret.model for secret in secrets)]
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
-    scenes = [as_scene(source, width, background) for source in sources]
     trains = chosen.capabilities.trains or any(each.model is None for each in inputs)
+    scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
     context = Context(target, folder.checkpoints() if folder and trains else None, resume, reporter)
     plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
     own, *others = map(Source, scenes, plain)
@@ -283,7 +283,7 @@ def evaluate(
     measured = measure_hiding(
         opened.stego.to(target),
         opened.opened,
-        opened.scenes(),
+        opened.scenes(train_pictures=False),
         [None if model is None else model.to(target) for model in opened.plain_models()],
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
         seed=seed or 0,

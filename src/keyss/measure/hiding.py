@@ -105,13 +105,17 @@ def what_wrong_keys_show(
     ]
     if not decoders:
         return None
-    shown = [[decode(stego, embedding) for decode, _, _ in decoders] for embedding in embeddings]
-    vs_secrets = (
-        [_psnr_in(secret, frame.inverse().apply_gaussians(models[index])) for models in shown]
-        for index, (_, frame, secret) in enumerate(decoders)
-    )
-    vs_cover = [fmean(_psnr_in(cover, model) for model in models) for models in shown]
-    return WrongKeys(len(embeddings), _range(vs_cover), tuple(map(_range, vs_secrets)))
+    vs_cover: list[list[float]] = []
+    vs_secrets: list[list[float]] = []
+    for decode, frame, secret in decoders:
+        vs_cover.append([])
+        vs_secrets.append([])
+        for embedding in embeddings:  # one model at a time: they are large
+            shown = decode(stego, embedding)
+            vs_cover[-1].append(_psnr_in(cover, shown))
+            vs_secrets[-1].append(_psnr_in(secret, frame.inverse().apply_gaussians(shown)))
+    means = [fmean(each) for each in zip(*vs_cover, strict=True)]
+    return WrongKeys(len(embeddings), _range(means), tuple(map(_range, vs_secrets)))
 
 
 def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:

@@ -29,14 +29,25 @@ def is_model(source: str | Path | Gaussians) -> bool:
 
 @torch.no_grad()
 def scene_of_model(
-    model: Gaussians, name: str, *, size: int | None = None, background: Tensor | None = None
+    model: Gaussians,
+    name: str,
+    *,
+    size: int | None = None,
+    background: Tensor | None = None,
+    train_pictures: bool = True,
 ) -> Scene:
-    """Pictures of `model`, size x size, from the cameras of `orbit`; every eighth is kept for testing."""
+    """Pictures of `model`, size x size, from the cameras of `orbit`; every eighth is kept for testing.
+
+    Without `train_pictures`, where nothing is trained, only those are rendered; the others are [0, 0, 3].
+    """
     background = torch.zeros(3) if background is None else background
     views = []
-    for camera in orbit(model, size or IMAGE_SIZE):
-        image = render(model, camera, background.to(model.device))
-        views.append(View(camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()))
+    for index, camera in enumerate(orbit(model, size or IMAGE_SIZE)):
+        picture = torch.zeros(0, 0, 3, dtype=torch.uint8)
+        if train_pictures or index % TEST_EVERY == 0:
+            image = render(model, camera, background.to(model.device))
+            picture = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+        views.append(View(camera, picture))
     colors = ((model.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1) * 255).round().to(torch.uint8)
     return Scene(
         name,

@@ -38,9 +38,12 @@ class HidingRun:
     keys: tuple[str, ...] = field(repr=False)  # in the same order
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
 
-    def scenes(self) -> list[Scene]:
+    def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
         """The cover and the secrets with their photos, or with pictures of the models that they are."""
-        return [as_scene(source, self.config.width, self.config.background) for source in self.sources]
+        return [
+            as_scene(source, self.config.width, self.config.background, train_pictures=train_pictures)
+            for source in self.sources
+        ]
 
     def plain_models(self) -> list[Gaussians | None]:
         """Plain models of the cover and of the secrets, in their own frames; None where there is none."""
@@ -99,15 +102,26 @@ def sidecar_beside(stego: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def as_scene(source: PathLike | Scene | Gaussians, width: int | None, background: Background) -> Scene:
-    """A scene, the photos in a folder, or what a model or the one in a `.ply` shows from all around."""
+def as_scene(
+    source: PathLike | Scene | Gaussians,
+    width: int | None,
+    background: Background,
+    *,
+    train_pictures: bool = True,
+) -> Scene:
+    """A scene, the photos in a folder, or what a model or the one in a `.ply` shows from all around.
+
+    `train_pictures`: see `scene_of_model`.
+    """
     if isinstance(source, Scene):
         return source
     if not isinstance(source, Gaussians) and not is_model(source):
         return load_scene(source, width=width, background=background)
     name = "model" if isinstance(source, Gaussians) else Path(source).stem
     colour = None if background is None else torch.as_tensor(background, dtype=torch.float32)
-    return scene_of_model(as_model(source), name, size=width, background=colour)
+    return scene_of_model(
+        as_model(source), name, size=width, background=colour, train_pictures=train_pictures
+    )
 
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
