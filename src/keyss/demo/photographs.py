@@ -76,10 +76,8 @@ def write_demo_scene(
     studio = _Studio(make_world(seed), _poses(target, views, rng), width, height)
     images = studio.photos(progress)
     names = [f"images/{index:04d}.png" for index in range(views)]
-    files = {name: png_bytes(torch.from_numpy(image)) for name, image in zip(names, images, strict=True)} | {
-        "points.ply": studio.points(images, rng),
-        "transforms.json": studio.transforms(names),
-    }
+    files = {name: png_bytes(torch.from_numpy(image)) for name, image in zip(names, images, strict=True)}
+    files |= {"points.ply": studio.points(images, rng), "transforms.json": studio.transforms(names)}
     output.fill({name: partial(write_bytes, data=data) for name, data in files.items()})
 
 

@@ -142,15 +142,14 @@ def _comparison(out: Path, cover: Scene, secret: Scene, metrics: HideMetrics, de
     assert metrics.wrong_key is not None
     decoy = verbs.reveal(out / STEGO, WRONG_KEYS[0], decoy=True, device=device)
     shown, opened, wrong = metrics.cover.psnr, metrics.secrets[0].psnr, metrics.wrong_key.vs_cover.mean
-    return contact_sheet(
-        [
-            ("cover: photo", "", photos(cover)),
-            ("cover: published model", f"{shown:.1f} dB", renders(out / STEGO, cover)),
-            ("secret: photo", "", photos(secret)),
-            ("opened with the key", f"{opened:.1f} dB", renders(out / SECRET_PLY, secret)),
-            ("with a wrong key", f"{wrong:.1f} dB against the cover", renders(decoy, cover)),
-        ]
-    )
+    columns = [
+        ("cover: photo", "", photos(cover)),
+        ("cover: published model", f"{shown:.1f} dB", renders(out / STEGO, cover)),
+        ("secret: photo", "", photos(secret)),
+        ("opened with the key", f"{opened:.1f} dB", renders(out / SECRET_PLY, secret)),
+        ("with a wrong key", f"{wrong:.1f} dB against the cover", renders(decoy, cover)),
+    ]
+    return contact_sheet(columns)
 
 
 def contact_sheet(

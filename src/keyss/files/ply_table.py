@@ -98,13 +98,13 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str | None, list[_Element]
                 elements[-1].properties[name] = _SCALARS[scalar]
             case _:
                 raise InputError(f"{path}: line {number} of the PLY header makes no sense: {line[:80]!r}")
-    positions = [i for i, element in enumerate(elements) if element.name == "vertex"]
-    if not formats or len(positions) != 1:
+    names = [element.name for element in elements]
+    if not formats or names.count("vertex") != 1:
         raise InputError(
             f"{path}: expected one 'format' line and one 'element vertex' in the PLY header, "
-            f"got {len(formats)} and {len(positions)}"
+            f"got {len(formats)} and {names.count('vertex')}"
         )
-    *before, vertex = elements[: positions[0] + 1]
+    *before, vertex = elements[: names.index("vertex") + 1]
     for element in [*before, vertex]:
         if element.has_list:
             raise InputError(f"{path}: element {element.name!r} has a list property: it cannot be read")
@@ -154,20 +154,13 @@ def _read_rows(
     if byte_order is None:
         return _read_ascii(file, skipped, vertex, names, path)
     file.seek(skipped, os.SEEK_CUR)
-    return _read_binary(file, byte_order, vertex, names, path)
-
-
-def _read_binary(
-    file: BinaryIO, byte_order: str, vertex: _Element, names: list[str], path: Path
-) -> npt.NDArray[np.float32]:
     dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
-    stride = dtype.itemsize
     rows = np.empty((vertex.count, len(names)), dtype=np.float32)
-    step = max(1, _CHUNK_BYTES // stride)
+    step = max(1, _CHUNK_BYTES // vertex.stride)
     for start in range(0, vertex.count, step):
         part = rows[start : start + step]
-        data = file.read(len(part) * stride)
-        if len(data) != len(part) * stride:
+        data = file.read(len(part) * vertex.stride)
+        if len(data) != len(part) * vertex.stride:
             raise InputError(f"{path}: not a whole .ply file: it ends inside the data")
         chunk = np.frombuffer(data, dtype=dtype)
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is reported as infinite
@@ -179,7 +172,7 @@ def _read_binary(
 def _read_ascii(
     file: BinaryIO, skipped: int, vertex: _Element, names: list[str], path: Path
 ) -> npt.NDArray[np.float32]:
-    """The same from text, after `skipped` values. Only the order of the values matters, not the lines."""
+    """The values in text, after `skipped` values. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
     tokens = (token for line in file for token in line.split())
     try:

@@ -134,13 +134,8 @@ def _inside(path: Path, file_path: str) -> str:
     """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent."""
     name = os.path.normpath(file_path.replace("\\", "/")).replace(os.sep, "/")
     parts = name.split("/")
-    if (
-        not file_path.isprintable()
-        or os.path.isabs(name)
-        or ":" in parts[0]
-        or parts[:2] == ["..", ".."]
-        or name in (".", "..")
-    ):
+    outside = os.path.isabs(name) or ":" in parts[0] or parts[:2] == ["..", ".."] or name in (".", "..")
+    if outside or not file_path.isprintable():
         raise InputError(
             f"{path}: expected paths in the scene's folder or its parent, found {file_path[:99]!r}"
         )

@@ -7,7 +7,6 @@ costs quality, see docs/method.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -63,18 +62,14 @@ class RowAdam(torch.optim.Adam):
     """
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """One step for all parameters that have a gradient. Returns what `closure` does, as torch's."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """One step for all parameters that have a gradient; there are no closures."""
         if all(_for_kernel(group) for group in self.param_groups):
             for group in self.param_groups:
                 for parameter in group["params"]:
                     if parameter.grad is not None:
                         self._step_on_cpu(parameter, group)
-            return loss
+            return
         # Torch's step at the full rate, then back by what is too much of it.
         scaled = [group for group in self.param_groups if "lr_scale" in group]
         before = [[parameter.clone() for parameter in group["params"]] for group in scaled]
@@ -82,7 +77,6 @@ class RowAdam(torch.optim.Adam):
         for group, olds in zip(scaled, before, strict=True):
             for parameter, old in zip(group["params"], olds, strict=True):
                 parameter.lerp_(old, (1 - group["lr_scale"].to(parameter)).expand_as(parameter))
-        return loss
 
     def _step_on_cpu(self, parameter: Tensor, group: dict[str, Any]) -> None:
         state = self.state[parameter]
@@ -97,8 +91,8 @@ class RowAdam(torch.optim.Adam):
         if "lr_scale" in group:
             rates *= group["lr_scale"]
         assert parameter.grad is not None
-        tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], rates)
-        flat = (each.reshape(-1).numpy() for each in tensors)
+        tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"], rates)
+        flat = (each.view(-1).numpy() for each in tensors)
         constants = (1 - beta1, 1 - beta2, (1 - beta2**step) ** -0.5, group["eps"])
         parallel.run(_adam, *flat, tuple(np.float32(each) for each in constants))
 
