@@ -150,10 +150,9 @@ def hide(
     `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     chosen, options = _method(method)
-    if not 1 <= len(secrets) <= chosen.capabilities.most_secrets:
+    if not 1 <= len(secrets) <= chosen.most_secrets:
         raise UsageError(
-            f"expected 1 to {chosen.capabilities.most_secrets} secrets for the method {chosen.name}, "
-            f"got {len(secrets)}"
+            f"expected 1 to {chosen.most_secrets} secrets for the method {chosen.name}, got {len(secrets)}"
         )
     keys = [secret.key for secret in secrets]
     _check_keys(keys)
@@ -165,7 +164,7 @@ def hide(
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
     scenes = [as_scene(source, width, background) for source in sources]
-    trains = chosen.capabilities.trains or any(each.model is None for each in inputs)
+    trains = chosen.trains or any(each.model is None for each in inputs)
     context = Context(target, folder.checkpoints() if folder and trains else None, resume, reporter)
     plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
     own, *others = map(Source, scenes, plain)
