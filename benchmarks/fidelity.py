@@ -37,8 +37,8 @@ from keyss.keys import DerivedKey, KeyDerivation, random_embeddings
 from keyss.measure.hiding import what_wrong_keys_show
 from keyss.methods import registry
 from keyss.methods.learned.joint import JointRun
+from keyss.methods.learned.method import training_salt
 from keyss.methods.learned.options import PRESETS, LearnedOptions
-from keyss.methods.learned.pipeline import training_salt
 from keyss.methods.learned.targets import PlacedScene
 from keyss.progress import reporter
 

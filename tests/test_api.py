@@ -258,6 +258,19 @@ def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tu
         keyss.info(run / "nothing")
 
 
+def test_info_sums_up_a_model(tmp_path: Path) -> None:
+    model, path = random_gaussians(50, sh_degree=1), tmp_path / "a.ply"
+    keyss.write_model(path, model)
+    info = msgspec.to_builtins(keyss.info(path))
+    assert (info["gaussians"], info["sh_degree"], info["bytes"]) == (50, 1, path.stat().st_size)
+    for corner, expected in zip(
+        info["bounding_box"], (model.means.amin(0), model.means.amax(0)), strict=True
+    ):
+        assert corner == pytest.approx(expected.tolist(), abs=1e-4)
+    share = float((model.opacities < 0.05).float().mean())
+    assert info["nearly_transparent"] == pytest.approx(share, abs=1e-4)
+
+
 def test_a_secret_does_not_show_its_key() -> None:
     assert "hunter2" not in repr(Secret("scene", "hunter2"))
 
@@ -321,7 +334,7 @@ def _signatures() -> str:
     """The public names, what each takes and gives, and what it takes by default."""
     lines = []
     # What shares its name with a package is in `keyss.api` alone.
-    named = [(name, getattr(keyss, name)) for name in keyss.__all__]
+    named = [(name, getattr(keyss, name)) for name in sorted(keyss.__all__)]
     named += [(f"api.{name}", getattr(keyss.api, name)) for name in ("audit", "write_report")]
     for name, value in named:
         lines.append(name)

@@ -5,7 +5,7 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -18,6 +18,7 @@ from keyss.audit.run import audit as audit
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
+from keyss.files.images import png_bytes
 from keyss.files.models import check_model_output, write_model
 from keyss.files.output import OutputFolder
 from keyss.fitting.config import FitConfig
@@ -34,18 +35,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.report.writing import write_report as write_report
 from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
-from keyss.runs.files import (
-    CONFIG,
-    METRICS,
-    MODEL,
-    SIDECAR,
-    STEGO,
-    bytes_writer,
-    plain_names,
-    ply_writer,
-    png_writer,
-    record_writer,
-)
+from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names, writers
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, sidecar_beside
 from keyss.runs.records import write_record
@@ -116,13 +106,7 @@ def fit(
         settings = FitRunConfig(
             scene=path_of(scene), width=width, background=colour_of(background), config=config
         )
-        folder.fill(
-            {
-                MODEL: ply_writer(result.gaussians),
-                CONFIG: record_writer(settings),
-                METRICS: record_writer(metrics),
-            }
-        )
+        folder.fill(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
     return result
 
 
@@ -150,10 +134,9 @@ def hide(
     `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     chosen, options = _method(method)
-    if not 1 <= len(secrets) <= chosen.capabilities.most_secrets:
+    if not 1 <= len(secrets) <= chosen.most_secrets:
         raise UsageError(
-            f"expected 1 to {chosen.capabilities.most_secrets} secrets for the method {chosen.name}, "
-            f"got {len(secrets)}"
+            f"expected 1 to {chosen.most_secrets} secrets for the method {chosen.name}, got {len(secrets)}"
         )
     keys = [secret.key for secret in secrets]
     _check_keys(keys)
@@ -164,7 +147,7 @@ def hide(
     models = [cover_model, *(secret.model for secret in secrets)]
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
-    trains = chosen.capabilities.trains or any(each.model is None for each in inputs)
+    trains = chosen.trains or any(each.model is None for each in inputs)
     scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
     context = Context(target, folder.checkpoints() if folder and trains else None, resume, reporter)
     plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
@@ -183,17 +166,10 @@ def hide(
             payloads=tuple(each.fingerprint() for each in stego.opened),
             options=options,
         )
-        writers: dict[str, Callable[[Path], None]] = {
-            STEGO: ply_writer(stego.gaussians),
-            CONFIG: record_writer(settings),
-            METRICS: record_writer(metrics),
-        }
+        contents: dict[str, object] = {STEGO: stego.gaussians, CONFIG: settings, METRICS: metrics}
         if stego.sidecar is not None:
-            writers[SIDECAR] = bytes_writer(stego.sidecar)
-        writers |= {
-            name: ply_writer(model) for name, model in zip(plain_names(len(secrets)), plain, strict=True)
-        }
-        folder.fill(writers)
+            contents[SIDECAR] = stego.sidecar
+        folder.fill(writers(contents | dict(zip(plain_names(len(secrets)), plain, strict=True))))
     return HideResult(stego.gaussians, stego.sidecar, metrics)
 
 
@@ -255,7 +231,7 @@ def render(
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, views[split])
     if folder is not None:
-        folder.fill({name: png_writer(image) for name, image in pictures})
+        folder.fill(writers({name: png_bytes(image) for name, image in pictures}))
     return pictures
 
 

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from keyss.core import Gaussians, InputError, OutputError, UsageError
 from keyss.files import models, read_model, write_model
-from keyss.files.models import ModelFormat, check_model_output, describe_model, is_model_path
+from keyss.files.models import ModelFormat, check_model_output, is_model_path
 from tiny_scenes import random_gaussians
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -38,7 +38,7 @@ def same(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
 
 
-def test_a_new_format_is_read_written_and_described(toy: None, tmp_path: Path) -> None:
+def test_a_new_format_is_read_and_written(toy: None, tmp_path: Path) -> None:
     model = random_gaussians(9, sh_degree=2)
     for name, kind in (("a.toy", "toy"), ("b.TOY.bin", "toy"), ("c.ply", "PLY"), ("d.Ply", "PLY")):
         path = tmp_path / name
@@ -46,7 +46,6 @@ def test_a_new_format_is_read_written_and_described(toy: None, tmp_path: Path) -
         write_model(path, model)
         assert path.read_bytes().startswith(b"TOY!" if kind == "toy" else b"ply\n")
         assert same(read_model(path), model)
-        assert describe_model(path).format == kind
 
 
 def test_the_content_decides_where_the_name_says_nothing(toy: None, tmp_path: Path) -> None:
@@ -61,11 +60,10 @@ def test_the_content_decides_where_the_name_says_nothing(toy: None, tmp_path: Pa
 def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
     write_model(tmp_path / "a.toy", random_gaussians(5))
     path = (tmp_path / "a.toy").rename(tmp_path / "a.ply")
-    for read in (read_model, describe_model):
-        with pytest.raises(
-            InputError, match=r"a\.ply: the name says PLY, but the content is toy; .* end in \.toy"
-        ):
-            read(path)
+    with pytest.raises(
+        InputError, match=r"a\.ply: the name says PLY, but the content is toy; .* end in \.toy"
+    ):
+        read_model(path)
 
 
 @pytest.mark.parametrize("data", [b"", b"pl", b"\x89PNG\r\n\x1a\n"])
@@ -97,13 +95,3 @@ def test_outputs_are_not_overwritten_unasked(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="exists"):
         check_model_output(path, False)
     assert check_model_output(str(path), True) == path
-
-
-def test_describes(tmp_path: Path) -> None:
-    model, path = random_gaussians(50, sh_degree=1), tmp_path / "a.ply"
-    write_model(path, model)
-    info = describe_model(path)
-    assert (info.count, info.sh_degree, info.bytes) == (50, 1, path.stat().st_size)
-    assert info.lower == tuple(model.means.amin(0).tolist())
-    assert info.upper == tuple(model.means.amax(0).tolist())
-    assert info.faint_share == pytest.approx(float((model.opacities < 0.05).float().mean()))

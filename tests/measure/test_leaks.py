@@ -29,7 +29,6 @@ from keyss.methods.learned.attacks import known_remaps as learned_attacks
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.opacity_band import OpacityBand, hidden_logits, opacity_remap
 from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import OpenedSecret
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
 Rows = dict[str, AttackResult]
@@ -174,7 +173,7 @@ def _decoder(conditioning: str) -> HiddenSecret:
 
 def test_a_gate_shows_the_cover_without_its_key_and_the_secret_with_it() -> None:
     stego = _with_hidden(hidden_logits(HIDDEN.opacity_logits, 0))
-    opened = OpenedSecret(_decoder("gate"))
+    opened = _decoder("gate")
     assert opened.decode is not None
     key = with_the_key(lambda model: opened.reveal(model, frame="cover", force=True))
     rows = _look(stego, [decoder_attack(opened.decode), key])
@@ -187,7 +186,7 @@ def test_a_gate_shows_the_cover_without_its_key_and_the_secret_with_it() -> None
 
 def test_a_decoder_with_a_bias_is_searched() -> None:
     """This one is new and changes nothing, whatever the key: all that it shows is the cover."""
-    decode = OpenedSecret(_decoder("bias")).decode
+    decode = _decoder("bias").decode
     assert decode is not None
     search = decoder_attack(decode, restarts=2, steps=3)
     as_it_is = Attack("as it is", "", {}, lambda model: iter([("as it is", model)]))

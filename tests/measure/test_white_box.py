@@ -10,7 +10,6 @@ from torch import Tensor
 from keyss.core import Gaussians
 from keyss.measure.white_box import search_embeddings
 from keyss.methods.learned.payload import HiddenSecret
-from keyss.methods.learned.revealing import OpenedSecret, decode
 from methods.learned.hiding import Hidden, hide_scenes
 from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
 
@@ -25,7 +24,7 @@ def hidden() -> Hidden:
 
 
 def _decoder(secret: HiddenSecret) -> Callable[[Gaussians, Tensor], Gaussians]:
-    return OpenedSecret(secret).decode
+    return secret.decode
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +42,7 @@ def _gain(hidden: Hidden, found: list[Tensor], decoder_of: int, shown: int) -> l
         return _psnr(target.frame.inverse().apply_gaussians(model), scenes[shown + 1])
 
     return [
-        psnr(decode(hidden.stego, owner, embedding)) - psnr(hidden.stego) for embedding in found[decoder_of]
+        psnr(owner.decode(hidden.stego, embedding)) - psnr(hidden.stego) for embedding in found[decoder_of]
     ]
 
 

@@ -22,7 +22,6 @@ from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import registry
 from keyss.methods.base import (
-    Capabilities,
     CommandLineOption,
     Context,
     Frame,
@@ -67,14 +66,8 @@ class WholeMethod:
 
     name = "whole"
     summary = "embed the floats themselves"
-    capabilities = Capabilities(
-        trains=False,
-        decoder=False,
-        standard_file=True,
-        most_secrets=1,
-        sidecar=False,
-        recommended_for="tests",
-    )
+    trains = False
+    most_secrets = 1
     options = WholeOptions
     presets: Mapping[str, WholeOptions] = {"small": WholeOptions(), "large": WholeOptions(most=1000)}
 

@@ -28,10 +28,9 @@ from keyss.runs.audit_record import (
     WrongKeyResult,
 )
 from keyss.runs.config import PathLike
-from keyss.runs.files import bytes_writer
+from keyss.runs.files import writers
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.opening import HidingRun, open_run
-from keyss.runs.records import record_bytes
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
 
@@ -90,8 +89,8 @@ def audit(
         wrong_key=_wrong_keys(opened.metrics),
         **sections,
     )
-    writers = {f"{PICTURES}/{name}": bytes_writer(data) for name, data in pictures.items()}
-    output.fill({AUDIT_FILE: bytes_writer(record_bytes(found)), **writers})
+    shown = {f"{PICTURES}/{name}": data for name, data in pictures.items()}
+    output.fill(writers({AUDIT_FILE: found, **shown}))
     write_report(opened.folder)
     return found
 

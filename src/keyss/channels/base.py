@@ -18,7 +18,6 @@ from keyss.core.gaussians import Gaussians
 
 Bytes = npt.NDArray[np.uint8]
 
-
 METHOD_BYTES = 15  # of the name of a method in files
 
 
@@ -26,7 +25,7 @@ METHOD_BYTES = 15  # of the name of a method in files
 class Payload:
     """Bytes that come out whole or not at all."""
 
-    method: str  # who reads them: the name of a method, 1 to 15 ASCII characters
+    method: str  # who reads them, 1 to METHOD_BYTES ASCII characters
     data: bytes
 
 
@@ -52,7 +51,7 @@ class RecordPlan:
 class Records:
     """Pieces of one size that come out one by one, in any order."""
 
-    method: str  # who reads them: the name of a method, 1 to 15 ASCII characters
+    method: str  # who reads them, 1 to METHOD_BYTES ASCII characters
     header: bytes  # how they are to be read; comes out whole or not at all
     records: Bytes  # [R, size]
     plan: RecordPlan  # as the channel gave it
@@ -87,9 +86,6 @@ class PreparedCover(Protocol):
     def carriers(self) -> int:
         """Gaussians that can carry something."""
 
-    def payload_capacity(self, secrets: int = 1) -> int:
-        """Bytes of one compressed and encrypted payload, for each of so many secrets."""
-
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         """Records that fit for all requests together, however many they ask for."""
 
@@ -106,14 +102,6 @@ class PreparedCover(Protocol):
 
 class Channel(Protocol):
     """A place for bits in a model."""
-
-    @property
-    def name(self) -> str:
-        """In files and on the command line."""
-
-    @property
-    def survives(self) -> tuple[str, ...]:
-        """File formats from which `extract` still works."""
 
     def largest_record(self, sh_degree: int) -> int:
         """Bytes of the largest record in a model of this SH degree; 0 where there is no room at all."""

@@ -6,6 +6,7 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 import inspect
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -113,7 +114,7 @@ def hide(
         out,
         {
             "stego.ply": "the cover with the secret in it: this is what to publish",
-            "decoder.sealed": "what the keys open, encrypted: needed for revealing",
+            "decoder.sealed": "the payloads, encrypted: needed for revealing",
             "private": "plain models of all scenes: keep them to yourself",
             "metrics.json": "the numbers",
             "config.json": "what ran",
@@ -129,7 +130,9 @@ def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
     from keyss.core.errors import UsageError
     from keyss.methods.registry import METHODS
 
-    given = _method_in(arguments)
+    chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    chooser.add_argument("--method", nargs="?")
+    given = chooser.parse_known_args(arguments)[0].method
     method = METHODS[given if given in METHODS else DEFAULT_METHOD]
     flags = {name: _flags(each) for name, each in METHODS.items()}
     for argument in arguments:
@@ -148,34 +151,34 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     """`hide` with a signature for tyro: what all methods take, then the options of this one."""
     from keyss.methods.registry import METHODS
 
-    def command(**arguments: Any) -> None:
-        hide(**arguments)
-
     summaries = "; ".join(f"{each.name}: {each.summary}" for each in METHODS.values())
-    hints = get_type_hints(hide, include_extras=True)
-    hints["method"] = Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")]
-    hints["preset"] = Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")]
-    defaults = {name: each.default for name, each in inspect.signature(hide).parameters.items()}
-    defaults |= {"method": method.name, "preset": next(iter(method.presets))}
-    for name in ("own", "return"):
-        hints.pop(name), defaults.pop(name, None)
+    # Types and defaults by name, for what `hide` leaves open.
+    hints: dict[str, Any] = {
+        "method": Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")],
+        "preset": Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")],
+    }
+    defaults: dict[str, Any] = {"method": method.name, "preset": next(iter(method.presets))}
     for name, (kind, option) in _own_options(method).items():
         aliases = [f"--{option.alias}"] if option.alias else None
         if kind is bool:
             hints[name], defaults[name] = Annotated[bool, arg(help=option.help, aliases=aliases)], False
             continue
         choices = "{" + ",".join(get_args(kind)) + "}" if get_origin(kind) is Literal else None
-        given = str if option.parse else kind
-        metavar = option.metavar or choices or "TEXT"
-        described = optional(metavar, option.help, "the preset's", aliases)
-        hints[name], defaults[name] = Annotated[given | None, described], None
-    command.__name__, command.__doc__, command.__annotations__ = "hide", hide.__doc__, hints
-    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=hint)
-            for name, hint in hints.items()
-        ]
-    )
+        described = optional(option.metavar or choices or "TEXT", option.help, "the preset's", aliases)
+        hints[name], defaults[name] = Annotated[(str if option.parse else kind) | None, described], None
+
+    def command(**arguments: Any) -> None:
+        hide(**arguments)
+
+    signature = inspect.signature(hide, eval_str=True)
+    parameters = {name: each for name, each in signature.parameters.items() if name != "own"}
+    for name, hint in hints.items():
+        parameters[name] = inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=hint
+        )
+    command.__signature__ = signature.replace(parameters=list(parameters.values()))  # type: ignore[attr-defined]
+    command.__name__, command.__doc__ = "hide", hide.__doc__
+    command.__annotations__ = {name: each.annotation for name, each in parameters.items()}
     return command
 
 
@@ -184,30 +187,19 @@ def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
     from keyss.methods.base import CommandLineOption
 
     hints = get_type_hints(method.options, include_extras=True)
-    described = {each.name: get_args(hints[each.name]) for each in fields(method.options)}
     return {
-        name: (kind, extra)
-        for name, (kind, *extras) in ((name, args) for name, args in described.items() if args)
-        for extra in extras
+        each.name: (get_args(hints[each.name])[0], extra)
+        for each in fields(method.options)
+        for extra in getattr(hints[each.name], "__metadata__", ())
         if isinstance(extra, CommandLineOption)
     }
 
 
 def _flags(method: Method) -> set[str]:
     """As they are typed: `--prune-to-fit`, `--thin`."""
-    options = _own_options(method).items()
-    names = [name for own, (_, option) in options for name in (own, option.alias) if name]
-    return {f"--{name.replace('_', '-')}" for name in names}
-
-
-def _method_in(arguments: Sequence[str]) -> str | None:
-    """The last value of `--method`."""
-    found = None
-    for index, argument in enumerate(arguments):
-        name, _, value = argument.partition("=")
-        if name == "--method":
-            found = value or "".join(arguments[index + 1 : index + 2])
-    return found
+    own = _own_options(method)
+    aliases = [option.alias for _, option in own.values() if option.alias]
+    return {f"--{name.replace('_', '-')}" for name in (*own, *aliases)}
 
 
 def reveal(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,28 +17,28 @@ if TYPE_CHECKING:
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     """The numbers of a hiding: a row for each scene beside its baseline, wrong keys, the method's own."""
-    rows = [_QualityRow("cover", metrics.cover, metrics.baseline.cover, metrics.gaussians)]
-    count = len(metrics.secrets)
-    for i, (secret, plain) in enumerate(zip(metrics.secrets, metrics.baseline.secrets, strict=True)):
-        name = _numbered("secret", i, count)
-        rows.append(_QualityRow(name, secret, plain, metrics.secret_gaussians[i]))
-    wrong = metrics.wrong_key
-    if wrong is not None:
-        rows.append(_QualityRow(f"{wrong.keys} wrong keys, against the cover", wrong.vs_cover.mean))
-        rows.append(_QualityRow("  the worst of them", wrong.vs_cover.min))
-        for i, found in enumerate(wrong.vs_secrets):
-            rows.append(_QualityRow(f"  the one nearest to {_numbered('the secret', i, count)}", found.max))
-    for i, level in enumerate(metrics.chance_level):
-        rows.append(_QualityRow(f"the stego cover, against {_numbered('the secret', i, count)}", level))
-    cells = [row.cells() for row in rows]
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for index, name in enumerate(
-        ("against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians")
-    ):
-        if any(row[index] for row in cells):
-            table.add_column(name, justify="right" if index else "left")
-    for row in cells:
-        table.add_row(*(cell for cell, *column in zip(row, *cells, strict=True) if any(column)))
+    numbers = [f" {i}" for i in range(1, len(metrics.secrets) + 1)] if len(metrics.secrets) > 1 else [""]
+    rows = [_scene_row("cover", metrics.cover, metrics.baseline.cover, metrics.gaussians)]
+    secrets = zip(numbers, metrics.secrets, metrics.baseline.secrets, metrics.secret_gaussians, strict=True)
+    rows += [_scene_row(f"secret{number}", found, plain, size) for number, found, plain, size in secrets]
+    psnrs = []
+    if (wrong := metrics.wrong_key) is not None:
+        psnrs += [(f"{wrong.keys} wrong keys, against the cover", wrong.vs_cover.mean)]
+        psnrs += [("  the worst of them", wrong.vs_cover.min)]
+        psnrs += [
+            (f"  the one nearest to the secret{number}", found.max)
+            for number, found in zip(numbers, wrong.vs_secrets, strict=True)
+        ]
+    psnrs += [
+        (f"the stego cover, against the secret{number}", level)
+        for number, level in zip(numbers, metrics.chance_level, strict=True)
+    ]
+    rows += [[name, f"{psnr:.2f}", "", "", "", ""] for name, psnr in psnrs]
+    names = ("against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians")
+    filled = [column for column in zip(names, *rows, strict=True) if any(column[1:])]
+    table = _table(*(name for name, *_ in filled), texts=1)
+    for row in zip(*(cells for _, *cells in filled), strict=True):
+        table.add_row(*row)
     console = console or Console()
     console.print(table)
     console.print("Baseline: plain 3DGS of the same scene. PSNR, baseline and loss in dB.")
@@ -47,46 +46,34 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False)
 
 
-def print_fit(metrics: FitMetrics, console: Console | None = None) -> None:
+def print_fit(metrics: FitMetrics) -> None:
     """The numbers of a plain fit."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("PSNR", "SSIM", "Gaussians", "iterations", "seconds"):
-        table.add_column(name, justify="right")
-    table.add_row(
-        f"{metrics.psnr:.2f}",
-        f"{metrics.ssim:.3f}",
-        f"{metrics.gaussians:,}",
-        f"{metrics.iterations:,}",
-        f"{metrics.seconds:.0f}",
-    )
-    (console or Console()).print(table)
+    table = _table("PSNR", "SSIM", "Gaussians", "iterations", "seconds")
+    sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
+    table.add_row(f"{metrics.psnr:.2f}", f"{metrics.ssim:.3f}", *sizes)
+    Console().print(table)
 
 
-def print_steganalysis(found: Steganalysis, console: Console | None = None) -> None:
+def print_steganalysis(found: Steganalysis) -> None:
     """How many images there are and how many of them are taken for stego images."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("images", "flagged", "mean fusion"):
-        table.add_column(name, justify="right")
+    table = _table("images", "flagged", "mean fusion")
     mean = found.mean_fusion
     flagged = sum(row.flagged for row in found.rows)
     table.add_row(f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
-    (console or Console()).print(table)
+    Console().print(table)
 
 
-def print_verdicts(run: Path, console: Console | None = None) -> None:
-    """What an audit comes to: a line for each measure, beside its bound or null."""
+def print_verdicts(run: Path) -> None:
+    """What an audit comes to: a line for each measure, beside its baseline or control."""
     from keyss.report.verdicts import headline, verdicts
     from keyss.runs.audit_record import read_audit
 
     lines = verdicts(read_audit(run))
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("", "value", "beside", "limit", ""):
-        table.add_column(name)
+    table = _table("", "value", "beside", "limit", "", texts=5)
     for line in lines:
         table.add_row(line.measure, line.value, line.beside, line.limit, line.word)
-    console = console or Console()
-    console.print(table)
-    console.print(headline(lines), highlight=False)
+    Console().print(table)
+    Console().print(headline(lines), highlight=False)
 
 
 def print_facts(facts: Mapping[str, Any]) -> None:
@@ -106,30 +93,18 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {text}")
 
 
-@dataclass(frozen=True)
-class _QualityRow:
-    """A name, a quality or a PSNR alone, the baseline's quality, and a number of Gaussians."""
-
-    name: str
-    found: ImageQuality | float
-    baseline: ImageQuality | None = None
-    gaussians: int | None = None
-
-    def cells(self) -> list[str]:
-        """Six cells, empty ones included."""
-        psnr = self.found if isinstance(self.found, float) else self.found.psnr
-        return [
-            self.name,
-            f"{psnr:.2f}",
-            "" if isinstance(self.found, float) else f"{self.found.ssim:.3f}",
-            "" if self.baseline is None else f"{self.baseline.psnr:.2f}",
-            "" if self.baseline is None else f"{self.baseline.psnr - psnr:.2f}",
-            "" if self.gaussians is None else f"{self.gaussians:,}",
-        ]
+def _scene_row(name: str, found: ImageQuality, plain: ImageQuality | None, gaussians: int) -> list[str]:
+    """Cells of one scene: PSNR, SSIM, those of its plain model, the loss, and the number of Gaussians."""
+    beside = ["", ""] if plain is None else [f"{plain.psnr:.2f}", f"{plain.psnr - found.psnr:.2f}"]
+    return [name, f"{found.psnr:.2f}", f"{found.ssim:.3f}", *beside, f"{gaussians:,}"]
 
 
-def _numbered(name: str, index: int, count: int) -> str:
-    return f"{name} {index + 1}" if count > 1 else name
+def _table(*names: str, texts: int = 0) -> Table:
+    """An empty table with these columns, of which the first ones hold texts and the others numbers."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for index, name in enumerate(names):
+        table.add_column(name, justify="left" if index < texts else "right")
+    return table
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -29,19 +29,6 @@ class ModelFormat:
 FORMATS = [ModelFormat("PLY", (".ply",), b"ply", read_ply, write_ply)]
 
 
-@dataclass(frozen=True)
-class ModelInfo:
-    """What a person asks first about a 3DGS model on disk."""
-
-    format: str
-    count: int
-    sh_degree: int  # 0 to 3
-    bytes: int  # size of the file
-    lower: tuple[float, ...]  # smallest x, y, z of the means
-    upper: tuple[float, ...]  # largest x, y, z of the means
-    faint_share: float  # share of the Gaussians with opacity below 0.05, in [0, 1]
-
-
 def is_model_path(path: Path | str) -> bool:
     """Whether a name ends as those of model files do; the file itself is not looked at."""
     return _by_suffix(path) is not None
@@ -70,22 +57,6 @@ def check_model_output(path: Path | str, overwrite: bool) -> Path:
     path = check_output_file(path, overwrite)
     _for_writing(path)
     return path
-
-
-def describe_model(path: Path | str) -> ModelInfo:
-    """Read the model at `path` and sum it up. Raises InputError as `read_model` does."""
-    path = Path(path)
-    found = _by_content(path)
-    model = found.read(path)
-    return ModelInfo(
-        format=found.name,
-        count=len(model),
-        sh_degree=model.sh_degree,
-        bytes=path.stat().st_size,
-        lower=tuple(model.means.amin(0).tolist()),
-        upper=tuple(model.means.amax(0).tolist()),
-        faint_share=float((model.opacities < 0.05).float().mean()),
-    )
 
 
 def _by_suffix(path: Path | str) -> ModelFormat | None:

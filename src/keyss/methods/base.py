@@ -27,18 +27,6 @@ Frame = Literal["secret", "cover"]
 
 
 @dataclass(frozen=True)
-class Capabilities:
-    """What a method can do; the command line, the audit and tables read it instead of its name."""
-
-    trains: bool  # hiding is a training of its own, after the plain models
-    decoder: bool  # keys condition a decoder, so that a wrong key can be measured: `Opened.decode`
-    standard_file: bool  # what is published is an ordinary 3DGS model for every viewer
-    most_secrets: int
-    sidecar: bool  # can write what keys open to a file beside the model
-    recommended_for: str  # one line for tables and help
-
-
-@dataclass(frozen=True)
 class SceneInput:
     """What is known of a scene before anything is rendered or trained."""
 
@@ -102,7 +90,7 @@ class Stego:
     """What hiding gives."""
 
     gaussians: Gaussians  # to be published
-    sidecar: bytes | None  # what keys open, where it is not in the model
+    sidecar: bytes | None  # the encrypted payloads, where they are not in the model
     opened: tuple[Opened, ...]  # the secrets as they come out again with their keys
     seconds: float  # of hiding alone, without plain models
     iterations: int = 0  # of the method's own training
@@ -149,8 +137,12 @@ class Method(Protocol):
         """One line that goes on from the name."""
 
     @property
-    def capabilities(self) -> Capabilities:
-        """What it can do."""
+    def trains(self) -> bool:
+        """Whether hiding is a training of its own, after the plain models."""
+
+    @property
+    def most_secrets(self) -> int:
+        """How many secrets one model can have."""
 
     @property
     def options(self) -> type[MethodOptions]:

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
 from keyss.methods.base import Frame
 
-LEAST_OPACITY = 1 / 255  # below it a Gaussian is not drawn
 _STRENGTH = 0.02  # standard deviation of the changes of opacity logits
 _MOVE = 1e-4  # of turns (radians), shifts (of the model's size) and changes of scale
 _KNOTS, _LOGITS = 16, 10.0  # the changes are a piecewise linear function of logits from -10 to 10
@@ -48,7 +47,7 @@ class Decoy:
         left = place.long().clamp_max(_KNOTS - 2)
         change = torch.lerp(self.changes[left], self.changes[left + 1], place - left)
         shown = replace(stego, opacity_logits=stego.opacity_logits + change)
-        if (drawn := shown.opacities >= LEAST_OPACITY).any():
+        if (drawn := shown.opacities >= DRAWN_OPACITY).any():
             shown = shown[drawn]
         return shown if frame == "cover" else self.frame.inverse().apply_gaussians(shown)
 

@@ -61,7 +61,6 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
 def _unpacked(content: Content) -> Opened:
     if content.method not in METHODS:
         raise InputError(
-            f"what the key opens was hidden by the method {content.method!r}; this program has "
-            f"{', '.join(METHODS)}"
+            f"the secret was hidden by the method {content.method!r}; this program has {', '.join(METHODS)}"
         )
     return METHODS[content.method].unpack(content)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from keyss.channels.sidecar import read_header
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene
-from keyss.files.models import describe_model, is_model_path
+from keyss.files.models import is_model_path, read_model
 from keyss.files.scenes import load_scene
 from keyss.runs.files import METRICS, MODEL, STEGO
 from keyss.runs.metrics import FitMetrics, HideMetrics
@@ -86,18 +88,26 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if is_model_path(path):
-        facts = describe_model(path)
-        lower, upper = (tuple(round(x, 4) for x in corner) for corner in (facts.lower, facts.upper))
-        share = round(facts.faint_share, 4)
-        return ModelInfo(
-            "3DGS model", str(path), facts.bytes, facts.count, facts.sh_degree, (lower, upper), share
-        )
+        return _model_info(path)
     try:
         costs, _, _ = read_header(read_sidecar(path))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     derivation = KeyDerivationInfo("Argon2id", costs.memory_kib, costs.time_cost, costs.parallelism)
     return SidecarInfo("sidecar", str(path), path.stat().st_size, derivation)
+
+
+def _model_info(path: Path) -> ModelInfo:
+    model = read_model(path)
+    return ModelInfo(
+        kind="3DGS model",
+        path=str(path),
+        bytes=path.stat().st_size,
+        gaussians=len(model),
+        sh_degree=model.sh_degree,
+        bounding_box=(_rounded(model.means.amin(0)), _rounded(model.means.amax(0))),
+        nearly_transparent=round(float((model.opacities < 0.05).float().mean()), 4),
+    )
 
 
 def _scene_info(scene: Scene) -> SceneInfo:
@@ -110,5 +120,9 @@ def _scene_info(scene: Scene) -> SceneInfo:
         image_size=(camera.width, camera.height),
         points=len(scene.points),
         extent=round(scene.extent, 4),
-        background=tuple(round(float(x), 4) for x in scene.background),
+        background=_rounded(scene.background),
     )
+
+
+def _rounded(values: Tensor) -> tuple[float, ...]:
+    return tuple(round(float(x), 4) for x in values)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
-from keyss.files.images import png_bytes
 from keyss.files.models import write_model
-from keyss.runs.records import write_record
+from keyss.runs.records import record_bytes
 
-STEGO, SIDECAR, CONFIG, METRICS, MODEL = (
-    "stego.ply",
-    "decoder.sealed",
-    "config.json",
-    "metrics.json",
-    "model.ply",
-)
+STEGO, SIDECAR, MODEL = "stego.ply", "decoder.sealed", "model.ply"
+CONFIG, METRICS = "config.json", "metrics.json"
 PRIVATE = "private"  # plain models of cover and secrets: for measuring, never to be published
 
 
@@ -29,21 +21,13 @@ def plain_names(secrets: int) -> list[str]:
     return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
 
 
-def ply_writer(gaussians: Gaussians) -> Callable[[Path], None]:
-    """For `OutputFolder.fill`: writes a model."""
-    return lambda path: write_model(path, gaussians)
+def writers(contents: Mapping[str, Any]) -> dict[str, Callable[[Path], None]]:
+    """For `OutputFolder.fill`, of each file's content: a model, bytes as they are, or a record."""
+    return {name: _writer(content) for name, content in contents.items()}
 
 
-def bytes_writer(data: bytes) -> Callable[[Path], None]:
-    """For `OutputFolder.fill`: writes bytes."""
+def _writer(content: Any) -> Callable[[Path], None]:
+    if isinstance(content, Gaussians):
+        return lambda path: write_model(path, content)
+    data = content if isinstance(content, bytes) else record_bytes(content)
     return lambda path: write_bytes(path, data)
-
-
-def png_writer(image: Tensor) -> Callable[[Path], None]:
-    """For `OutputFolder.fill`: writes an image [H, W, 3] uint8."""
-    return bytes_writer(png_bytes(image))
-
-
-def record_writer(record: Any) -> Callable[[Path], None]:
-    """For `OutputFolder.fill`: writes a record."""
-    return lambda path: write_record(path, record)

@@ -52,19 +52,19 @@ def test_every_attribute_comes_back_within_the_error_of_its_bits(
     back = codec.decode(codec.encode(model))
     assert Codec.unpack(codec.pack()) == codec
     scales = model.log_scales.double()
-    step = float(scales.max() - scales.min()) / ((1 << table.log_scales) - 1)
+    step = float(scales.max() - scales.min()) / ((1 << table.bits[1]) - 1)
     assert (
         float((back.log_scales - scales).abs().max()) <= 0.51 * step + 1e-6 * float(scales.abs().max()) + 1e-6
     )
     for axis, line in enumerate(codec.lines[:3]):
         was, now = (((m.means[:, axis].double() - line.centre) / line.spread).asinh() for m in (model, back))
-        assert float((was - now).abs().max()) <= 1.1 * line.reach / ((1 << table.means) - 1) + 1e-5
+        assert float((was - now).abs().max()) <= 1.1 * line.reach / ((1 << table.bits[0]) - 1) + 1e-5
     assert torch.isfinite(back.sh).all()
     length = model.quats.double().norm(dim=1)
     unit = model.quats.double() / length[:, None].clamp_min(1e-60)
     same = (unit * back.quats.double()).sum(1).abs()[length > 0]
     # Each of the three is off by half a step of sqrt(2) / (2^bits - 1), and the fourth by as much as follows.
-    assert (1 - same <= 6 * (0.5**0.5 / ((1 << table.quats) - 1)) ** 2 + 1e-6).all()
+    assert (1 - same <= 6 * (0.5**0.5 / ((1 << table.bits[2]) - 1)) ** 2 + 1e-6).all()
     assert torch.allclose(back.quats.norm(dim=1), torch.ones(count), atol=1e-5)
 
 
@@ -86,7 +86,7 @@ def test_tables_grow_bit_by_bit_and_say_when_nothing_fits(degree: int) -> None:
     for bits in range(floor.total, 1200, 50):
         table = Table.of_size(bits, degree)
         assert table is not None
-        assert bits - 63 <= table.total <= bits or table.means == 24
+        assert bits - 63 <= table.total <= bits or table.bits[0] == 24
         assert table.sh_degree == degree
         totals.append(table.total)
     assert totals == sorted(totals)
@@ -101,7 +101,7 @@ def test_half_and_whole_records_of_degree_3_are_as_near_as_promised() -> None:
         table = Table.of_size(bits, 3)
         assert table is not None
         codec = Codec.fit(model, table)
-        assert codec.record_bytes <= bits // 8
+        assert codec.table.record_bytes <= bits // 8
         back = codec.decode(codec.encode(model))
         for camera in ring_cameras(3):
             error = (render(model, camera) - render(back, camera)).square().mean()
@@ -114,7 +114,7 @@ def test_damaged_parameters_are_an_input_error_or_bounded_numbers(data: bytes) -
         codec = Codec.unpack(data)
     except InputError:
         return
-    records = np.random.default_rng(0).integers(0, 256, (20, codec.record_bytes), dtype=np.uint8)
+    records = np.random.default_rng(0).integers(0, 256, (20, codec.table.record_bytes), dtype=np.uint8)
     assert all(torch.isfinite(values).all() for values in vars(codec.decode(records)).values())
 
 

@@ -17,7 +17,6 @@ from keyss.methods.base import Context, KeyedSource, SceneInput, Source
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors
-from keyss.methods.learned.revealing import OpenedSecret
 from keyss.methods.plain_models import plain_models
 
 
@@ -50,15 +49,15 @@ def hide_scenes(
     context = Context(torch.device("cpu"), checkpoints, resume, reporter)
     cover, *secrets = map(Source, scenes, plain_models(scenes, given, options.fit, context))
     stego = method.hide(cover, list(map(KeyedSource, secrets, keys)), options, context)
-    opened = tuple(each.secret for each in stego.opened if isinstance(each, OpenedSecret))
+    opened = tuple(each for each in stego.opened if isinstance(each, HiddenSecret))
     return Hidden(stego.gaussians, stego.sidecar, opened)
 
 
 def open_secret(stego: Gaussians, key: str, sidecar: bytes | None = None) -> HiddenSecret:
     """What `key` opens; raises WrongKeyError."""
     opened = registry.open_model(stego, key, sidecar=sidecar)
-    assert isinstance(opened, OpenedSecret)
-    return opened.secret
+    assert isinstance(opened, HiddenSecret)
+    return opened
 
 
 def some_secret(stego: Gaussians) -> HiddenSecret:

@@ -9,8 +9,7 @@ import torch
 
 from keyss.core import Gaussians, UsageError
 from keyss.keys import random_embeddings
-from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.mask import ATTRIBUTES, parse_mask
+from keyss.methods.learned.decoder import ATTRIBUTES, Decoder, DecoderShape, parse_mask
 from tiny_scenes import random_gaussians
 
 FIELD_OF = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}

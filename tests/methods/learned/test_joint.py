@@ -19,7 +19,6 @@ from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.keys import random_embeddings
 from keyss.methods.learned.joint import JointRun, combine_densification
 from keyss.methods.learned.options import PRESETS, LearnedOptions
-from keyss.methods.learned.revealing import decode, reveal_gaussians
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
 from keyss.rendering import render
 from methods.learned.hiding import Hidden, hide_scenes, open_secret
@@ -85,15 +84,15 @@ def test_the_published_model_shows_the_cover(hidden: Hidden) -> None:
 @pytest.mark.parametrize("secret", [1, 2])
 def test_each_key_opens_its_secret_in_its_own_frame(hidden: Hidden, secret: int) -> None:
     scenes, _ = _scenes()
-    revealed = reveal_gaussians(hidden.stego, hidden.secrets[secret - 1])
+    revealed = hidden.secrets[secret - 1].reveal(hidden.stego)
     assert _psnr(revealed, scenes[secret]) > 26
     assert _psnr(revealed, scenes[secret]) > _psnr(hidden.stego, scenes[secret]) + 10
 
 
 def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> None:
     scenes, _ = _scenes()
-    own = reveal_gaussians(hidden.stego, hidden.secrets[0])
-    there = reveal_gaussians(hidden.stego, hidden.secrets[0], frame="cover")
+    own = hidden.secrets[0].reveal(hidden.stego)
+    there = hidden.secrets[0].reveal(hidden.stego, frame="cover")
     frame = hidden.secrets[0].frame
     assert frame.scale != pytest.approx(1, abs=0.1)
     camera = scenes[1].test[0].camera
@@ -113,7 +112,7 @@ def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:
 def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
     scenes, _ = _scenes()
     for embedding in random_embeddings(2, torch.Generator().manual_seed(5)):
-        decoy = decode(hidden.stego, hidden.secrets[0], embedding)
+        decoy = hidden.secrets[0].decode(hidden.stego, embedding)
         assert _psnr(decoy, scenes[0]) > 26
         assert _psnr(decoy, scenes[2]) < _psnr(hidden.stego, scenes[2]) + 1
 
@@ -135,20 +134,20 @@ def test_a_model_large_enough_carries_its_secrets() -> None:
     for key, secret in zip(KEYS, hidden.secrets, strict=True):
         opened = open_secret(hidden.stego, key)
         assert torch.equal(opened.embedding, secret.embedding)
-        assert _same(reveal_gaussians(hidden.stego, opened), reveal_gaussians(hidden.stego, secret))
+        assert _same(opened.reveal(hidden.stego), secret.reveal(hidden.stego))
     for secret, scene in zip(hidden.secrets, scenes[1:], strict=True):
-        assert _psnr(reveal_gaussians(hidden.stego, secret), scene) > 26
+        assert _psnr(secret.reveal(hidden.stego), scene) > 26
 
 
 def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: Hidden) -> None:
     scenes, _ = _scenes()
     chosen = torch.randperm(len(hidden.stego), generator=torch.Generator().manual_seed(0))
-    shuffled = reveal_gaussians(hidden.stego[chosen], hidden.secrets[1])
+    shuffled = hidden.secrets[1].reveal(hidden.stego[chosen])
     assert _psnr(shuffled, scenes[2]) > 26
-    reveal_gaussians(hidden.stego[chosen[:200]], hidden.secrets[1])
+    hidden.secrets[1].reveal(hidden.stego[chosen[:200]])
     with pytest.raises(InputError, match="another model"):
-        reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1])
-    reveal_gaussians(random_gaussians(seed=9), hidden.secrets[1], force=True)
+        hidden.secrets[1].reveal(random_gaussians(seed=9))
+    hidden.secrets[1].reveal(random_gaussians(seed=9), force=True)
 
 
 class _InterruptAt(SilentReporter):
@@ -244,7 +243,7 @@ def test_the_published_presets_train(preset: str) -> None:
     )
     hidden = hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
     for secret in hidden.secrets:
-        revealed = reveal_gaussians(hidden.stego, secret)
+        revealed = secret.reveal(hidden.stego)
         assert 0 < len(revealed) <= len(hidden.stego)
         assert all(getattr(revealed, f.name).isfinite().all() for f in fields(Gaussians))
 

@@ -10,7 +10,6 @@ import torch
 from channels.low_bits.trained_like import trained_like
 from keyss.core import InputError
 from keyss.methods.learned.payload import pack_secret, unpack_secret
-from keyss.methods.learned.revealing import reveal_gaussians
 from methods.learned.hiding import some_secret
 
 
@@ -23,8 +22,8 @@ def test_opacities_that_were_rounded_to_zero_are_taken_for_faint_ones() -> None:
         for logit in (-16.0, secret.decoder.nearly_opaque_logit)
     )
     assert torch.equal(
-        reveal_gaussians(rounded, secret, force=True).opacity_logits,
-        reveal_gaussians(faint, secret, force=True).opacity_logits,
+        secret.reveal(rounded, force=True).opacity_logits,
+        secret.reveal(faint, force=True).opacity_logits,
     )
 
 
@@ -47,7 +46,7 @@ def test_a_sidecar_knows_what_was_rounded_whatever_the_order(logit: float) -> No
     known = secret.with_faint(rounded[order])
     assert torch.equal(known.opacity_logits, stego.opacity_logits[order])
     assert torch.equal(known.sh[:, 0], stego.sh[order, 0])
-    revealed, whole = (reveal_gaussians(model, secret, force=True) for model in (rounded, stego))
+    revealed, whole = (secret.reveal(model, force=True) for model in (rounded, stego))
     assert torch.equal(revealed.opacity_logits, whole.opacity_logits)
 
 
@@ -56,21 +55,19 @@ def test_positions_that_were_rounded_need_force() -> None:
     secret = some_secret(stego)
     rounded = replace(stego, means=(stego.means * 500).round() / 500)
     with pytest.raises(InputError, match="--force"):
-        reveal_gaussians(rounded, secret)
-    assert len(reveal_gaussians(rounded, secret, force=True)) == 200
+        secret.reveal(rounded)
+    assert len(secret.reveal(rounded, force=True)) == 200
 
 
 def test_what_is_left_makes_up_for_what_was_lost() -> None:
     stego = trained_like(200)
     secret = some_secret(stego)
     secret = unpack_secret(pack_secret(replace(secret, count=200)))
-    left = reveal_gaussians(stego[:150], secret)
-    alone = reveal_gaussians(stego[:150], replace(secret, count=0))
+    left = secret.reveal(stego[:150])
+    alone = replace(secret, count=0).reveal(stego[:150])
     assert (left.opacities > alone.opacities).all()
     assert (left.log_scales > alone.log_scales).all()
-    assert torch.equal(
-        reveal_gaussians(stego, secret).sh, reveal_gaussians(stego, replace(secret, count=0)).sh
-    )
+    assert torch.equal(secret.reveal(stego).sh, replace(secret, count=0).reveal(stego).sh)
 
 
 @pytest.mark.parametrize("count", [-1, 2**40, 1.5, True, None])

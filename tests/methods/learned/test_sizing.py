@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.methods.base import SceneInput
-from keyss.methods.learned.options import LearnedOptions
-from keyss.methods.learned.revealing import reveal_gaussians
-from keyss.methods.learned.sizing import sized
+from keyss.methods.learned.options import LearnedOptions, sized
 from keyss.rendering.orbit import scene_of_model
 from methods.learned.hiding import hide_scenes, open_secret
 from tiny_scenes import random_gaussians
@@ -20,7 +18,7 @@ def test_one_model_hides_in_another_without_photos() -> None:
     config = sized(LearnedOptions(), [SceneInput(model, photos=False) for model in models])
     assert (config.fit.max_gaussians, config.fit.iterations, config.fit.sh_degree) == (1900, 400, 3)
     hidden = hide_scenes(scenes, ["key"], config.with_fit(iterations=30, evaluate_every=0), plains=models)
-    revealed = reveal_gaussians(hidden.stego, open_secret(hidden.stego, "key"))
+    revealed = open_secret(hidden.stego, "key").reveal(hidden.stego)
     assert mean_psnr(hidden.stego, scenes[0].test, scenes[0].background) > 40
     assert mean_psnr(revealed, scenes[1].test, scenes[1].background) > 40
 

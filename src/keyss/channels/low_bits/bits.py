@@ -28,7 +28,8 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 
 IDENTITY_BYTES = 16
-_GEOMETRY = 8  # fields of a Gaussian before the spherical harmonics
+_FIELDS = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
+_GEOMETRY = len(_FIELDS)  # fields of a Gaussian before the spherical harmonics
 _GEOMETRY_BITS, _SH_BITS = 8, 12
 _UNUSED_BITS = 1  # below them
 _GROUPS = (slice(0, 3), slice(3, 7), slice(7, 8), slice(8, None))  # scales, quaternions, opacity, harmonics
@@ -135,8 +136,9 @@ def check_usable(gaussians: Gaussians, usable: Flags) -> None:
         for column in range(used.shape[1]):
             ratio = _chi_square(used[:, column] >> shift & 255)
             if ratio > _LARGEST_RATIO:
+                name = _FIELDS[column] if column < _GEOMETRY else "f_rest"
                 raise InputError(
-                    f"the low bits of {_field_name(column)} are not random in this model (chi-square "
+                    f"the low bits of {name} are not random in this model (chi-square "
                     f"{ratio:.1f} per degree of freedom, 1 expected), so that nothing can be hidden in them: "
                     "it was quantised, scaled or moved after its training"
                 )
@@ -153,15 +155,6 @@ def _chi_square(bytes_: npt.NDArray[np.integer[Any]]) -> float:
     counts = np.bincount(bytes_, minlength=256)
     expected = len(bytes_) / 256
     return float(((counts - expected) ** 2).sum() / expected / 255)
-
-
-def _field_name(column: int) -> str:
-    groups = ((3, "scale_"), (4, "rot_"), (1, "opacity"))
-    for size, name in groups:
-        if column < size:
-            return name if size == 1 else f"{name}{column}"
-        column -= size
-    return "f_rest"
 
 
 def _sh_count(sh_degree: int) -> int:

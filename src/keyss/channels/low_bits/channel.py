@@ -24,6 +24,7 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,12 +62,8 @@ _ASSOCIATED = b"keyss/v1/low-bits"
 _OPENS_NOTHING = "this key opens nothing here"
 
 
-@dataclass(frozen=True)
 class LowBits:
     """The channel; see `keyss.channels.base.Channel`."""
-
-    name: str = "low_bits"
-    survives: tuple[str, ...] = ("ply",)
 
     def largest_record(self, sh_degree: int) -> int:
         return record_bytes(sh_degree, 1)
@@ -83,10 +80,8 @@ class LowBits:
         """
         reader = LowBitsReader.of(stego)
         for derived in reader.keys(key):
-            try:
+            with suppress(WrongKeyError):
                 return reader.extract(derived)
-            except WrongKeyError:
-                continue
         raise WrongKeyError(_OPENS_NOTHING)
 
 
@@ -104,9 +99,6 @@ class LowBitsCover:
     def carriers(self) -> int:
         return int(self.usable.sum())
 
-    def payload_capacity(self, secrets: int = 1) -> int:
-        return spread.payload_capacity(self.carriers, secrets, self.cover.sh_degree)
-
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         return record_capacity(requests, self.carriers, self.cover.sh_degree)
 
@@ -115,10 +107,9 @@ class LowBitsCover:
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
-        keys = derive_all(self.cover, [key for key, _ in contents])
-        return self.embed_derived(
-            list(zip(keys, (content for _, content in contents), strict=True)), entropy=entropy
-        )
+        derivations = [derivation_of(identity) for identity in salts(identities(self.cover))]
+        derived = [([DerivedKey(key, each) for each in derivations], content) for key, content in contents]
+        return self.embed_derived(derived, entropy=entropy)
 
     def embed_derived(
         self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], *, entropy: bytes | None = None
@@ -134,10 +125,8 @@ class LowBitsCover:
         records = [(keys, each) for keys, each in contents if isinstance(each, Records)]
         if payloads and records:
             raise ValueError("expected payloads or records in one model, got both")
-        if payloads:
-            writer.payloads(payloads)
-        else:
-            writer.records(records)
+        writer.payloads(payloads)
+        writer.records(records)
         return write_low_bits(self.cover, writer.rows, writer.table)
 
 
@@ -186,7 +175,7 @@ class LowBitsReader:
         if not 0 < found.record_bytes <= room:
             raise InputError("the hidden parameters are damaged: records larger than their cells")
         records, copies = (
-            self._decrypt(_record_cipher(data_key, found.record_bytes, label), found.cells)
+            self._decrypt(CellCipher(data_key, label, found.record_bytes), found.cells)
             for label in ("record", "copy")
         )
         records = np.concatenate([records, copies[~_are_among(copies, records)]])
@@ -218,12 +207,6 @@ def salts(names: Bytes) -> list[bytes]:
 def derivation_of(identity: bytes) -> KeyDerivation:
     """The costs are fixed: there is nowhere to state others before a key is derived."""
     return KeyDerivation(salt=hashlib.sha256(b"keyss/v1/salt" + identity).digest()[:SALT_BYTES])
-
-
-def derive_all(cover: Gaussians, keys: Sequence[str]) -> list[list[DerivedKey]]:
-    """What each of the keys becomes under each of the salts; takes 1.6 s a key."""
-    derivations = [derivation_of(identity) for identity in salts(identities(cover))]
-    return [[DerivedKey(key, each) for each in derivations] for key in keys]
 
 
 class _Writer:
@@ -272,7 +255,7 @@ class _Writer:
             content = contents[index][1]
             cells = content.plan.cells_per_carrier
             for label, records in (("record", content.records), ("copy", content.records[content.copied])):
-                cipher = _record_cipher(self._data_key(index), records.shape[1], label)
+                cipher = CellCipher(self._data_key(index), label, records.shape[1])
                 if cells == 1:
                     self._whole(cipher, records)
                     continue
@@ -314,10 +297,6 @@ def _parameter_cipher(data_key: bytes, sh_degree: int) -> CellCipher:
 def _chunk_cipher(data_key: bytes, sh_degree: int) -> CellCipher:
     size = spread.NUMBER_BYTES + spread.chunk_bytes(sh_degree)
     return CellCipher(data_key, "chunk", size, spread.TAG_BYTES)
-
-
-def _record_cipher(data_key: bytes, size: int, label: str) -> CellCipher:
-    return CellCipher(data_key, label, size)
 
 
 def _payload_key(data_key: bytes) -> bytes:

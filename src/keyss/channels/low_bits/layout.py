@@ -58,7 +58,12 @@ def plan_records(requests: Sequence[RecordRequest], carriers: int, sh_degree: in
 
     `carriers`, `sh_degree`: of the cover. Raises UsageError with the number of records that fits.
     """
-    _check_record_size(requests, sh_degree)
+    least, most = max(request.least_bytes for request in requests), record_bytes(sh_degree, 1)
+    if least > most:
+        raise UsageError(
+            f"a Gaussian of SH degree {sh_degree} has room for records of {most} bytes, and at least {least} "
+            "are needed"
+        )
     own = [_own_cells(request, carriers, sh_degree) for request in requests]
     attempts = [[1 if cells == 1 else max(own) for cells in own]]
     attempts += [[cells] * len(requests) for cells in (*range(2, MOST_CELLS + 1), 1)]
@@ -85,15 +90,6 @@ def record_capacity(requests: Sequence[RecordRequest], carriers: int, sh_degree:
     least = max(request.least_bytes for request in requests)
     cells = [each for each in range(1, MOST_CELLS + 1) if record_bytes(sh_degree, each) >= least]
     return max(0, left) * max(cells, default=0)
-
-
-def _check_record_size(requests: Sequence[RecordRequest], sh_degree: int) -> None:
-    least, most = max(request.least_bytes for request in requests), record_bytes(sh_degree, 1)
-    if least > most:
-        raise UsageError(
-            f"a Gaussian of SH degree {sh_degree} has room for records of {most} bytes, and at least {least} "
-            "are needed"
-        )
 
 
 def _own_cells(request: RecordRequest, carriers: int, sh_degree: int) -> int:

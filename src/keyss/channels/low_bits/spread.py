@@ -8,6 +8,7 @@ of carriers are used: what it does not need becomes redundancy, and the number o
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -104,14 +105,10 @@ def carriers_for(size: int, secrets: int, sh_degree: int) -> int:
     """The least number of carriers in which `size` bytes for each of `secrets` fit. `sh_degree`: 1 to 3."""
     if chunk_bytes(sh_degree) == 0:
         raise ValueError(f"no number of carriers will do for SH degree {sh_degree}")
-    low, high = 0, 1 << 10
-    while payload_capacity(high, secrets, sh_degree) < size:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        enough = payload_capacity(middle, secrets, sh_degree) >= size
-        low, high = (low, middle) if enough else (middle, high)
-    return high
+    enough = 1 << 10
+    while payload_capacity(enough, secrets, sh_degree) < size:
+        enough *= 2
+    return bisect_left(range(enough), size, key=lambda each: payload_capacity(each, secrets, sh_degree))
 
 
 def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
@@ -138,7 +135,5 @@ def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree:
 @lru_cache(maxsize=1024)
 def _most_data(n: int, blocks: int) -> int:
     """The largest k with which all blocks survive removal with probability 1 - FAILURE; 0 if none."""
-    for k in range(n, 0, -1):
-        if binom.sf(n - k, n, REMOVAL) * blocks < FAILURE:
-            return k
-    return 0
+    data = np.arange(1, n + 1)
+    return int(data[binom.sf(n - data, n, REMOVAL) * blocks < FAILURE].max(initial=0))

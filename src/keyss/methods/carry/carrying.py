@@ -11,12 +11,16 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+import torch
+
 from keyss.channels.base import Channel, PreparedCover, RecordPlan, RecordRequest, Records
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
+from keyss.methods.base import Frame
 from keyss.methods.carry.quantise import Codec
-from keyss.methods.carry.subsampling import most_visible_rows
 from keyss.methods.carry.table import Table
 
 NAME = "carry"
@@ -25,31 +29,39 @@ _COUNT = struct.Struct("<I")
 
 @dataclass(frozen=True)
 class CarriedSecret:
-    """A secret as it comes out."""
+    """A secret as it comes out; see `keyss.methods.base.Opened`."""
 
     gaussians: Gaussians  # those that are left, in the order of their carriers
     count: int  # how many were embedded
     bits: int  # of a record
+    frame: None = None
+    decode: None = None
 
-    def compensated(self) -> Gaussians:
-        """The Gaussians that are left, made to cover what all did."""
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """The Gaussians that are left make up for those that were lost with their carriers."""
+        if frame == "cover":
+            raise UsageError("a carried secret never lay in the cover's coordinates: leave out --frame cover")
         return compensate_pruning(self.gaussians, self.count)
 
     def fingerprint(self) -> str:
-        """16 hexadecimal digits by which a whole secret is recognised; they say nothing without it."""
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
 
 def record_request(count: int, sh_degree: int) -> RecordRequest:
     """What a model of `count` Gaussians asks of a channel."""
-    least_bytes = -(-Table.floor(sh_degree).total // 8)
-    return RecordRequest(count, least_bytes, _COUNT.size + Codec.packed_size(sh_degree))
+    header_bytes = _COUNT.size + Codec.packed_size(sh_degree)
+    return RecordRequest(count, Table.floor(sh_degree).record_bytes, header_bytes)
+
+
+def record_requests(models: Sequence[Gaussians]) -> list[RecordRequest]:
+    """What models ask of a channel together."""
+    return [record_request(len(model), model.sh_degree) for model in models]
 
 
 def check_degrees(channel: Channel, cover: Gaussians, secrets: Sequence[Gaussians]) -> None:
     """Raise UsageError if not even one Gaussian of these secrets fits into a Gaussian of the cover."""
     degree = max(secret.sh_degree for secret in secrets)
-    least, most = record_request(1, degree).least_bytes, channel.largest_record(cover.sh_degree)
+    least, most = Table.floor(degree).record_bytes, channel.largest_record(cover.sh_degree)
     if least > most:
         raise UsageError(
             f"a cover of SH degree {cover.sh_degree} cannot carry a secret of SH degree {degree}: one of its "
@@ -62,9 +74,7 @@ def encode(model: Gaussians, plan: RecordPlan) -> Records:
     """The records of a model, as precise as the plan has room for."""
     table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
     if table is None:
-        raise ValueError(
-            f"records of {plan.record_bytes} bytes are too small for SH degree {model.sh_degree}"
-        )
+        raise ValueError(f"{plan.record_bytes} bytes are too few for a record of SH degree {model.sh_degree}")
     codec = Codec.fit(model, table)
     header = _COUNT.pack(len(model)) + codec.pack()
     return Records(NAME, header, codec.encode(model), plan, most_visible_rows(model, plan.copies))
@@ -76,17 +86,15 @@ def decode(records: Records) -> CarriedSecret:
         raise InputError("the hidden parameters are damaged: they are too short")
     (count,) = _COUNT.unpack_from(records.header)
     codec = Codec.unpack(records.header[_COUNT.size :])
-    if records.records.shape[1] != codec.record_bytes:
-        raise InputError(
-            f"the hidden parameters are damaged: records of {records.records.shape[1]} bytes, "
-            f"expected {codec.record_bytes}"
-        )
+    expected, found = codec.table.record_bytes, records.records.shape[1]
+    if found != expected:
+        raise InputError(f"the hidden parameters are damaged: records of {found} bytes, expected {expected}")
     return CarriedSecret(codec.decode(records.records), count, codec.table.total)
 
 
 def encode_all(prepared: PreparedCover, models: Sequence[Gaussians]) -> list[Records]:
     """The records of all models, as they fit into one cover together. Raises UsageError if they do not."""
-    plans = prepared.plan_records([record_request(len(model), model.sh_degree) for model in models])
+    plans = prepared.plan_records(record_requests(models))
     return [encode(model, plan) for model, plan in zip(models, plans, strict=True)]
 
 
@@ -95,7 +103,7 @@ def subsampled_counts(prepared: PreparedCover, models: Sequence[Gaussians]) -> l
 
     Raises UsageError if nothing fits at all.
     """
-    left = prepared.record_capacity([record_request(len(model), model.sh_degree) for model in models])
+    left = prepared.record_capacity(record_requests(models))
     if left < len(models):
         raise UsageError(
             f"nothing fits into this cover: {prepared.carriers:,} of its {len(prepared.cover):,} Gaussians "
@@ -106,3 +114,23 @@ def subsampled_counts(prepared: PreparedCover, models: Sequence[Gaussians]) -> l
         counts[index] = min(len(models[index]), left // (len(models) - len(counts)))
         left -= counts[index]
     return [counts[index] for index in range(len(models))]
+
+
+def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
+    """The `count` Gaussians of `most_visible_rows`; all of them if there are no more."""
+    if count >= len(gaussians):
+        return gaussians
+    return gaussians[torch.from_numpy(most_visible_rows(gaussians, count))]
+
+
+def most_visible_rows(gaussians: Gaussians, count: int) -> npt.NDArray[np.int64]:
+    """[count] the Gaussians with the largest opacity times size, in their order.
+
+    Size is the square root of the cross-section, and no more than that of a typical large Gaussian: else a
+    few huge faint ones would stay before all detail.
+    """
+    size = gaussians.log_scales.sort(dim=1).values[:, 1:].mean(1)  # log, of the larger two axes
+    at_most = size.sort().values[int(0.9 * len(size))]
+    visibility = gaussians.opacities * size.clamp_max(at_most).exp()
+    rows: npt.NDArray[np.int64] = visibility.topk(count).indices.sort().values.numpy()
+    return rows

@@ -5,56 +5,28 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from keyss.channels.base import Content, PreparedCover, RecordRequest, Records
+from keyss.channels.base import Content, Records
 from keyss.channels.low_bits import LOW_BITS
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import (
-    Capabilities,
-    Context,
-    Frame,
-    KeyedSource,
-    SceneInput,
-    Source,
-    Stego,
-    advising,
-)
+from keyss.methods.base import Context, KeyedSource, SceneInput, Source, Stego, advising
 from keyss.methods.carry.carrying import (
     NAME,
     CarriedSecret,
     check_degrees,
     decode,
     encode_all,
-    record_request,
+    most_visible,
+    record_requests,
     subsampled_counts,
 )
 from keyss.methods.carry.dither import cost, dither
 from keyss.methods.carry.options import PRESETS, CarryOptions
-from keyss.methods.carry.subsampling import most_visible
 
 _PRUNE = "--prune-to-fit leaves out the least visible"
 _DITHER = "--dither gives it new low bits, at a price, and --method learned --sidecar needs none"
-
-
-@dataclass(frozen=True)
-class OpenedCarried:
-    """A carried secret as its key opens it; see `keyss.methods.base.Opened`."""
-
-    carried: CarriedSecret
-    frame: None = None
-    decode: None = None
-
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """Gaussians that were lost with their carriers, the others make up for."""
-        if frame == "cover":
-            raise UsageError("a carried secret never lay in the cover's coordinates: leave out --frame cover")
-        return self.carried.compensated()
-
-    def fingerprint(self) -> str:
-        return self.carried.fingerprint()
 
 
 class CarryMethod:
@@ -62,14 +34,8 @@ class CarryMethod:
 
     name = NAME
     summary = "carry models in the low bits of the cover's"
-    capabilities = Capabilities(
-        trains=False,
-        decoder=False,
-        standard_file=True,
-        most_secrets=256,
-        sidecar=False,
-        recommended_for="files that are passed on unchanged",
-    )
+    trains = False
+    most_secrets = 256
     options = CarryOptions
     presets: Mapping[str, CarryOptions] = PRESETS
 
@@ -84,7 +50,7 @@ class CarryMethod:
                 prepared = LOW_BITS.prepare(cover)
             if not options.prune_to_fit and len(secrets) == len(others):
                 with advising(UsageError, _PRUNE):
-                    prepared.plan_records([_request(model) for model in secrets])
+                    prepared.plan_records(record_requests(secrets))
         return options
 
     def hide(
@@ -100,7 +66,11 @@ class CarryMethod:
         carrier = dither(cover.model, os.urandom(32)) if options.dither else cover.model
         with advising(InputError, _DITHER):
             prepared = LOW_BITS.prepare(carrier)
-        details = _details(prepared, models)
+        details: dict[str, Any] = {
+            "carriers": prepared.carriers,
+            "capacity": prepared.record_capacity(record_requests(models)),
+            "gaussians_before_pruning": [len(model) for model in models],
+        }
         if options.prune_to_fit:
             counts = subsampled_counts(prepared, models)
             models = [most_visible(model, count) for model, count in zip(models, counts, strict=True)]
@@ -109,31 +79,19 @@ class CarryMethod:
         stego = prepared.embed(list(zip(keys, records, strict=True)))
         opened = [self.unpack(LOW_BITS.extract(stego, key)) for key in keys]
         seconds = time.monotonic() - start
-        if [len(each.carried.gaussians) for each in opened] != [len(model) for model in models]:
+        if [len(each.gaussians) for each in opened] != [len(model) for model in models]:
             raise RuntimeError("what was written does not open again as it should")
-        details["bits_per_gaussian"] = [each.carried.bits for each in opened]
+        details["bits_per_gaussian"] = [each.bits for each in opened]
         if options.dither:
             details["dither_psnr"] = round(cost(cover.model, carrier), 1)
         return Stego(stego, None, tuple(opened), seconds, details=details)
 
-    def unpack(self, content: Content) -> OpenedCarried:
+    def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""
         if not isinstance(content, Records):
-            raise InputError("what the key opens is damaged: expected records, got one payload")
-        return OpenedCarried(decode(content))
+            raise InputError("the hidden secret is damaged: expected records, got one payload")
+        return decode(content)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """None: without a key, low bits that carry something are as random as any."""
         return {}
-
-
-def _details(prepared: PreparedCover, models: Sequence[Gaussians]) -> dict[str, Any]:
-    return {
-        "carriers": prepared.carriers,
-        "capacity": prepared.record_capacity([_request(model) for model in models]),
-        "gaussians_before_pruning": [len(model) for model in models],
-    }
-
-
-def _request(model: Gaussians) -> RecordRequest:
-    return record_request(len(model), model.sh_degree)

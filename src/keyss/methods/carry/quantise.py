@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +31,12 @@ Codes = npt.NDArray[np.uint32]
 Bytes = npt.NDArray[np.uint8]
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
-_LARGEST_QUAT = 0.5**0.5
 _FURTHEST = 1e30  # no value that a line may give is larger
 _CHUNK = 1 << 14  # Gaussians at a time when packing: every bit takes a byte meanwhile
 _LEAST_SPREAD = 1e-30
 _SAMPLE = 20_000  # values that a line is fitted to
 _LINE = struct.Struct("<3f")
-_TABLE_BYTES = len(astuple(Table.floor(0)))
+_TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
 # The line with the least square error makes numbers smaller on average, which costs more against photos than
 # errors that are independent of the numbers: this part of the error counts so much more.
 _SHRINKING_WEIGHT = 20.0
@@ -73,6 +72,9 @@ class Line:
         return offset + self.centre
 
 
+_QUAT_LINE = Line(0, 0, 0.5**0.5)
+
+
 @dataclass(frozen=True)
 class Codec:
     """How the Gaussians of one secret are written: a table of bits, and a line for each kind of number."""
@@ -87,37 +89,26 @@ class Codec:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
         means = [_asinh_line(_doubles(gaussians.means[:, axis])) for axis in range(3)]
         flat = [_even_line(_doubles(gaussians.log_scales)), _even_line(_logits(gaussians))]
-        colours = [
-            _best_line(values, bits, centred=band > 0)
-            for band in range(table.sh_degree + 1)
-            for values, bits in _colours(gaussians, table, band)
-        ]
+        colours = [_best_line(*each) for each in _colours(gaussians, table)]
         return Codec(table, (*means, *flat, *colours))
-
-    @property
-    def record_bytes(self) -> int:
-        """Whole bytes of a record."""
-        return -(-self.table.total // 8)
 
     def encode(self, gaussians: Gaussians) -> Bytes:
         """[N, record_bytes] the records of N Gaussians; the bits left over are zero."""
-        records = np.empty((len(gaussians), self.record_bytes), np.uint8)
+        records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
         for start in range(0, len(gaussians), _CHUNK):
-            part = self._codes(gaussians[start : start + _CHUNK])
-            records[start : start + _CHUNK] = _packed(part)
+            part = slice(start, start + _CHUNK)
+            records[part] = _packed(self._codes(gaussians[part]))
         return records
 
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes]: finite float32, whatever bytes they are."""
-        parts = [
-            self._values(records[start : start + _CHUNK]) for start in range(0, max(len(records), 1), _CHUNK)
-        ]
-        return Gaussians.cat(parts)
+        starts = range(0, max(len(records), 1), _CHUNK)
+        return Gaussians.cat([self._values(records[start : start + _CHUNK]) for start in starts])
 
     def pack(self) -> bytes:
         """The codec itself: 92 to 164 bytes."""
         numbers = b"".join(_LINE.pack(line.centre, line.spread, line.reach) for line in self.lines)
-        return bytes(astuple(self.table)) + numbers
+        return bytes(self.table.bits).ljust(_TABLE_BYTES, b"\0") + numbers
 
     @staticmethod
     def packed_size(sh_degree: int) -> int:
@@ -125,15 +116,10 @@ class Codec:
         return _TABLE_BYTES + _LINE.size * (7 + 2 * sh_degree)
 
     @staticmethod
-    def size_from(data: bytes) -> int:
-        """Bytes of the packed codec that `data` begins with. Raises InputError if it is none."""
-        return Codec.packed_size(_unpack_table(data).sh_degree)
-
-    @staticmethod
     def unpack(data: bytes) -> Codec:
         """The codec of `pack`; what follows it is ignored. Raises InputError for anything else."""
-        table = _unpack_table(data)
         try:
+            table = Table(tuple(data[:_TABLE_BYTES].rstrip(b"\0")))
             numbers = data[_TABLE_BYTES : Codec.packed_size(table.sh_degree)]
             lines = tuple(Line(*values) for values in _LINE.iter_unpack(numbers))
         except (ValueError, struct.error) as error:
@@ -144,56 +130,42 @@ class Codec:
 
     def _codes(self, gaussians: Gaussians) -> Iterator[tuple[Codes, int]]:
         """Columns of codes and the bits of each."""
-        table, lines = self.table, iter(self.lines)
+        lines, (means, log_scales, quats, opacity, *_) = iter(self.lines), self.table.bits
         for axis in range(3):
-            yield next(lines).encode(_doubles(gaussians.means[:, axis : axis + 1]), table.means), table.means
-        yield next(lines).encode(_doubles(gaussians.log_scales), table.log_scales), table.log_scales
-        yield next(lines).encode(_logits(gaussians)[:, None], table.opacity), table.opacity
+            yield next(lines).encode(_doubles(gaussians.means[:, axis : axis + 1]), means), means
+        yield next(lines).encode(_doubles(gaussians.log_scales), log_scales), log_scales
+        yield next(lines).encode(_logits(gaussians)[:, None], opacity), opacity
         left_out, three = _three_smallest(_doubles(gaussians.quats))
         yield left_out, 2
-        yield Line(0, 0, _LARGEST_QUAT).encode(three, table.quats), table.quats
-        for band in range(table.sh_degree + 1):
-            for values, bits in _colours(gaussians, table, band):
-                yield next(lines).encode(values.reshape(len(values), -1), bits), bits
+        yield _QUAT_LINE.encode(three, quats), quats
+        for values, bits, _ in _colours(gaussians, self.table):
+            yield next(lines).encode(values.reshape(len(values), -1), bits), bits
 
     def _values(self, records: Bytes) -> Gaussians:
-        table, lines, read = self.table, iter(self.lines), _Unpacker(records)
-        means = np.concatenate([next(lines).decode(read(1, table.means), table.means) for _ in range(3)], 1)
-        log_scales = next(lines).decode(read(3, table.log_scales), table.log_scales)
-        logits = next(lines).decode(read(1, table.opacity), table.opacity)[:, 0]
-        left_out = read(1, 2)
-        quats = _whole_quats(left_out, Line(0, 0, _LARGEST_QUAT).decode(read(3, table.quats), table.quats))
+        lines, (means, log_scales, quats, opacity, *colours) = iter(self.lines), self.table.bits
+        unread = np.unpackbits(records, axis=1)
+
+        def codes(columns: int, bits: int) -> Codes:
+            """[N, columns] the next codes, in the order in which they were packed."""
+            nonlocal unread
+            part, unread = np.split(unread, [columns * bits], axis=1)
+            powers = np.uint32(1) << np.arange(bits, dtype=np.uint32)[::-1]
+            return part.reshape(-1, columns, bits) @ powers
+
+        def values(columns: int, bits: int) -> Floats:
+            return next(lines).decode(codes(columns, bits), bits)
+
+        positions = np.concatenate([values(1, means) for _ in range(3)], axis=1)
+        sizes, logits = values(3, log_scales), values(1, opacity)[:, 0]
+        left_out = codes(1, 2)
+        turns = _whole_quats(left_out, _QUAT_LINE.decode(codes(3, quats), quats))
         harmonics = []
-        for count, bits in zip((1, *BANDS), (table.dc, *table.bands), strict=False):
-            brightness = next(lines).decode(read(count, bits), bits)[:, :, None]
-            bits -= CHROMA_FEWER
-            differences = next(lines).decode(read(2 * count, bits), bits).reshape(-1, count, 2)
+        for count, bits in zip(BANDS, colours, strict=False):
+            brightness = values(count, bits)[:, :, None]
+            differences = values(2 * count, bits - CHROMA_FEWER).reshape(-1, count, 2)
             harmonics.append(np.concatenate([brightness, differences], axis=2) @ OPPONENT)
         sh = np.concatenate(harmonics, axis=1)
-        return Gaussians(*(torch.from_numpy(v).float() for v in (means, quats, log_scales, logits, sh)))
-
-
-class _Unpacker:
-    """Reads columns of codes from records, in the order in which they were packed."""
-
-    def __init__(self, records: Bytes) -> None:
-        self._bits = np.unpackbits(records, axis=1)
-        self._next = 0
-
-    def __call__(self, columns: int, bits: int) -> Codes:
-        part = self._bits[:, self._next : self._next + columns * bits].reshape(-1, columns, bits)
-        self._next += columns * bits
-        codes = np.zeros(part.shape[:2], np.uint32)
-        for bit in range(bits):
-            codes = codes << np.uint32(1) | part[:, :, bit]
-        return codes
-
-
-def _unpack_table(data: bytes) -> Table:
-    try:
-        return Table(*data[:_TABLE_BYTES])
-    except (ValueError, TypeError) as error:
-        raise InputError(f"the hidden parameters are damaged: {error}") from error
+        return Gaussians(*(torch.from_numpy(v).float() for v in (positions, turns, sizes, logits, sh)))
 
 
 def _packed(columns: Iterator[tuple[Codes, int]]) -> Bytes:
@@ -238,7 +210,7 @@ def _asinh_line(values: Floats) -> Line:
     return _line(centre, spread, float(np.arcsinh(np.abs(values - centre).max() / spread)))
 
 
-def _best_line(values: Floats, bits: int, *, centred: bool = False) -> Line:
+def _best_line(values: Floats, bits: int, centred: bool) -> Line:
     """Of some lines that reach to the furthest value or less far the one with the least error."""
     flat = values.ravel()
     centre = 0.0 if centred else float(np.median(flat))
@@ -264,12 +236,12 @@ def _line(centre: float, spread: float, reach: float) -> Line:
     return Line(*_LINE.unpack(_LINE.pack(centre, spread, reach)))
 
 
-def _colours(gaussians: Gaussians, table: Table, band: int) -> Iterator[tuple[Floats, int]]:
-    """A band's brightness [N, count] and differences [N, count, 2], with the bits of each."""
-    bits = (table.dc, *table.bands)[band]
-    rotated = _doubles(gaussians.sh[:, band**2 : (band + 1) ** 2]) @ OPPONENT.T
-    yield rotated[:, :, 0], bits
-    yield rotated[:, :, 1:], bits - CHROMA_FEWER
+def _colours(gaussians: Gaussians, table: Table) -> Iterator[tuple[Floats, int, bool]]:
+    """Each band's brightness [N, count] and differences [N, count, 2]; bits; whether zero is the centre."""
+    for band, bits in enumerate(table.bits[4:]):
+        rotated = _doubles(gaussians.sh[:, band**2 : (band + 1) ** 2]) @ OPPONENT.T
+        yield rotated[:, :, 0], bits, band > 0
+        yield rotated[:, :, 1:], bits - CHROMA_FEWER, band > 0
 
 
 def _doubles(values: torch.Tensor) -> Floats:

@@ -15,19 +15,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, get_args
 
 import torch
 import torch.nn.functional as F
 from msgspec import Meta
 from torch import Tensor, nn
 
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import EMBEDDING_SIZE
-from keyss.methods.learned.mask import Mask
 from keyss.methods.learned.opacity_band import OpacityBand
 
+Attribute = Literal["op", "ro", "sc", "xyz", "sh"]  # opacity, rotation, scale, position, colour
+Mask = tuple[Attribute, ...]  # the paper's theta: which attributes the decoder updates
+ATTRIBUTES: Mask = get_args(Attribute)
+FIELDS = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}
 CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
 # Units of a residual, so that all branches learn at like speed: logits, quaternion components, natural
 # logarithms of scale, scene extents, SH coefficients.
@@ -39,6 +43,17 @@ GATE_SHUT, GATE_OPEN = 0.7, 0.9
 KNOTS = 6
 
 Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
+
+
+def parse_mask(text: str) -> Mask:
+    """The attributes in a text like `op,ro,sc`, in canonical order. Raises UsageError for unknown or none."""
+    names = {name.strip() for name in text.split(",") if name.strip()}
+    unknown = sorted(names - set(ATTRIBUTES))
+    if unknown or not names:
+        raise UsageError(
+            f"mask {text!r}: expected some of {','.join(ATTRIBUTES)}, got {','.join(unknown) or 'none'}"
+        )
+    return tuple(name for name in ATTRIBUTES if name in names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,16 +259,9 @@ def _normalised(gaussians: Gaussians, whole: Gaussians) -> Tensor:
 
 def add_residuals(gaussians: Gaussians, residuals: Mapping[str, Tensor], extent: Tensor) -> Gaussians:
     """attribute* = attribute + residual (KeySS, eq. 9), on raw attributes; positions in units of `extent`."""
-    means, quats, log_scales = gaussians.means, gaussians.quats, gaussians.log_scales
-    opacity_logits, sh = gaussians.opacity_logits, gaussians.sh
-    if "op" in residuals:
-        opacity_logits = opacity_logits + residuals["op"][:, 0]
-    if "ro" in residuals:
-        quats = quats + residuals["ro"]
-    if "sc" in residuals:
-        log_scales = log_scales + residuals["sc"]
-    if "xyz" in residuals:
-        means = means + residuals["xyz"] * extent
-    if "sh" in residuals:
-        sh = sh + residuals["sh"].view_as(sh)
-    return Gaussians(means, quats, log_scales, opacity_logits, sh)
+    changed = {}
+    for attribute, residual in residuals.items():
+        before: Tensor = getattr(gaussians, FIELDS[attribute])
+        step = residual * extent if attribute == "xyz" else residual
+        changed[FIELDS[attribute]] = before + step.view_as(before)
+    return replace(gaussians, **changed)

@@ -16,9 +16,9 @@ from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
-from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits
-from keyss.methods.learned.options import LearnedOptions, chosen_scenes
+from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
 from keyss.methods.learned.start import make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
 from keyss.methods.learned.visibility import possibly_seen
@@ -81,11 +81,10 @@ class JointRun:
         for decoder, remap in zip(self.decoders, start.remaps or (), strict=False):
             decoder.set_remap(*remap)
         self._all_decoders = torch.nn.ModuleList(self.decoders)
-        weights = list(self._all_decoders.parameters())  # none for curves
-        self.decoder_optimizer = (
-            torch.optim.AdamW(weights, lr=config.decoder_rate, weight_decay=config.weight_decay)
-            if weights
-            else None
+        # Opacity remaps have no weights, and an optimizer takes no empty list.
+        weights = list(self._all_decoders.parameters()) or [torch.nn.Parameter(torch.zeros(0))]
+        self.decoder_optimizer = torch.optim.AdamW(
+            weights, lr=config.decoder_rate, weight_decay=config.weight_decay
         )
 
     def __len__(self) -> int:
@@ -122,9 +121,8 @@ class JointRun:
         total.backward()
         self._set_rates()
         for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
-            if optimizer is not None:
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
         if self.warm:
             with torch.no_grad():
                 self.parameters["opacities"].clamp_(*self.logit_limits)
@@ -164,9 +162,8 @@ class JointRun:
         for name, optimizer in self.optimizers.items():
             decay = 0.01**progress if name == "means" else late
             optimizer.param_groups[0]["lr"] = self.rates[name] * decay
-        if self.decoder_optimizer is not None:
-            warm_up = min(1.0, self.iteration / 100)
-            self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress
+        warm_up = min(1.0, self.iteration / 100)
+        self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress
 
     @torch.no_grad()
     def _largest_opacity(self) -> Tensor:
@@ -201,8 +198,7 @@ class JointRun:
     def state(self) -> tuple[State, dict[str, Any]]:
         tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
         tensors |= {f"decoders.{name}": value for name, value in self._all_decoders.state_dict().items()}
-        adam = self.decoder_optimizer.state_dict()["state"] if self.decoder_optimizer is not None else {}
-        for index, moments in adam.items():
+        for index, moments in self.decoder_optimizer.state_dict()["state"].items():
             tensors |= {f"decoder_adam.{index}.{name}": value for name, value in moments.items()}
         tensors |= {"owners": self.owner_order.state(), "generator": self.generator.get_state()}
         tensors |= {f"order.{i}": shuffle.state() for i, shuffle in enumerate(self.shuffles)}
@@ -215,33 +211,17 @@ class JointRun:
         self._all_decoders.load_state_dict(
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         )
-        if self.decoder_optimizer is not None:
-            adam = self.decoder_optimizer.state_dict()
-            for name, value in tensors.items():
-                if name.startswith("decoder_adam."):
-                    _, index, key = name.split(".")
-                    adam["state"].setdefault(int(index), {})[key] = value
-            self.decoder_optimizer.load_state_dict(adam)
+        adam = self.decoder_optimizer.state_dict()
+        for name, value in tensors.items():
+            if name.startswith("decoder_adam."):
+                _, index, key = name.split(".")
+                adam["state"].setdefault(int(index), {})[key] = value
+        self.decoder_optimizer.load_state_dict(adam)
         self.owner_order.load(tensors["owners"])
         for i, shuffle in enumerate(self.shuffles):
             shuffle.load(tensors[f"order.{i}"])
         self.generator.set_state(tensors["generator"])
         self.iteration = int(meta["iteration"])
-
-
-def decoder_shape(config: LearnedOptions) -> DecoderShape:
-    """The sizes of the decoder that `config` asks for."""
-    return DecoderShape(
-        mask=config.mask,
-        kind=config.decoder,
-        hidden=config.hidden,
-        branch=config.branch,
-        frequencies=config.frequencies,
-        sh_degree=config.fit.sh_degree,
-        design=config.design,
-        residuals=config.residuals,
-        conditioning=config.conditioning,
-    )
 
 
 def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:

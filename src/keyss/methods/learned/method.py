@@ -1,40 +1,58 @@
 """The learned method: one model trained to show the cover, and through a keyed decoder the secrets.
 
-*Key-Secured 3D Secrets within 3D Gaussian Splatting* (KeySS), with the corrections in `docs/method.md`.
+*Key-Secured 3D Secrets within 3D Gaussian Splatting* (KeySS), with the corrections in `docs/method.md`: one
+frame for all scenes, joint training, encryption.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
 
 from keyss.channels.base import Content, Payload
-from keyss.core.errors import InputError
-from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Capabilities, Context, KeyedSource, Opened, SceneInput, Source, Stego
-from keyss.methods.learned.options import PRESETS, LearnedOptions
+from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.low_bits.spread import check_payload_fits
+from keyss.channels.sidecar import encrypt_sidecar
+from keyss.core.alignment import align
+from keyss.core.errors import InputError, KeyssError, UsageError
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.scene import Scene
+from keyss.core.similarity import Similarity
+from keyss.fitting.loop import train
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES
+from keyss.methods.base import Context, KeyedSource, Opened, SceneInput, Source, Stego, advising
+from keyss.methods.learned.attacks import known_remaps
+from keyss.methods.learned.clip_keys import MODEL, ClipKeys
+from keyss.methods.learned.decoder import Decoder
+from keyss.methods.learned.joint import JointRun
+from keyss.methods.learned.options import PRESETS, LearnedOptions, decoder_shape, sized, training_options
+from keyss.methods.learned.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
+from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift, match_quaternion_lengths
+from keyss.methods.learned.targets import PlacedScene
+
+NAME = "learned"
+SIDECAR_ADVICE = "--sidecar writes a file beside it instead"
 
 
 class LearnedMethod:
     """See `keyss.methods.base.Method`."""
 
-    name = "learned"
+    name = NAME
     summary = "train one model that shows both"
-    capabilities = Capabilities(
-        trains=True,
-        decoder=True,
-        standard_file=True,
-        most_secrets=9,
-        sidecar=True,
-        recommended_for="files that will be converted, and nobody attacks (with --sidecar)",
-    )
+    trains = True
+    most_secrets = 9
     options = LearnedOptions
     presets: Mapping[str, LearnedOptions] = PRESETS
 
     def prepare(self, inputs: Sequence[SceneInput], options: LearnedOptions) -> LearnedOptions:
         """Sized for models where they are all there is; refuses models too small for their low bits."""
-        from keyss.methods.learned.pipeline import check_room, encoder_of
-        from keyss.methods.learned.sizing import sized
-
         options = sized(options, inputs)
         encoder_of(options)  # says what is missing
         if not options.sidecar:
@@ -44,22 +62,134 @@ class LearnedMethod:
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context
     ) -> Stego:
-        """See `keyss.methods.learned.pipeline`."""
-        from keyss.methods.learned.pipeline import hide
+        """Raises UsageError for a model too small for what it has to carry, Interrupted on Ctrl-C, and
+        InputError for a checkpoint of another run.
+        """
+        options = training_options(options)
+        sources, keys = [cover, *(each.source for each in secrets)], [each.key for each in secrets]
+        models = [source.model.with_sh_degree(options.fit.sh_degree) for source in sources]
+        scenes = [source.scene for source in sources]
+        derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.seed))
+        derived = [DerivedKey(key, derivation) for key in keys]
+        encoder = encoder_of(options)
+        embeddings = (
+            [key.embedding() for key in derived] if encoder is None else [encoder(key) for key in keys]
+        )
 
-        return hide(cover, secrets, options, context)
+        cover_cameras = [view.camera for view in scenes[0].train]
+        frames = [Similarity.identity()]
+        frames += [align([view.camera for view in scene.train], cover_cameras) for scene in scenes[1:]]
+        placed = [PlacedScene.of(*parts) for parts in zip(scenes, models, frames, strict=True)]
+        run = JointRun(placed, embeddings, options, context.device)
+        seconds = train(
+            run,
+            "hide",
+            fingerprint={
+                "scenes": [scene.digest() for scene in scenes],
+                "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
+                "keys": [
+                    hashlib.sha256(key.verifier() + embedding.numpy().tobytes()).hexdigest()
+                    for key, embedding in zip(derived, embeddings, strict=True)
+                ],
+                "options": json.loads(json.dumps(asdict(options))),  # tuples as they are read back
+                "device": context.device.type,
+            },
+            seed=options.fit.seed,
+            checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,
+            resume=context.resume,
+            checkpoint_seconds=options.fit.checkpoint_seconds,
+            evaluate_every=options.fit.evaluate_every,
+            reporter=context.reporter,
+        )
+        stego = run.gaussians().to("cpu")
+        decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
+        if run.warm:
+            stego = stego[run.drawn().cpu()]
+        rank_shifts: list[RankShift | None] = [None] * len(keys)
+        # A sidecar is for files that will be rounded, and no keyed rank shift survives rounding.
+        if run.warm and not options.sidecar:
+            for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
+                if options.decoder == "remap":  # a network would see the difference
+                    stego = match_quaternion_lengths(stego, decoder.band.outer)
+                shift = RankShift.of(stego, key.expand("rank-shift", KEY_BYTES), decoder.band.outer)
+                stego, rank_shifts[index] = shift.encrypt(stego), shift
+        anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.seed))
+        transparent = stego[stego.opacities < DRAWN_OPACITY]
+        faint = None
+        if options.sidecar and len(transparent):
+            columns = [transparent.means, transparent.opacity_logits[:, None], transparent.sh[:, 0]]
+            faint = torch.cat(columns, dim=1)
+        packed = []
+        for decoder, frame, rank_shift in zip(decoders, frames[1:], rank_shifts, strict=True):
+            secret = HiddenSecret(decoder, frame, anchors, rank_shift, faint)
+            drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
+            packed.append(pack_secret(replace(secret, count=int(drawn.sum()))))
+        payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
+        sidecar, entropy = None, _discarded(run, derived)
+        if options.sidecar:
+            sidecar = encrypt_sidecar(payloads, entropy=entropy)
+        else:
+            with advising(KeyssError, SIDECAR_ADVICE):
+                stego = LOW_BITS.prepare(stego).embed(payloads, entropy=entropy)
+        return Stego(stego, sidecar, tuple(map(unpack_secret, packed)), seconds, options.fit.iterations)
 
     def unpack(self, content: Content) -> Opened:
         """A decoder, and where the secret lies. Raises InputError for damage."""
-        from keyss.methods.learned.payload import unpack_secret
-        from keyss.methods.learned.revealing import OpenedSecret
-
         if not isinstance(content, Payload):
-            raise InputError("what the key opens is damaged: expected one payload, got records")
-        return OpenedSecret(unpack_secret(content.data))
+            raise InputError("the hidden secret is damaged: expected one payload, got records")
+        return unpack_secret(content.data)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """The opacity remaps of a warm start are in the source; nothing else is known without a key."""
-        from keyss.methods.learned.attacks import known_remaps
-
         return known_remaps(stego, secrets)
+
+
+def encoder_of(options: LearnedOptions) -> Callable[[str], Tensor] | None:
+    """From a key to the embedding [64] that conditions its decoder; None: Argon2id's. Raises BackendError."""
+    if options.key_encoder == "argon2":
+        return None
+    return _clip(options.clip_model or MODEL)
+
+
+_clip = lru_cache(maxsize=1)(ClipKeys)  # preparing and hiding use the same one
+
+
+def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:
+    """Raise UsageError if the payloads will hardly fit into the model that is to be trained.
+
+    `models`: of the cover and of the secrets, those that are known. A warm start from them adds no Gaussians.
+    """
+    options = training_options(options)
+    gaussians, known = options.fit.max_gaussians, [model for model in models if model is not None]
+    if options.start == "warm" and len(known) == len(models):
+        gaussians = min(gaussians, sum(len(model) for model in known))
+    with advising(UsageError, SIDECAR_ADVICE):
+        check_payload_fits(_largest_payload(options), gaussians, len(models) - 1, options.fit.sh_degree)
+
+
+def _largest_payload(options: LearnedOptions) -> int:
+    """Bytes of a secret whose decoder cannot be compressed."""
+    decoder = Decoder(decoder_shape(options))
+    rank_shift = None
+    if options.start == "warm":
+        tables = torch.rand(2, CHANNELS, KNOTS)
+        rank_shift = RankShift(bytes(KEY_BYTES), (0.0, 1.0), tables[0], tables[1])
+    secret = HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3), rank_shift)
+    return len(pack_secret(secret))
+
+
+def _discarded(run: JointRun, keys: Sequence[DerivedKey]) -> bytes:
+    """32 bytes that only who trained with these keys can know: the optimiser's state is thrown away."""
+    tensors, _ = run.state()
+    state = hashlib.sha256(b"keyss/v1/discarded" + b"".join(key.expand("writer", 32) for key in keys))
+    for name in sorted(tensors):
+        state.update(tensors[name].cpu().contiguous().numpy().tobytes())
+    return state.digest()
+
+
+def training_salt(cover: Scene, seed: int) -> bytes:
+    """A salt that is the same when a run is repeated and differs between covers and between seeds.
+
+    A salt must be unique rather than secret; taking it from public things makes runs repeatable.
+    """
+    return hashlib.sha256(f"keyss/v1/salt {seed} {cover.digest()}".encode()).digest()[:SALT_BYTES]

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Self
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import CommandLineOption, MethodOptions
-from keyss.methods.learned.mask import Mask, parse_mask
+from keyss.methods.base import CommandLineOption, MethodOptions, SceneInput
+from keyss.methods.learned.decoder import DecoderShape, Mask, parse_mask
+
+# Of the joint training where only models are given: iterations at most, factor on the rates.
+MODEL_ITERATIONS, MODEL_RATE = 400, 0.1
 
 Scenes = Literal["both", "cover", "secret"]  # "both": all, however many secrets there are
 
@@ -17,8 +21,7 @@ Scenes = Literal["both", "cover", "secret"]  # "both": all, however many secrets
 class LearnedOptions(MethodOptions):
     """The joint training of the published model and the decoder (KeySS, section 3.4); `fit` has its rates."""
 
-    # Of the joint training: those of `fit` by default, and where only models are given, what suits them
-    # (`keyss.methods.learned.sizing`).
+    # Of the joint training: those of `fit` by default, and where only models are given, what suits them.
     iterations: int | None = None
     max_gaussians: int | None = None
 
@@ -107,6 +110,40 @@ class LearnedOptions(MethodOptions):
         """The same with changed fields of `fit`; size and length are those of the joint training too."""
         own = {name: changes[name] for name in ("iterations", "max_gaussians") if name in changes}
         return replace(super().with_fit(**changes), **own)
+
+
+def sized(options: LearnedOptions, inputs: Sequence[SceneInput]) -> LearnedOptions:
+    """`options` for the cover and secrets of `inputs`; unchanged where one of them has photos.
+
+    Where models are all there is, the published model holds the Gaussians of all of them unless
+    `options.max_gaussians` says otherwise. If nothing has to be left out the start is right already: the
+    training is short and gentle, for large steps would only do harm.
+    """
+    models = [each.model for each in inputs if each.model is not None and not each.photos]
+    total = sum(len(model) for model in models)
+    if len(models) < len(inputs) or (options.max_gaussians or total) < total:
+        return options
+    fit = replace(
+        options.fit,
+        iterations=options.iterations or min(options.fit.iterations, MODEL_ITERATIONS),
+        max_gaussians=options.max_gaussians or max(16, total),
+        # Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are.
+        sh_degree=max(1, *(model.sh_degree for model in models)),
+    )
+    return replace(options, fit=fit, warm_rate=MODEL_RATE * options.warm_rate)
+
+
+def training_options(options: LearnedOptions) -> LearnedOptions:
+    """`options` whose `fit` is that of the joint training."""
+    iterations = options.iterations or options.fit.iterations
+    cap = options.max_gaussians or options.fit.max_gaussians
+    return replace(options, fit=replace(options.fit, iterations=iterations, max_gaussians=cap))
+
+
+def decoder_shape(options: LearnedOptions) -> DecoderShape:
+    """Kind and sizes of the decoder; most have the same names."""
+    shape = {name: getattr(options, name) for name in vars(DecoderShape()) if hasattr(options, name)}
+    return DecoderShape(kind=options.decoder, sh_degree=options.fit.sh_degree, **shape)
 
 
 def chosen_scenes(which: Scenes, count: int) -> list[int]:

@@ -1,15 +1,17 @@
-"""A secret as bytes: the payload that is encrypted under its key. safetensors, nothing executable.
+"""A secret of the learned method: what it reveals of a stego model, and its bytes, the payload.
 
-It holds the decoder (a network's weights in half precision, all constants whole) with the embedding that
-it belongs to, the similarity that leads back to the secret's own frame, and *anchors*: positions of some
-Gaussians of the stego model. They are there in any order and, mostly, after pruning, and tell whether a
-sidecar belongs to a model. A secret's bytes say nothing of other secrets. docs/format.md lists them.
+The payload is safetensors, nothing executable. It holds the decoder (a network's weights in half precision,
+all constants whole) with the embedding that it belongs to, the similarity that leads back to the secret's own
+frame, and *anchors*: positions of some Gaussians of the stego model. They are there in any order and, mostly,
+after pruning, and tell whether a sidecar belongs to a model. A secret's bytes say nothing of other secrets.
+docs/format.md lists them.
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -22,30 +24,32 @@ from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.mask import parse_mask
+from keyss.methods.base import Frame
+from keyss.methods.learned.decoder import Decoder, DecoderShape, parse_mask
 from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift
 
-FORMAT: Literal["keyss-secret"] = "keyss-secret"
-VERSION: Literal[4] = 4
+FORMAT, VERSION = "keyss-secret", 4
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
+_ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
 _WEIGHTS = "decoder."
 # What reading a damaged header or damaged weights can raise.
-_DAMAGE = (
-    safetensors.SafetensorError,
-    msgspec.MsgspecError,
-    KeyError,
-    TypeError,
-    ValueError,
-    RuntimeError,
-    RecursionError,
-    UsageError,
-)
+_LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
+_DAMAGE = (*_LIBRARY_ERRORS, KeyError, TypeError, ValueError, RuntimeError, UsageError)
 
 _Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A `Similarity`."""
+
+    scale: float
+    rotation: tuple[_Three, _Three, _Three]
+    translation: _Three
 
 
 @dataclass(frozen=True)
@@ -57,20 +61,9 @@ class _Version:
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """A similarity."""
-
-    scale: float
-    rotation: tuple[_Three, _Three, _Three]
-    translation: _Three
-
-
-@dataclass(frozen=True)
-class _Header:
+class _Header(_Version):
     """The JSON beside the tensors; msgspec holds it to these types and bounds."""
 
-    format: Literal["keyss-secret"]
-    version: Literal[4]
     shape: DecoderShape
     frame: _Frame
     count: Annotated[int, Meta(ge=0, le=2**31)]
@@ -78,7 +71,7 @@ class _Header:
 
 @dataclass(frozen=True)
 class HiddenSecret:
-    """All that revealing one secret needs besides the stego model."""
+    """All that revealing one secret needs besides the stego model; see `keyss.methods.base.Opened`."""
 
     decoder: Decoder
     frame: Similarity  # from the secret's own frame into the cover's
@@ -88,6 +81,36 @@ class HiddenSecret:
     # opacities to nothing, and some drop the colours of what is transparent.
     faint: Tensor | None = None
     count: int = 0  # Gaussians that the secret has when it is revealed from a whole file; 0: not known
+
+    @torch.no_grad()
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """A model that needs no decoder and no cover, without what is never drawn; see `Opened.reveal`.
+
+        Where opacities were rounded to nothing, they are taken from the sidecar. If Gaussians were lost, the
+        others make up for them.
+        """
+        if not force:
+            self.check_belongs_to(stego)
+        if (force or self.faint is not None) and _is_rounded(stego):
+            stego = self.with_faint(stego)
+        decoded = self.decode(stego, self.embedding)
+        if (drawn := decoded.opacities >= DRAWN_OPACITY).any():
+            decoded = decoded[drawn]
+        decoded = compensate_pruning(decoded, self.count).to("cpu")
+        return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
+
+    def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
+        """What the decoder makes of `stego` for an embedding [64]; see `Opened.decode`."""
+        decoder = self.decoder.to(stego.device)
+        if self.rank_shift is not None:
+            stego = self.rank_shift.decrypt(stego)
+        decoded: Gaussians = decoder(
+            stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device)
+        )
+        return decoded
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(pack_secret(self)).hexdigest()[:16]
 
     def with_faint(self, stego: Gaussians) -> Gaussians:
         """`stego` with transparent Gaussians as the nearest in `faint` are, or all nearly opaque."""
@@ -119,6 +142,12 @@ class HiddenSecret:
                 f"at least {ANCHORS_NEEDED:.0%} expected "
                 "(quantising the positions does that too: --force tries all the same)"
             )
+
+
+def _is_rounded(stego: Gaussians) -> bool:
+    """Whether the opacities of transparent Gaussians are so few that a format must have rounded them."""
+    logits = stego.opacity_logits[stego.opacities < DRAWN_OPACITY]
+    return len(logits.unique()) < _ROUNDED_SHARE * len(logits)
 
 
 def choose_anchors(stego: Gaussians, generator: torch.Generator) -> Tensor:
@@ -165,7 +194,7 @@ def unpack_secret(data: bytes) -> HiddenSecret:
         return _from_parts(_read_header(data), tensors)
     except _DAMAGE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"what the key decrypts is no secret of keyss, or damaged: {reason}") from error
+        raise InputError(f"the payload is no secret of keyss, or damaged: {reason}") from error
 
 
 def _read_header(data: bytes) -> _Header:
@@ -175,12 +204,12 @@ def _read_header(data: bytes) -> _Header:
     text = msgspec.json.decode(outer["__metadata__"], type=dict[str, str])["keyss"].encode()
     found = msgspec.json.decode(text, type=_Version)
     if found.format != FORMAT:
-        raise InputError("what the key decrypts is no secret of keyss")
+        raise InputError("the payload is no secret of keyss")
     if found.version != VERSION:
         raise InputError(f"secret of version {found.version}; this program reads version {VERSION}")
     header = msgspec.json.decode(text, type=_Header)
     if msgspec.json.encode(header) != text or parse_mask(",".join(header.shape.mask)) != header.shape.mask:
-        raise InputError("what the key decrypts is no secret of keyss: its header has more or other fields")
+        raise InputError("the payload is no secret of keyss: its header has more or other fields")
     return header
 
 
@@ -201,7 +230,7 @@ def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
     decoder = Decoder(header.shape)
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
     if not (decoder.knots.diff() > 0).all():
-        raise InputError("opacity curve: expected ascending knots")
+        raise InputError("opacity remap: expected ascending knots")
     frame = Similarity(
         header.frame.scale,
         torch.tensor(header.frame.rotation, dtype=torch.float64),
