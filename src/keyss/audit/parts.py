@@ -20,7 +20,8 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_controls
 from keyss.measure.histograms import histograms
 from keyss.measure.images import compare_images, renders_of
-from keyss.measure.leaks import AttackResult, decoder_attack, look_for_secret, source_attack, with_the_key
+from keyss.measure.leaks.attacks import decoder_attack, file_attacks, source_attack, with_the_key
+from keyss.measure.leaks.looking import AttackResult, look_for_secret
 from keyss.measure.robustness import breakdown_points
 from keyss.measure.robustness import robustness as measure_robustness
 from keyss.measure.roc import stegexpose_roc
@@ -128,17 +129,17 @@ def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
     found: list[tuple[AttackResult, ...]] = []
     pictures: dict[str, Tensor] = {}
     tried = max(SECRETS_TRIED, len(subject.secrets))
+    attacks = file_attacks(subject.cover, seed=seed)
+    attacks.append(source_attack(lambda model: _views_by_source(model, tried)))
     for index, (secret, frame, opened) in enumerate(
         zip(subject.secrets, subject.frames, subject.opened, strict=True), start=1
     ):
         progress(index - 1, len(subject.secrets))
-        more = [source_attack(lambda model: _views_by_source(model, tried))]
+        more = []
         if opened.decode is not None:
             more.append(decoder_attack(opened.decode, seed=seed))
             more.append(with_the_key(lambda model, own=opened: own.reveal(model, frame="cover", force=True)))  # type: ignore[misc]
-        rows, shown = look_for_secret(
-            subject.stego, subject.controls, subject.cover, secret, frame, more=more, seed=seed
-        )
+        rows, shown = look_for_secret(subject.stego, subject.controls, secret, frame, [*attacks, *more])
         files = [f"leak-{index}-{number:02}.png" for number in range(1, len(rows) + 1)]
         pictures |= {file: shown[row.attack] for file, row in zip(files, rows, strict=True)}
         found.append(

@@ -8,7 +8,7 @@ _HOME_OF = {
     "attribute_distances": "distances",
     "compare_images": "images",
     "composite_score": "sinkhorn",
-    "look_for_secret": "leaks",
+    "look_for_secret": "leaks.looking",
     "measure_hiding": "hiding",
     "sealwatch_roc": "sealwatch_detectors",
     "search_embeddings": "white_box",

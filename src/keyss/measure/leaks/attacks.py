@@ -11,17 +11,10 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera
+from keyss.core.scene import Camera, Scene
+from keyss.fitting.image_metrics import subsample_views
 from keyss.keys import random_embeddings
-from keyss.measure.leaks.attributes import Attribute, Side, clusters, outliers
-from keyss.measure.leaks.opacities import (
-    faint,
-    inverted,
-    least_contributing,
-    matched,
-    opaque,
-    rescaled,
-)
+from keyss.measure.leaks import views
 from keyss.measure.white_box import search_embeddings
 from keyss.rendering.contributions import contributions
 
@@ -47,40 +40,44 @@ class Attack:
     with_key: bool = False  # no attack: shows what there is to find
 
 
-def file_attacks(cover_cameras: Sequence[Camera], seed: int = 0) -> list[Attack]:
-    """The attacks of somebody who has the published file, and photos of the cover from these cameras."""
+def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[Attack]:
+    """The attacks of somebody who has the published file, and photos of the cover.
+
+    Of its training views at most `cover_views` are used, evenly spread.
+    """
+    cameras = [view.camera for view in subsample_views(cover.train, cover_views)]
     return [
         Attack(
             "restored opacities",
             "Gaussians below an opacity are made opaque and the others left out, or all made opaque.",
             {"thresholds": list(THRESHOLDS)},
-            _restored,
+            _of_faint(views.opaque, also_of_all=True),
         ),
         Attack(
             "rescaled opacities",
             "Gaussians below an opacity alone, all opacities multiplied by one factor.",
             {"thresholds": list(THRESHOLDS)},
-            lambda model: ((_below(t), rescaled(faint(model, t))) for t in THRESHOLDS),
+            _of_faint(views.rescaled),
         ),
         Attack(
             "matched opacities",
             "Gaussians below an opacity alone, with the opacities of the others, given by rank.",
             {"thresholds": list(THRESHOLDS)},
-            lambda model: ((_below(t), matched(model, t)) for t in THRESHOLDS),
+            lambda model: ((f"below {t}", views.matched(model, t)) for t in THRESHOLDS),
         ),
         Attack(
             "inverted opacities",
             "Opacities o become 1 - o, of Gaussians below an opacity alone or of all.",
             {"thresholds": list(THRESHOLDS)},
-            _inverted,
+            _of_faint(views.inverted, also_of_all=True),
         ),
         Attack(
             "least contribution",
             "The Gaussians that add least to the cover's views are made opaque, the others left out.",
-            {"shares": list(SHARES), "views": len(cover_cameras)},
-            lambda model: _least_contributing(model, cover_cameras),
+            {"shares": list(SHARES), "views": len(cameras)},
+            lambda model: _least_contributing(model, cameras),
         ),
-        *(_outliers(attribute) for attribute in get_args(Attribute)),
+        *(_outliers(attribute) for attribute in get_args(views.Attribute)),
         Attack(
             "clusters",
             "Groups of like attributes (a mixture of normal distributions), each alone and made opaque.",
@@ -90,16 +87,16 @@ def file_attacks(cover_cameras: Sequence[Camera], seed: int = 0) -> list[Attack]
     ]
 
 
-def source_attack(views: Callable[[Gaussians], Mapping[str, Gaussians]]) -> Attack:
+def source_attack(show: Callable[[Gaussians], Mapping[str, Gaussians]]) -> Attack:
     """The attack of somebody who read the source of the methods: `keyss.methods.base.Method.attacks`.
 
-    `views` gives the same names for every model.
+    `show` gives the same names for every model.
     """
     return Attack(
         "by the source",
         "What this program's source tells somebody to try.",
         {},
-        lambda model: iter(views(model).items()),
+        lambda model: iter(show(model).items()),
     )
 
 
@@ -145,28 +142,30 @@ def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
     )
 
 
-def _restored(model: Gaussians) -> Shown:
-    for threshold in THRESHOLDS:
-        yield _below(threshold), opaque(faint(model, threshold))
-    yield "all", opaque(model)
+def _of_faint(
+    change: Callable[[Gaussians], Gaussians], *, also_of_all: bool = False
+) -> Callable[[Gaussians], Shown]:
+    """A change of the Gaussians below each opacity alone, and of all."""
 
+    def show(model: Gaussians) -> Shown:
+        for threshold in THRESHOLDS:
+            yield f"below {threshold}", change(views.faint(model, threshold))
+        if also_of_all:
+            yield "all", change(model)
 
-def _inverted(model: Gaussians) -> Shown:
-    for threshold in THRESHOLDS:
-        yield _below(threshold), inverted(faint(model, threshold))
-    yield "all", inverted(model)
+    return show
 
 
 def _least_contributing(model: Gaussians, cameras: Sequence[Camera]) -> Shown:
     weights = contributions(model, cameras)
     for share in SHARES:
-        yield f"{share:.0%}", opaque(least_contributing(model, weights, share))
+        yield f"{share:.0%}", views.opaque(views.least_contributing(model, weights, share))
 
 
-def _outliers(attribute: Attribute) -> Attack:
+def _outliers(attribute: views.Attribute) -> Attack:
     def show(model: Gaussians) -> Shown:
-        for side, deviation in product(get_args(Side), DEVIATIONS):
-            yield f"{side}, {deviation} deviations", outliers(model, attribute, side, deviation)
+        for side, deviation in product(get_args(views.Side), DEVIATIONS):
+            yield f"{side}, {deviation} deviations", views.outliers(model, attribute, side, deviation)
 
     return Attack(
         f"outliers in {attribute}",
@@ -178,9 +177,5 @@ def _outliers(attribute: Attribute) -> Attack:
 
 def _clusters(model: Gaussians, seed: int) -> Shown:
     for count in CLUSTERS:
-        for index, part in enumerate(clusters(model, count, seed), start=1):
+        for index, part in enumerate(views.clusters(model, count, seed), start=1):
             yield f"{index} of {count}", part
-
-
-def _below(threshold: float) -> str:
-    return f"below {threshold}"
