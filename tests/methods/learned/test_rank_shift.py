@@ -59,7 +59,9 @@ def test_the_key_puts_them_back_whatever_the_order_and_the_low_bits(seed: int) -
     rank_shift = RankShift.of(stego, bytes([seed]) * 32, BAND)
     published = rank_shift.encrypt(stego)
     rows = np.flatnonzero(usable_carriers(published))
-    noise = np.random.default_rng(seed).integers(0, 256, read_low_bits(published)[rows].shape, dtype=np.uint8)
+    noise = np.random.default_rng(seed).integers(
+        0, 256, read_low_bits(published)[rows].shape, dtype=np.uint8
+    )
     order = torch.randperm(2000, generator=torch.Generator().manual_seed(seed))[:1500]
     decrypted = rank_shift.decrypt(write_low_bits(published, rows, noise)[order])
     for name in ("means", "log_scales", "opacity_logits", "sh"):
