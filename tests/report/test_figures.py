@@ -14,7 +14,7 @@ from markupsafe import Markup
 from keyss.core.errors import InputError
 from keyss.measure.distances import AttributeDistance
 from keyss.measure.histograms import Histogram
-from keyss.measure.robustness import ChangeResult
+from keyss.measure.robustness.survival import ChangeResult
 from keyss.measure.roc import Roc
 from keyss.measure.two_sample import TwoSample
 from keyss.report import figures, plots

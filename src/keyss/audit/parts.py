@@ -22,8 +22,8 @@ from keyss.measure.histograms import histograms
 from keyss.measure.images import compare_images, renders_of
 from keyss.measure.leaks.attacks import decoder_attack, file_attacks, source_attack, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
-from keyss.measure.robustness import breakdown_points
-from keyss.measure.robustness import robustness as measure_robustness
+from keyss.measure.robustness.survival import breakdown_points
+from keyss.measure.robustness.survival import robustness as measure_robustness
 from keyss.measure.roc import stegexpose_roc
 from keyss.measure.sealwatch_detectors import SealwatchRocs, sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d

@@ -20,7 +20,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
-from keyss.measure.robustness import Reopener
+from keyss.measure.robustness.survival import Reopener
 from keyss.methods import registry
 from keyss.methods.base import Opened
 from keyss.runs.opening import HidingRun

@@ -20,7 +20,7 @@ from keyss.core.scene import Scene
 from keyss.files.ply import read_ply, write_ply
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_gsply, transform
-from keyss.measure.robustness.reopening import Reopen
+from keyss.measure.robustness.survival import Reopen
 from keyss.rendering import render
 
 Columns = dict[str, np.ndarray[Any, Any]]
