@@ -87,20 +87,17 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 4)
     published = sinkhorn_3d(original, stego)
+    quality = subject.run.metrics
+    secret_psnr = fmean(each.psnr for each in quality.secrets)
+    score = composite_score(quality.cover.psnr, secret_psnr, published.sum)
     between = tuple(sinkhorn_3d(original, control) for control in controls)
     progress(1, 4)
     distances = against_controls(stego, controls, original=original, seed=seed)
     progress(2, 4)
     two_sample = two_sample_against_controls(stego, controls, original=original, seed=seed)
     progress(3, 4)
-    return PartResult(
-        ParametersResult(
-            SinkhornResult(published, between, _composite_score(subject, published.sum)),
-            distances,
-            two_sample,
-            histograms(stego, controls),
-        )
-    )
+    sinkhorn = SinkhornResult(published, between, score)
+    return PartResult(ParametersResult(sinkhorn, distances, two_sample, histograms(stego, controls)))
 
 
 def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RendersResult]:
@@ -132,7 +129,7 @@ def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
     attacks = file_attacks(subject.cover, seed=seed)
     attacks.append(source_attack(lambda model: _views_by_source(model, tried)))
     for index, (secret, frame, opened) in enumerate(
-        zip(subject.secrets, subject.frames, subject.opened, strict=True), start=1
+        zip(subject.secrets, subject.frames, subject.run.opened, strict=True), start=1
     ):
         progress(index - 1, len(subject.secrets))
         more = []
@@ -185,12 +182,6 @@ def _sealwatch(
         return sealwatch_roc(plain, others, seed=seed), None
     except BackendError as error:
         return None, str(error)
-
-
-def _composite_score(subject: AuditSubject, distance: float) -> float:
-    """The paper's composite score (eq. 10) of the cover and the mean secret."""
-    metrics = subject.run.metrics
-    return composite_score(metrics.cover.psnr, fmean(each.psnr for each in metrics.secrets), distance)
 
 
 def _views_by_source(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:

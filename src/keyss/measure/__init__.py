@@ -11,7 +11,7 @@ _HOME_OF = {
     "look_for_secret": "leaks.looking",
     "measure_hiding": "hiding",
     "sealwatch_roc": "sealwatch_detectors",
-    "search_embeddings": "white_box",
+    "search_embeddings": "leaks.attacks",
     "sinkhorn_3d": "sinkhorn",
     "stegexpose_roc": "roc",
     "two_sample_against_controls": "two_sample",

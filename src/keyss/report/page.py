@@ -98,19 +98,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    formats = (
-        numbers.bytes_text,
-        numbers.difference,
-        numbers.integer,
-        numbers.number,
-        numbers.numbered,
-        numbers.seconds_text,
-        numbers.significant,
-        numbers.times,
-        auc_text,
-        flat,
-        prose,
-    )
+    formats = [*filter(callable, vars(numbers).values()), auc_text, flat, prose]
     environment.filters |= {each.__name__: each for each in formats}
     environment.globals["figures"] = figures
     return environment

@@ -185,12 +185,8 @@ def mean_over_draws(results: Sequence[ChangeResult]) -> list[ChangeResult]:
         replace(
             draws[0],
             draws=len(draws),
-            cover=_mean([draw.cover for draw in draws if draw.cover is not None]),
-            secrets=tuple(
-                found
-                for each in zip(*(draw.secrets for draw in draws), strict=False)
-                if (found := _mean(each)) is not None
-            ),
+            cover=_mean(covers) if (covers := [draw.cover for draw in draws if draw.cover]) else None,
+            secrets=tuple(map(_mean, zip(*(draw.secrets for draw in draws), strict=False))),
         )
         for draws in groups
     ]
@@ -238,9 +234,7 @@ def _grouped(items: Sequence[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
-def _mean(draws: Sequence[ChangedQuality]) -> ChangedQuality | None:
-    if not draws:
-        return None
+def _mean(draws: Sequence[ChangedQuality]) -> ChangedQuality:
     return ChangedQuality(
         fmean(draw.psnr for draw in draws),
         fmean(draw.ssim for draw in draws),
