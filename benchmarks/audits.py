@@ -18,7 +18,7 @@ from typing import Any
 from keyss.files.atomic import write_bytes
 from keyss.measure import composite_score
 from keyss.measure.images import ImageComparison
-from keyss.measure.robustness import mean_over_draws
+from keyss.measure.robustness.survival import mean_over_draws
 from keyss.report.verdicts import detector_rocs
 from keyss.runs.audit_record import Audit, read_audit
 

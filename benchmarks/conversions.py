@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import keyss
@@ -19,8 +20,10 @@ from keyss.cli.keys import key_of_file
 from keyss.core import BackendError, Gaussians
 from keyss.files.models import read_model
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.measure.robustness import Reopener, converters
 from keyss.measure.robustness.changes import half_floats
+from keyss.measure.robustness.conversions import converters
+from keyss.measure.robustness.survival import Reopener
+from keyss.methods.registry import open_model
 
 
 def main() -> None:
@@ -35,7 +38,8 @@ def main() -> None:
         for path in (settings["cover"], settings["secrets"][0])
     )
     stego, source = read_model(asked.run / "stego.ply"), asked.run / "stego.ply"
-    reopen = Reopener(key_of_file(asked.key_file), (asked.run / "decoder.sealed").read_bytes())
+    sidecar = (asked.run / "decoder.sealed").read_bytes()
+    reopen = Reopener(key_of_file(asked.key_file), partial(open_model, sidecar=sidecar))
 
     def measured(model: Gaussians) -> tuple[float, float]:
         shown = mean_psnr(model, cover.test, cover.background)

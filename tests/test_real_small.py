@@ -48,5 +48,8 @@ def test_bonsai_hides_fox(real_data: Path, tmp_path: Path) -> None:
     assert cover > 19.1  # 20.1 was measured, and 22.9 for the secret
     assert secret > 21.9
     assert psnr_against_photos(out / "stego.ply", fox) < 9  # without the key there is no fox to be seen
-    assert main(["reveal", str(out / "stego.ply"), "--key-file", str(other), "-o", str(tmp_path / "no.ply")]) == 3
+    assert (
+        main(["reveal", str(out / "stego.ply"), "--key-file", str(other), "-o", str(tmp_path / "no.ply")])
+        == 3
+    )
     assert not (tmp_path / "no.ply").exists()

@@ -33,7 +33,7 @@ from keyss.methods.base import Context, Frame, KeyedSource, Method, MethodOption
 from keyss.methods.plain_models import plain_models
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
-from keyss.report.writing import write_report as write_report
+from keyss.report.page import write_report as write_report
 from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
 from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names, writers
 from keyss.runs.metrics import FitMetrics, HideMetrics

@@ -14,24 +14,22 @@ from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
 from keyss.core import BackendError, Gaussians, Scene, UsageError
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.measure.robustness import (
-    Change,
-    Reopened,
-    breakdown_points,
-    converters,
-    robustness,
-)
 from keyss.measure.robustness.changes import (
     NOISY,
+    Change,
     cropping,
     fewer_harmonics,
+    fine_tuning,
     half_floats,
     noise,
     opacity_pruning,
+    purification,
     random_pruning,
+    refined,
+    unused,
 )
-from keyss.measure.robustness.conversions import Converter
-from keyss.measure.robustness.retraining import fine_tuning, purification, refined, unused
+from keyss.measure.robustness.conversions import Converter, converters
+from keyss.measure.robustness.survival import Reopened, breakdown_points, robustness
 from keyss.methods.learned.payload import choose_anchors
 from tiny_scenes import random_gaussians, tiny_scene
 

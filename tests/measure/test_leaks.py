@@ -14,22 +14,20 @@ import keyss
 from keyss.core import Gaussians, UsageError
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
-from keyss.measure.leaks import (
+from keyss.measure.leaks.attacks import (
+    THRESHOLDS,
     Attack,
-    AttackResult,
-    attack,
     decoder_attack,
     file_attacks,
-    look_for_secret,
     source_attack,
     with_the_key,
 )
-from keyss.measure.leaks.attacks import THRESHOLDS
+from keyss.measure.leaks.looking import AttackResult, look_for_secret
 from keyss.methods.learned.attacks import known_remaps as learned_attacks
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.opacity_band import OpacityBand, hidden_logits, opacity_remap
 from keyss.methods.learned.payload import HiddenSecret
-from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
+from tiny_scenes import random_gaussians, tiny_scene
 
 Rows = dict[str, AttackResult]
 SOURCE = source_attack(lambda model: learned_attacks(model, 3))
@@ -55,7 +53,8 @@ PLAINS = [_plain(seed) for seed in range(2)]
 
 
 def _look(stego: Gaussians, more: Sequence[Attack] = ()) -> Rows:
-    rows, _ = look_for_secret(stego, PLAINS, COVER, SECRET, FRAME, more=[SOURCE, *more], cover_views=4)
+    attacks = [*file_attacks(COVER, cover_views=4), SOURCE, *more]
+    rows, _ = look_for_secret(stego, PLAINS, SECRET, FRAME, attacks)
     return {row.attack: row for row in rows}
 
 
@@ -127,7 +126,9 @@ def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
         cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
     carried = keyss.hide(cover, [secret], method="carry", width=40).stego
-    rows, pictures = look_for_secret(carried, [cover], COVER, SECRET, FRAME, more=[SOURCE], cover_views=4)
+    rows, pictures = look_for_secret(
+        carried, [cover], SECRET, FRAME, [*file_attacks(COVER, cover_views=4), SOURCE]
+    )
     for row in rows:
         if not (row.attack.endswith("opacities") or row.attack == "by the source"):
             assert row.leak.gradient < 0.15, row.attack  # of these a low bit may decide some
@@ -139,19 +140,19 @@ def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
 
 def test_more_views_are_no_more_leak() -> None:
     """Who tries something twice tries it twice on plain models too: rows depend on what is shown only."""
-    attacks = file_attacks(ring_cameras(2))[:1]
+    attacks = file_attacks(COVER, cover_views=2)[:1]
     twice = [replace(each, show=lambda model, show=each.show: [*show(model)] * 2) for each in attacks]
-    once_rows, _ = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
-    twice_rows, _ = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, twice)
+    once_rows, _ = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
+    twice_rows, _ = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, twice)
     assert twice_rows == [replace(row, views=2 * row.views) for row in once_rows]
 
 
 def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_photo() -> None:
     attacks = [
-        each for each in file_attacks(ring_cameras(2)) if each.name in ("clusters", "least contribution")
+        each for each in file_attacks(COVER, cover_views=2) if each.name in ("clusters", "least contribution")
     ]
-    rows, pictures = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
-    again, same = attack(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
+    rows, pictures = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
+    again, same = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
     assert rows == again
     assert list(pictures) == [row.attack for row in rows]
     for name, picture in pictures.items():
@@ -190,13 +191,13 @@ def test_a_decoder_with_a_bias_is_searched() -> None:
     assert decode is not None
     search = decoder_attack(decode, restarts=2, steps=3)
     as_it_is = Attack("as it is", "", {}, lambda model: iter([("as it is", model)]))
-    searched, shown = attack(PLAINS[0], PLAINS, SECRET, FRAME, [search, as_it_is])[0]
+    searched, shown = look_for_secret(PLAINS[0], PLAINS, SECRET, FRAME, [search, as_it_is])[0]
     assert searched.views == 6
     assert asdict(searched.scores) == pytest.approx(asdict(shown.scores))
 
 
 def test_nothing_to_compare_with_is_refused() -> None:
     with pytest.raises(UsageError, match="plain model"):
-        look_for_secret(PLAINS[0], [], COVER, SECRET, FRAME)
+        look_for_secret(PLAINS[0], [], SECRET, FRAME, [])
     with pytest.raises(UsageError, match="no test views"):
-        look_for_secret(PLAINS[0], PLAINS, COVER, replace(SECRET, test=()), FRAME)
+        look_for_secret(PLAINS[0], PLAINS, replace(SECRET, test=()), FRAME, [])

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from keyss.fitting.image_metrics import psnr, quality
-from keyss.measure.leaks import coarse, fit_colours, gradient_correlation, scores
+from keyss.measure.leaks.scores import coarse, fit_colours, gradient_correlation, scores
 from tiny_scenes import random_gaussians, tiny_scene
 
 

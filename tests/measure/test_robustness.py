@@ -15,24 +15,26 @@ from keyss.channels.low_bits import LOW_BITS
 from keyss.core import Gaussians, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import mean_psnr, quality
-from keyss.measure.robustness import (
+from keyss.measure.robustness.changes import (
+    NOISY,
+    half_floats,
+    noise,
+    purification,
+    random_pruning,
+)
+from keyss.measure.robustness.survival import (
     BreakdownPoint,
+    ChangedQuality,
     ChangeResult,
+    First,
     Reopened,
     Reopener,
+    StrengthLosses,
     breakdown_points,
     default_changes,
     mean_over_draws,
     robustness,
 )
-from keyss.measure.robustness.changes import (
-    NOISY,
-    half_floats,
-    noise,
-    random_pruning,
-)
-from keyss.measure.robustness.retraining import purification
-from keyss.measure.robustness.survival import ChangedQuality, First, StrengthLosses
 from keyss.methods.carry.carrying import record_request
 from keyss.methods.registry import open_model
 from methods.carry.carried import embed

@@ -16,7 +16,7 @@ from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
 from keyss.files.ply import write_ply
 from keyss.measure import speed as module
-from keyss.measure.robustness import Reopened, Reopener
+from keyss.measure.robustness.survival import Reopened, Reopener
 from keyss.measure.speed import FileSize, ReaderResult, readers, render_time, reveal_seconds, speed
 from keyss.methods.registry import open_model
 from methods.carry.carried import embed

@@ -17,8 +17,8 @@ from scipy.stats import chi2
 
 from keyss.core.errors import InputError, UsageError
 from keyss.files import images
+from keyss.measure.lsb_detectors import _rate
 from keyss.measure.stegexpose import DETECTORS, Scores, read_pixels, score_file, score_image
-from keyss.measure.stegexpose.rs import _rate
 from measure import stegexpose_literal as literal
 
 Pixels = npt.NDArray[np.uint8]
@@ -148,7 +148,7 @@ class TestAgainstItsDescription:
     def test_many_blocks(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Chi Square does not care how many of its histograms are in memory together."""
         whole = score_image(smooth())
-        monkeypatch.setattr("keyss.measure.stegexpose.chi_square._AT_ONCE", 100)
+        monkeypatch.setattr("keyss.measure.lsb_detectors._AT_ONCE", 100)
         assert score_image(smooth()).chi_square == pytest.approx(whole.chi_square, abs=1e-12)
 
     @staticmethod

@@ -8,7 +8,7 @@ import pytest
 from torch import Tensor
 
 from keyss.core import Gaussians
-from keyss.measure.white_box import search_embeddings
+from keyss.measure.leaks.attacks import search_embeddings
 from keyss.methods.learned.payload import HiddenSecret
 from methods.learned.hiding import Hidden, hide_scenes
 from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes

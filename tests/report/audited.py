@@ -15,8 +15,9 @@ import pytest
 import keyss
 from keyss import Secret
 from keyss.audit import audit
-from keyss.measure.robustness import Change, converters, survival
-from keyss.measure.robustness.changes import half_floats, random_pruning
+from keyss.measure.robustness import survival
+from keyss.measure.robustness.changes import Change, half_floats, random_pruning
+from keyss.measure.robustness.conversions import converters
 from keyss.runs.audit_record import Audit
 from test_api import CONFIG, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene

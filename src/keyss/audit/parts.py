@@ -20,9 +20,10 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_controls
 from keyss.measure.histograms import histograms
 from keyss.measure.images import compare_images, renders_of
-from keyss.measure.leaks import AttackResult, decoder_attack, look_for_secret, source_attack, with_the_key
-from keyss.measure.robustness import breakdown_points
-from keyss.measure.robustness import robustness as measure_robustness
+from keyss.measure.leaks.attacks import decoder_attack, file_attacks, source_attack, with_the_key
+from keyss.measure.leaks.looking import AttackResult, look_for_secret
+from keyss.measure.robustness.survival import breakdown_points
+from keyss.measure.robustness.survival import robustness as measure_robustness
 from keyss.measure.roc import stegexpose_roc
 from keyss.measure.sealwatch_detectors import SealwatchRocs, sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
@@ -86,20 +87,17 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 4)
     published = sinkhorn_3d(original, stego)
+    quality = subject.run.metrics
+    secret_psnr = fmean(each.psnr for each in quality.secrets)
+    score = composite_score(quality.cover.psnr, secret_psnr, published.sum)
     between = tuple(sinkhorn_3d(original, control) for control in controls)
     progress(1, 4)
     distances = against_controls(stego, controls, original=original, seed=seed)
     progress(2, 4)
     two_sample = two_sample_against_controls(stego, controls, original=original, seed=seed)
     progress(3, 4)
-    return PartResult(
-        ParametersResult(
-            SinkhornResult(published, between, _composite_score(subject, published.sum)),
-            distances,
-            two_sample,
-            histograms(stego, controls),
-        )
-    )
+    sinkhorn = SinkhornResult(published, between, score)
+    return PartResult(ParametersResult(sinkhorn, distances, two_sample, histograms(stego, controls)))
 
 
 def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RendersResult]:
@@ -128,17 +126,17 @@ def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
     found: list[tuple[AttackResult, ...]] = []
     pictures: dict[str, Tensor] = {}
     tried = max(SECRETS_TRIED, len(subject.secrets))
+    attacks = file_attacks(subject.cover, seed=seed)
+    attacks.append(source_attack(lambda model: _views_by_source(model, tried)))
     for index, (secret, frame, opened) in enumerate(
-        zip(subject.secrets, subject.frames, subject.opened, strict=True), start=1
+        zip(subject.secrets, subject.frames, subject.run.opened, strict=True), start=1
     ):
         progress(index - 1, len(subject.secrets))
-        more = [source_attack(lambda model: _views_by_source(model, tried))]
+        more = []
         if opened.decode is not None:
             more.append(decoder_attack(opened.decode, seed=seed))
             more.append(with_the_key(lambda model, own=opened: own.reveal(model, frame="cover", force=True)))  # type: ignore[misc]
-        rows, shown = look_for_secret(
-            subject.stego, subject.controls, subject.cover, secret, frame, more=more, seed=seed
-        )
+        rows, shown = look_for_secret(subject.stego, subject.controls, secret, frame, [*attacks, *more])
         files = [f"leak-{index}-{number:02}.png" for number in range(1, len(rows) + 1)]
         pictures |= {file: shown[row.attack] for file, row in zip(files, rows, strict=True)}
         found.append(
@@ -184,12 +182,6 @@ def _sealwatch(
         return sealwatch_roc(plain, others, seed=seed), None
     except BackendError as error:
         return None, str(error)
-
-
-def _composite_score(subject: AuditSubject, distance: float) -> float:
-    """The paper's composite score (eq. 10) of the cover and the mean secret."""
-    metrics = subject.run.metrics
-    return composite_score(metrics.cover.psnr, fmean(each.psnr for each in metrics.secrets), distance)
 
 
 def _views_by_source(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:

@@ -12,7 +12,7 @@ import msgspec
 from keyss._version import __version__
 from keyss.audit.parts import PARTS
 from keyss.audit.progress import FinishedParts, PartProgress
-from keyss.audit.subject import AuditSubject, control_seeds, subject_of
+from keyss.audit.subject import AuditSubject, subject_of
 from keyss.core.errors import UsageError
 from keyss.files.output import OutputFolder
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
@@ -29,7 +29,6 @@ from keyss.runs.audit_record import (
 )
 from keyss.runs.config import PathLike
 from keyss.runs.files import writers
-from keyss.runs.metrics import HideMetrics
 from keyss.runs.opening import HidingRun, open_run
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
@@ -64,9 +63,8 @@ def audit(
     started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
     output = OutputFolder(opened.folder / AUDIT_FOLDER, overwrite=overwrite, resume=resume)
-    seeds = control_seeds(opened, controls, seed)
-    subject = subject_of(opened, original, seeds, resolve_device(device), reporter)
-    finished = FinishedParts(output.checkpoints(), _inputs(subject, seeds, seed))
+    subject = subject_of(opened, original, controls, seed, resolve_device(device), reporter)
+    finished = FinishedParts(output.checkpoints(), _inputs(subject, seed))
     sections = {}
     pictures: dict[str, bytes] = {}
     chosen = [name for name in PARTS if not only or name in only]
@@ -79,30 +77,32 @@ def audit(
                 raise Interrupted(finished.folder, index) from error
             finally:
                 progress.finish(finished.has(name))
-        sections[name], shown = finished.take(name)
-        pictures |= shown
+        sections[name], own = finished.take(name)
+        pictures |= own
+    shown = opened.metrics.wrong_key
+    wrong_key = None if shown is None else WrongKeyResult(shown, opened.metrics.chance_level)
     found = Audit(
         keyss=__version__,
         seconds=round(time.monotonic() - started, 1),
         run=_audited_run(opened),
-        controls=Controls(controls, tuple(seeds)),
-        wrong_key=_wrong_keys(opened.metrics),
+        controls=Controls(controls, subject.seeds),
+        wrong_key=wrong_key,
         **sections,
     )
-    shown = {f"{PICTURES}/{name}": data for name, data in pictures.items()}
-    output.fill(writers({AUDIT_FILE: found, **shown}))
+    files = {f"{PICTURES}/{name}": data for name, data in pictures.items()}
+    output.fill(writers({AUDIT_FILE: found, **files}))
     write_report(opened.folder)
     return found
 
 
-def _inputs(subject: AuditSubject, seeds: Sequence[int], seed: int) -> dict[str, object]:
+def _inputs(subject: AuditSubject, seed: int) -> dict[str, object]:
     """What finished parts depend on."""
     return {
-        "payloads": [secret.fingerprint() for secret in subject.opened],
+        "payloads": [secret.fingerprint() for secret in subject.run.opened],
         "stego": subject.stego.digest(),
         "original": subject.original.digest(),
         "scenes": [scene.digest() for scene in subject.scenes],
-        "seeds": [*seeds, seed],
+        "seeds": [*subject.seeds, seed],
         "version": __version__,
     }
 
@@ -119,7 +119,3 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as it will be read again
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )
-
-
-def _wrong_keys(metrics: HideMetrics) -> WrongKeyResult | None:
-    return None if metrics.wrong_key is None else WrongKeyResult(metrics.wrong_key, metrics.chance_level)

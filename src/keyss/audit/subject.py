@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,9 +19,8 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
-from keyss.measure.robustness import Reopener
+from keyss.measure.robustness.survival import Reopener
 from keyss.methods import registry
-from keyss.methods.base import Opened
 from keyss.runs.opening import HidingRun
 
 CONTROLS = "private/controls"  # plain models of the cover from other seeds, in a run's folder
@@ -35,12 +33,12 @@ class AuditSubject:
     run: HidingRun
     scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
     stego: Gaussians
-    opened: tuple[Opened, ...]
     revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
     frames: tuple[Similarity, ...]  # from those to the cover's
     original: Gaussians  # plain model of the cover
     baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, where there are some
     controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
+    seeds: tuple[int, ...]  # of the controls
     device: torch.device
 
     @property
@@ -66,13 +64,15 @@ class AuditSubject:
 def subject_of(
     run: HidingRun,
     original: Path | str | None,
-    seeds: Sequence[int],
+    controls: int,
+    seed: int,
     device: torch.device,
     reporter: Reporter,
 ) -> AuditSubject:
     """Read, reveal and fit what the audit needs; plain models are kept in the run's folder and used again.
 
-    `original`: a plain model of the cover, by default the run's own. Raises UsageError where there is none.
+    `original`: a plain model of the cover, by default the run's own. `controls`: how many are trained, from
+    the seeds after the run's own and `seed`. Raises UsageError without a plain model of the cover.
     """
     scenes = run.scenes()
     plain, *baselines = run.plain_models()
@@ -84,30 +84,24 @@ def subject_of(
     config = run.config.options.fit
     if original is not None or run.config.models_given[0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
-    controls = tuple(
-        _plain_model(scenes[0], replace(config, seed=seed), folder, device, reporter).to(device)
-        for seed in seeds
-    )
+    seeds = tuple(run.config.options.fit.seed + seed + index for index in range(1, controls + 1))
     return AuditSubject(
         run=run,
         scenes=tuple(scenes),
         stego=stego,
-        opened=run.opened,
         revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
         frames=tuple(
             frame_of(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
         ),
         original=plain.to(device),
         baselines=tuple(None if model is None else model.to(device) for model in baselines),
-        controls=controls,
+        controls=tuple(
+            _plain_model(scenes[0], replace(config, seed=each), folder, device, reporter).to(device)
+            for each in seeds
+        ),
+        seeds=seeds,
         device=device,
     )
-
-
-def control_seeds(run: HidingRun, controls: int, seed: int) -> list[int]:
-    """From which the plain models are trained: those after the run's own."""
-    first = run.config.options.fit.seed + seed
-    return [first + index for index in range(1, controls + 1)]
 
 
 def _plain_model(

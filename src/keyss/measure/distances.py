@@ -56,7 +56,6 @@ def against_controls(
     *,
     original: Gaussians | None = None,
     seed: int = 0,
-    slices: int = SLICES,
 ) -> dict[str, AttributeDistance]:
     """How far `model` is from control models of the same scene, beside how far these are from each other.
 
@@ -70,10 +69,10 @@ def against_controls(
 
     def mean_distances(other: Gaussians) -> dict[str, float]:
         theirs = features(other, most=MOST, seed=seed)
-        return _means([_distances(each, theirs, seed, slices) for each in plain])
+        return _means([_distances(each, theirs, seed, SLICES) for each in plain])
 
     distance = mean_distances(model)
-    control = _means([_distances(one, two, seed, slices) for one, two in combinations(plain, 2)])
+    control = _means([_distances(one, two, seed, SLICES) for one, two in combinations(plain, 2)])
     own = {} if original is None else mean_distances(original)
 
     def ratio(distances: dict[str, float], name: str) -> float | None:

@@ -38,7 +38,7 @@ def histograms(stego: Gaussians, controls: Sequence[Gaussians]) -> dict[str, His
     for name in quantities[0]:
         values = [each[name].detach().cpu().double().nan_to_num() for each in quantities]
         together = torch.cat(values).sort().values
-        low, high = (float(together[rank]) for rank in _ranks(len(together)))
+        low, high = (float(together[int(share * (len(together) - 1))]) for share in (0.001, 0.999))
         edges = torch.linspace(low, max(high, low + 1e-9), BINS + 1, dtype=torch.float64)
         shares = [_shares(each, edges) for each in values]
         found[name] = Histogram(tuple(edges.tolist()), shares[0], tuple(shares[1:]))
@@ -59,10 +59,6 @@ def _quantities(model: Gaussians) -> dict[str, Tensor]:
         "brightness": (model.sh[:, 0] * SH_C0 + 0.5).mean(1),
         "energy of the harmonics (log10)": energy.clamp_min(1e-12).log10(),
     }
-
-
-def _ranks(count: int) -> tuple[int, int]:
-    return int(0.001 * (count - 1)), int(0.999 * (count - 1))
 
 
 def _shares(values: Tensor, edges: Tensor) -> tuple[float, ...]:

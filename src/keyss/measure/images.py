@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from statistics import fmean
@@ -11,7 +12,7 @@ from statistics import fmean
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.ndimage import correlate1d
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from keyss.core.errors import BackendError, InputError, KeyssError
@@ -28,8 +29,6 @@ Pictures = Path | str | Sequence[tuple[str, Tensor | Pixels]]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 RADIUS = 5  # SSIM's 11 x 11 window
-_WINDOW = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * 1.5**2))
-_WINDOW /= _WINDOW.sum()
 
 
 @dataclass(frozen=True)
@@ -140,11 +139,7 @@ def _unit_range(name: str, *pair: Path | Tensor | Pixels) -> list[Tensor]:
 
 
 def _ssim(a: Doubles, b: Doubles) -> dict[str, float]:
-    def blur(values: Doubles) -> Doubles:
-        rows = correlate1d(values, _WINDOW, axis=0, mode="constant")
-        blurred: Doubles = correlate1d(rows, _WINDOW, axis=1, mode="constant")
-        return blurred
-
+    blur = partial(gaussian_filter, sigma=1.5, mode="constant", radius=RADIUS, axes=(0, 1))
     c1, c2 = 0.01**2, 0.03**2
     mean_a, mean_b = blur(a), blur(b)
     variances = blur(a * a) - mean_a**2 + blur(b * b) - mean_b**2

@@ -20,7 +20,7 @@ from keyss.core.scene import Scene
 from keyss.files.ply import read_ply, write_ply
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_gsply, transform
-from keyss.measure.robustness.reopening import Reopen
+from keyss.measure.robustness.survival import Reopen
 from keyss.rendering import render
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -74,7 +74,6 @@ def speed(
     plains: Sequence[Gaussians],  # plain 3DGS models of the same scenes
     *,
     sidecar: Path | None = None,
-    views: int = 4,
     rounds: int = 15,
     device: torch.device | str = "cpu",
     progress: Callable[[int, int, str], None] | None = None,
@@ -98,8 +97,7 @@ def speed(
                 revealed.append(reveal_seconds(stego, reopen[number - 1], file))
             files.append(FileSize(name, file.stat().st_size))
             model = read_ply(file).to(device)
-            found = render_time(name, model, plain.to(device), scene, views=views, rounds=rounds)
-            rendered.append(found)
+            rendered.append(render_time(name, model, plain.to(device), scene, rounds=rounds))
             read += [replace(each, file=name) for each in readers(file)]
     if progress is not None:
         progress(len(names), len(names), "")

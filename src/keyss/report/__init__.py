@@ -1,5 +1,5 @@
 """From an audit to one HTML file that opens from disk."""
 
-from keyss.report.writing import write_report
+from keyss.report.page import write_report
 
 __all__ = ["write_report"]

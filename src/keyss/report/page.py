@@ -1,25 +1,46 @@
-"""The page: one file that loads nothing and, by its own policy, may not."""
+"""The report: one HTML file that opens from disk, loads nothing and, by its own policy, may not."""
 
 from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
 from importlib.resources import files
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from keyss.core.errors import InputError
+from keyss.files.atomic import write_bytes
 from keyss.measure.images import ImageComparison
 from keyss.measure.robustness.survival import mean_over_draws
-from keyss.report import numbers, plots
-from keyss.report.untrusted import AuditPictures, clean, flat
+from keyss.report import figures, numbers
+from keyss.report.untrusted import AuditPictures, check_bounds, clean, flat
 from keyss.report.verdicts import auc_text, detector_rocs, headline, verdicts
-from keyss.runs.audit_record import Audit, ImagesResult
+from keyss.runs.audit_record import Audit, ImagesResult, read_audit
+
+REPORT = "report.html"
 
 _STYLES = ("page.css", "pictures.css", "print.css")
 _HOW = "`keyss audit RUN --key-file KEY` measures it"
 _EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and audits after it have it"
+
+
+def write_report(run_folder: Path | str) -> Path:
+    """Write RUN/report.html from RUN/audit, atomically, and return its path.
+
+    One file that needs no network: pictures, figures, style and script are in it, and so it shows the secret.
+    The same audit gives the same bytes. Raises InputError when there is no audit, or it is broken, too large
+    or names pictures outside RUN/audit; OutputError when the file cannot be written.
+    """
+    run = Path(run_folder)
+    audit = read_audit(run)
+    try:
+        check_bounds(audit)
+    except RecursionError as error:
+        raise InputError(f"{run}: the audit's configuration is nested too deeply") from error
+    write_bytes(run / REPORT, page(audit, AuditPictures(run)).encode())
+    return run / REPORT
 
 
 def page(audit: Audit, pictures: AuditPictures) -> str:
@@ -77,21 +98,9 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    formats = (
-        numbers.bytes_text,
-        numbers.difference,
-        numbers.integer,
-        numbers.number,
-        numbers.numbered,
-        numbers.seconds_text,
-        numbers.significant,
-        numbers.times,
-        auc_text,
-        flat,
-        prose,
-    )
+    formats = [*filter(callable, vars(numbers).values()), auc_text, flat, prose]
     environment.filters |= {each.__name__: each for each in formats}
-    environment.globals["plots"] = plots
+    environment.globals["figures"] = figures
     return environment
 
 

@@ -92,15 +92,6 @@ class AuditPictures:
 
         Raises InputError when it lies outside the audit's folder, is missing, is no PNG or too large.
         """
-        path = self._inside(name)
-        data = read_file(path, min(_MAX_PICTURE, self._left))
-        if not data.startswith(_PNG):
-            raise InputError(f"{path}: expected a PNG picture")
-        width, height, _ = probe_image(path)
-        self._left -= len(data)
-        return EmbeddedPicture(width, height, "data:image/png;base64," + b64encode(data).decode())
-
-    def _inside(self, name: str) -> Path:
         try:
             folder = self._folder.resolve()
             path = (folder / name).resolve()
@@ -108,4 +99,9 @@ class AuditPictures:
             raise InputError(f"expected the name of a picture, found {name!r}") from error
         if not path.is_relative_to(folder):
             raise InputError(f"expected a picture in {self._folder}, found {name!r}")
-        return path
+        data = read_file(path, min(_MAX_PICTURE, self._left))
+        if not data.startswith(_PNG):
+            raise InputError(f"{path}: expected a PNG picture")
+        width, height, _ = probe_image(path)
+        self._left -= len(data)
+        return EmbeddedPicture(width, height, "data:image/png;base64," + b64encode(data).decode())

@@ -14,7 +14,7 @@ from keyss.measure.images import ImageComparison
 from keyss.measure.leaks.scores import LeakScores
 from keyss.measure.robustness.survival import mean_over_draws
 from keyss.measure.roc import Roc
-from keyss.report.numbers import decibel, difference, number, times
+from keyss.report.numbers import decibel, difference, number, numbered, times
 from keyss.runs.audit_record import Audit, RenderDetection
 
 QUALITY_LOSS = 1.0  # dB that cover or secret may be below plain 3DGS of the same photos
@@ -124,29 +124,17 @@ def _rocs(found: RenderDetection, program: Program) -> dict[str, Roc]:
 def _qualities(audit: Audit) -> Iterator[Verdict]:
     if audit.images is None:
         return
-    images = audit.images
-    yield from _quality("cover on test photos", images.cover, images.cover_baseline, "visible")
-    for index, (secret, baseline) in enumerate(
-        zip(images.secrets, images.secret_baselines, strict=False), start=1
-    ):
-        name = f"secret {index}" if len(images.secrets) > 1 else "secret"
-        yield from _quality(f"{name} on test photos", secret, baseline, "missed")
-
-
-def _quality(
-    measure: str, found: ImageComparison, baseline: ImageComparison | None, otherwise: Word
-) -> Iterator[Verdict]:
-    if baseline is None:
-        return
-    got, limit = found.mean.psnr, baseline.mean.psnr
-    yield Verdict(
-        measure,
-        decibel(got),
-        f"{decibel(limit)}, plain 3DGS",
-        f"at most {decibel(QUALITY_LOSS, 1)} less",
-        "fine" if got >= min(limit - QUALITY_LOSS, INVISIBLE) else otherwise,
-        "images",
-    )
+    images, count = audit.images, len(audit.images.secrets)
+    rows: list[tuple[str, ImageComparison, ImageComparison | None, Word]]
+    rows = [("cover", images.cover, images.cover_baseline, "visible")]
+    for index, pair in enumerate(zip(images.secrets, images.secret_baselines, strict=False)):
+        rows.append((numbered("secret", index, count), *pair, "missed"))
+    for name, found, baseline, otherwise in rows:
+        if baseline is not None:
+            got, plain = found.mean.psnr, baseline.mean.psnr
+            word = _word(got >= min(plain - QUALITY_LOSS, INVISIBLE), otherwise)
+            beside, limit = f"{decibel(plain)}, plain 3DGS", f"at most {decibel(QUALITY_LOSS, 1)} less"
+            yield Verdict(f"{name} on test photos", decibel(got), beside, limit, word, "images")
 
 
 def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
@@ -155,14 +143,9 @@ def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
     wrong = audit.wrong_key
     pairs = zip(wrong.shown.vs_secrets, wrong.chance_level, strict=False)
     shown, chance = max(((each.max, chance) for each, chance in pairs), key=lambda pair: pair[0] - pair[1])
-    yield Verdict(
-        "wrong keys",
-        f"{decibel(shown)}, best of {wrong.shown.keys:,}",
-        f"{decibel(chance)}, published model",
-        f"at most {decibel(LEAK_PSNR, 1)} more",
-        "fine" if shown - chance <= LEAK_PSNR else "visible",
-        "wrong-keys",
-    )
+    value, beside = f"{decibel(shown)}, best of {wrong.shown.keys:,}", f"{decibel(chance)}, published model"
+    limit = f"at most {decibel(LEAK_PSNR, 1)} more"
+    yield Verdict("wrong keys", value, beside, limit, _word(shown - chance <= LEAK_PSNR), "wrong-keys")
 
 
 def _leaks(audit: Audit) -> Iterator[Verdict]:
@@ -171,29 +154,18 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
     if not leaks:
         return
     worst = LeakScores.combined(max, leaks)
-    yield Verdict(
-        "leaks without the key",
-        f"{difference(worst.psnr)} dB, {difference(worst.ssim, 3)} SSIM",
-        "0, plain model",
-        f"at most {decibel(LEAK_PSNR, 1)} and {LEAK_SSIM} SSIM",
-        "fine" if worst.psnr <= LEAK_PSNR and worst.ssim <= LEAK_SSIM else "visible",
-        "leaks",
-    )
+    value = f"{difference(worst.psnr)} dB, {difference(worst.ssim, 3)} SSIM"
+    limit = f"at most {decibel(LEAK_PSNR, 1)} and {LEAK_SSIM} SSIM"
+    word = _word(worst.psnr <= LEAK_PSNR and worst.ssim <= LEAK_SSIM)
+    yield Verdict("leaks without the key", value, "0, plain model", limit, word, "leaks")
     # Haze is nearer to most photos than darkness is. What is left when colours are fitted is the secret.
-    within = (
-        worst.psnr_fitted <= LEAK_PSNR
-        and worst.ssim_fitted <= LEAK_SSIM
-        and worst.gradient_coarse <= LEAK_GRADIENT
-    )
-    yield Verdict(
-        "the secret's shapes in them",
-        f"{difference(worst.psnr_fitted)} dB, {difference(worst.ssim_fitted, 3)} SSIM, "
-        f"{difference(worst.gradient_coarse)} gradients",
-        "0, plain model; colours fitted",
-        f"at most {decibel(LEAK_PSNR, 1)}, {LEAK_SSIM} and {LEAK_GRADIENT}",
-        "fine" if within else "visible",
-        "leaks",
-    )
+    value = f"{difference(worst.psnr_fitted)} dB, {difference(worst.ssim_fitted, 3)} SSIM"
+    value += f", {difference(worst.gradient_coarse)} gradients"
+    limit = f"at most {decibel(LEAK_PSNR, 1)}, {LEAK_SSIM} and {LEAK_GRADIENT}"
+    nothing_fits = worst.psnr_fitted <= LEAK_PSNR and worst.ssim_fitted <= LEAK_SSIM
+    word = _word(nothing_fits and worst.gradient_coarse <= LEAK_GRADIENT)
+    beside = "0, plain model; colours fitted"
+    yield Verdict("the secret's shapes in them", value, beside, limit, word, "leaks")
 
 
 def _distances(audit: Audit) -> Iterator[Verdict]:
@@ -204,15 +176,10 @@ def _distances(audit: Audit) -> Iterator[Verdict]:
     plain = {name: each.original for name, each in attributes.items() if each.original is not None}
     worst = max(ratios, key=lambda name: ratios[name] / max(plain.get(name, 0.0), DISTANCE_RATIO))
     own = f"; the cover's plain model {times(plain[worst])}" if worst in plain else ""
-    within = ratios[worst] <= max(DISTANCE_RATIO, 1.01 * plain.get(worst, 0.0))
-    yield Verdict(
-        "attributes of the Gaussians",
-        f"{worst} {times(ratios[worst])}",
-        f"1×, between plain models{own}",
-        f"at most {DISTANCE_RATIO}×, or as the plain model's",
-        "fine" if within else "visible",
-        "statistics",
-    )
+    value, beside = f"{worst} {times(ratios[worst])}", f"1×, between plain models{own}"
+    limit = f"at most {DISTANCE_RATIO}×, or as the plain model's"
+    word = _word(ratios[worst] <= max(DISTANCE_RATIO, 1.01 * plain.get(worst, 0.0)))
+    yield Verdict("attributes of the Gaussians", value, beside, limit, word, "statistics")
 
 
 def _two_sample(audit: Audit) -> Iterator[Verdict]:
@@ -224,15 +191,10 @@ def _two_sample(audit: Audit) -> Iterator[Verdict]:
     own = max((each.auc for each in found.original), default=None)
     beside = [] if control is None else [f"{number(control, 2)}, between plain models"]
     beside += [] if own is None else [f"the cover's plain model {number(own, 2)}"]
-    within = stego <= max(TWO_SAMPLE_AUC, 0.0 if own is None else own + AS_THE_PLAIN_MODEL)
-    yield Verdict(
-        "classifier between models",
-        f"AUC {number(stego, 2)}",
-        "; ".join(beside),
-        f"at most {TWO_SAMPLE_AUC}" + ("" if own is None else ", or as the plain model's"),
-        "fine" if within else "visible",
-        "statistics",
-    )
+    limit = f"at most {TWO_SAMPLE_AUC}" + ("" if own is None else ", or as the plain model's")
+    word = _word(stego <= max(TWO_SAMPLE_AUC, 0.0 if own is None else own + AS_THE_PLAIN_MODEL))
+    value = f"AUC {number(stego, 2)}"
+    yield Verdict("classifier between models", value, "; ".join(beside), limit, word, "statistics")
 
 
 def _detectors(audit: Audit, program: Program) -> Iterator[Verdict]:
@@ -241,14 +203,14 @@ def _detectors(audit: Audit, program: Program) -> Iterator[Verdict]:
     if not found:
         return
     worst = max(found, key=lambda each: (each.is_suspicious(), each.excess()))
-    yield Verdict(
-        f"{program} on renders",
-        f"AUC {auc_text(worst.published)}" + (f", {worst.name}" if len(found) > 1 else ""),
-        f"{auc_text(worst.control)}, between plain models" if worst.control else "0.5, guessing",
-        f"{IMAGE_AUC} further from 0.5, or within interval",
-        "visible" if worst.is_suspicious() else "fine",
-        "renders",
-    )
+    value = f"AUC {auc_text(worst.published)}" + (f", {worst.name}" if len(found) > 1 else "")
+    beside = f"{auc_text(worst.control)}, between plain models" if worst.control else "0.5, guessing"
+    limit = f"{IMAGE_AUC} further from 0.5, or within interval"
+    yield Verdict(f"{program} on renders", value, beside, limit, _word(not worst.is_suspicious()), "renders")
+
+
+def _word(within: bool, otherwise: Word = "visible") -> Word:
+    return "fine" if within else otherwise
 
 
 def _pruning(audit: Audit) -> Iterator[Verdict]:
@@ -257,26 +219,16 @@ def _pruning(audit: Audit) -> Iterator[Verdict]:
     if pruned is None or pruned.cover is None or not pruned.secrets:
         return
     opens, worst = all(each.opens for each in pruned.secrets), max(each.loss for each in pruned.secrets)
-    within = opens and worst - pruned.cover.loss <= PRUNING_LOSS
-    yield Verdict(
-        f"loss of a random {PRUNED:.0%} of the Gaussians",
-        f"secret {difference(-worst)} dB" if opens else "the secret does not open",
-        f"cover {difference(-pruned.cover.loss)} dB",
-        f"at most {decibel(PRUNING_LOSS, 1)} more",
-        "fine" if within else "missed",
-        "robustness",
-    )
+    word = _word(opens and worst - pruned.cover.loss <= PRUNING_LOSS, "missed")
+    measure = f"loss of a random {PRUNED:.0%} of the Gaussians"
+    value = f"secret {difference(-worst)} dB" if opens else "the secret does not open"
+    beside, limit = f"cover {difference(-pruned.cover.loss)} dB", f"at most {decibel(PRUNING_LOSS, 1)} more"
+    yield Verdict(measure, value, beside, limit, word, "robustness")
 
 
 def _readers(audit: Audit) -> Iterator[Verdict]:
     loads = [each.loads for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
     if not loads:
         return
-    yield Verdict(
-        "other readers of the file",
-        f"{sum(loads)} of {len(loads)}",
-        "",
-        "all",
-        "fine" if all(loads) else "missed",
-        "speed",
-    )
+    word = _word(all(loads), "missed")
+    yield Verdict("other readers of the file", f"{sum(loads)} of {len(loads)}", "", "all", word, "speed")

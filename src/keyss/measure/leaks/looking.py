@@ -14,7 +14,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.core.similarity import Similarity
 from keyss.fitting.image_metrics import subsample_views
-from keyss.measure.leaks.attacks import Attack, Parameter, file_attacks
+from keyss.measure.leaks.attacks import Attack, Parameter
 from keyss.measure.leaks.scores import LeakScores, scores
 from keyss.rendering import render
 
@@ -44,30 +44,6 @@ class AttackResult:
 def look_for_secret(
     stego: Gaussians,
     controls: Sequence[Gaussians],
-    cover: Scene,
-    secret: Scene,
-    frame: Similarity,
-    *,
-    more: Sequence[Attack] = (),
-    test_views: int = 8,
-    cover_views: int = 32,
-    seed: int = 0,
-) -> tuple[list[AttackResult], dict[str, Tensor]]:
-    """Every attack on one secret, and a picture of each by its name.
-
-    `stego` and `controls`, one or more plain models of the cover, are in the cover's frame, `cover` and
-    `secret` in their own, and `frame` leads from the secret's into the cover's. `more`: attacks of who knows
-    more than the file, such as a `source_attack`. Of the secret's test views at most `test_views` are used
-    and of the cover's training views `cover_views`, evenly spread. See `attack` for what comes back. Raises
-    UsageError for no control and for a secret without test views.
-    """
-    attacks = file_attacks([view.camera for view in subsample_views(cover.train, cover_views)], seed)
-    return attack(stego, controls, secret, frame, [*attacks, *more], test_views=test_views)
-
-
-def attack(
-    stego: Gaussians,
-    controls: Sequence[Gaussians],
     secret: Scene,
     frame: Similarity,
     attacks: Sequence[Attack],
@@ -76,9 +52,11 @@ def attack(
 ) -> tuple[list[AttackResult], dict[str, Tensor]]:
     """How well attacks show the secret, seen from its own test cameras where it lies, against its photos.
 
-    The strictest assumption: the attacker stands where the secret was photographed. Pictures are uint8
+    `stego` and `controls`, one or more plain models of the cover, are in the cover's frame, `secret` in its
+    own, and `frame` leads from there into the cover's. Of the test views at most `test_views` are used. The
+    strictest assumption: the attacker stands where the secret was photographed. Pictures are uint8
     [H, W, 3], by the attack's name: the best view, from the first test camera, of stego and of the first
-    control, and the photo.
+    control, and the photo. Raises UsageError for no control and for a secret without test views.
     """
     if not controls:
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Literal, TypeVar
 
-from keyss.core.errors import BackendError, KeyssError, UsageError
+from keyss.core.errors import BackendError, InputError, KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -15,8 +15,7 @@ from keyss.fitting.image_metrics import quality, subsample_views
 from keyss.measure.robustness import changes as change
 from keyss.measure.robustness.changes import Change
 from keyss.measure.robustness.conversions import converters
-from keyss.measure.robustness.reopening import Reopen
-from keyss.measure.robustness.retraining import fine_tuning, purification
+from keyss.methods.base import Opened
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
@@ -27,6 +26,36 @@ UNCHANGED = "none"
 First = Literal["cover", "secret", "both", "neither"]
 T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class Reopened:
+    """A secret as it was revealed."""
+
+    gaussians: Gaussians  # in the secret's own frame
+    frame: Similarity = field(default_factory=Similarity.identity)  # from there into the cover's
+
+
+# Raises a KeyssError when the secret cannot be opened.
+Reopen = Callable[[Gaussians], Reopened]
+
+
+@dataclass(frozen=True)
+class Reopener:
+    """`reopener(stego)` is what `keyss reveal` gives, with `--force` where the model asks for it."""
+
+    key: str = field(repr=False)
+    open: Callable[[Gaussians, str], Opened] = field(repr=False)  # stego model on the CPU, key
+
+    def __call__(self, stego: Gaussians) -> Reopened:
+        """Raises WrongKeyError and InputError as `open` does."""
+        stego = stego.to("cpu")
+        secret = self.open(stego, self.key)
+        try:
+            revealed = secret.reveal(stego)
+        except InputError:  # positions changed, so that it seems to be another model
+            revealed = secret.reveal(stego, force=True)
+        return Reopened(revealed, secret.frame or Similarity.identity())
 
 
 @dataclass(frozen=True)
@@ -85,12 +114,10 @@ class BreakdownPoint:
     excess: float | None  # dB: the most that the secret loses more than the cover while that is not broken
 
 
-def default_changes(
-    cover: Scene, *, seed: int = 0, purify_steps: int = 300, tune_steps: int = 500, sog_iterations: int = 1
-) -> list[Change]:
+def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
     """All changes, those of an attack one after another, the mildest first.
 
-    `cover`: its training photos serve those who train on; so many steps. `sog_iterations`: see `converters`.
+    `cover`: its training photos serve those who train on.
     """
     return [
         *(change.random_pruning(share, seed + draw) for share in PRUNED for draw in range(DRAWS)),
@@ -99,9 +126,9 @@ def default_changes(
         *(change.fewer_harmonics(degree) for degree in (2, 1, 0)),
         change.half_floats(),
         *(change.noise(attribute, strength, seed) for attribute in change.NOISY for strength in NOISE),
-        *(converter.change() for converter in converters(sog_iterations)),
-        *(purification(cover, given_up, purify_steps, seed) for given_up in (0.0, 0.01)),
-        fine_tuning(cover, tune_steps, seed),
+        *(converter.change() for converter in converters()),
+        *(change.purification(cover, given_up, seed=seed) for given_up in (0.0, 0.01)),
+        change.fine_tuning(cover, seed=seed),
     ]
 
 
@@ -158,12 +185,8 @@ def mean_over_draws(results: Sequence[ChangeResult]) -> list[ChangeResult]:
         replace(
             draws[0],
             draws=len(draws),
-            cover=_mean([draw.cover for draw in draws if draw.cover is not None]),
-            secrets=tuple(
-                found
-                for each in zip(*(draw.secrets for draw in draws), strict=False)
-                if (found := _mean(each)) is not None
-            ),
+            cover=_mean(covers) if (covers := [draw.cover for draw in draws if draw.cover]) else None,
+            secrets=tuple(map(_mean, zip(*(draw.secrets for draw in draws), strict=False))),
         )
         for draws in groups
     ]
@@ -211,9 +234,7 @@ def _grouped(items: Sequence[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
-def _mean(draws: Sequence[ChangedQuality]) -> ChangedQuality | None:
-    if not draws:
-        return None
+def _mean(draws: Sequence[ChangedQuality]) -> ChangedQuality:
     return ChangedQuality(
         fmean(draw.psnr for draw in draws),
         fmean(draw.ssim for draw in draws),

@@ -1,0 +1,198 @@
+"""StegExpose (2014): four detectors of LSB replacement in 8-bit images, their mean, and whole folders.
+
+Written anew from a description of what the original program computes; it gives the original's scores,
+quirks included. For any renderer's output an AUC near 0.5 is to be expected: nothing there replaces the
+last bits of pixels.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from keyss.core.errors import InputError, UsageError
+from keyss.files.images import open_image
+from keyss.fitting.loop import Reporter, SilentReporter
+from keyss.measure.lsb_detectors import chi_square, primary_sets, rs, sample_pairs
+
+THRESHOLD = 0.2  # the original's
+# In the order in which the original program runs them, which matters to whoever stops early.
+_ORDER = {"primary_sets": primary_sets, "sample_pairs": sample_pairs, "chi_square": chi_square, "rs": rs}
+DETECTORS = ("primary_sets", "chi_square", "sample_pairs", "rs")  # in the order of its table
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What StegExpose says of one image, each in [0, 1].
+
+    A detector is NaN where its equation has no solution and None where it does not take the image (Sample
+    Pairs: an odd width or height; Chi Square: less than about 87,700 pixels) or was not reached. `fusion` is
+    the mean of the others, NaN where there are none. It averages whatever answered: compare only images of
+    one size.
+    """
+
+    primary_sets: float | None
+    chi_square: float | None
+    sample_pairs: float | None
+    rs: float | None
+    fusion: float | None  # None in records of what is NaN
+
+
+def score_image(image: NDArray[np.uint8], *, stop_below: float | None = None) -> Scores:
+    """Scores of an image [H, W, 3] uint8.
+
+    `stop_below` is the original's fast mode: as soon as the mean of what has answered is below it, the
+    detectors that are left are not run. Such means are of different detectors: make no ROC of them.
+    Raises UsageError for another shape or type.
+    """
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise UsageError(f"expected an image [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}")
+    found: dict[str, float | None] = dict.fromkeys(DETECTORS)
+    answers: list[float] = []
+    for name, detector in _ORDER.items():
+        score = detector(image)
+        if score is not None:
+            found[name] = score = score if math.isnan(score) else min(abs(score), 1.0)
+            if not math.isnan(score):
+                answers.append(score)
+        if stop_below is not None and answers and sum(answers) / len(answers) < stop_below:
+            break
+    return Scores(**found, fusion=sum(answers) / len(answers) if answers else math.nan)
+
+
+def score_file(path: Path | str, *, stop_below: float | None = None) -> Scores:
+    """`score_image` of a file, decoded as the original does (`read_pixels`). Raises InputError."""
+    return score_image(read_pixels(path), stop_below=stop_below)
+
+
+def read_pixels(path: Path | str) -> NDArray[np.uint8]:
+    """[H, W, 3] of an image file as Java's ImageIO decodes it.
+
+    Transparency is ignored, not blended. Grey of 8 and 16 bits is taken for linear light and gets the sRGB
+    curve, so that 256 levels become 183. Colours of 16 bits keep their upper byte, which may be 1 off.
+    Raises InputError for what cannot be read or has more than 89 million pixels.
+    """
+    path = Path(path)
+    with open_image(path) as image:
+        try:
+            return _decode(image)
+        except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
+            raise InputError(
+                f"{path}: expected an image, but its pixels cannot be decoded: {error}"
+            ) from error
+
+
+def _decode(image: Image.Image) -> NDArray[np.uint8]:
+    if image.mode.startswith("I"):
+        light = np.asarray(image, dtype=np.float64).clip(0, 65535) / 65535
+    elif image.mode in ("L", "LA") and image.format != "BMP":  # a grey BMP has a palette, in truth
+        light = np.asarray(image.getchannel(0)) / 255
+    else:
+        image.load()
+        image.info.pop("transparency", None)  # Pillow would warn that it gets lost
+        return np.array(image.convert("RGB"), dtype=np.uint8)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    return np.repeat(np.rint(255 * encoded).astype(np.uint8)[:, :, None], 3, axis=2)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One image: its file name, its scores, and what they are taken for."""
+
+    file: str
+    scores: Scores
+    flagged: bool  # fusion above the threshold
+    secret_bytes: int  # size of the secret, guessed as fusion x size of the file / 3
+
+
+@dataclass(frozen=True)
+class Steganalysis:
+    """The images of a folder by name, and the names of the files that are no readable images."""
+
+    rows: list[Row]
+    skipped: list[str]
+
+    @property
+    def mean_fusion(self) -> float | None:
+        """Over the images that have one."""
+        found = [row.scores.fusion for row in self.rows]
+        fusions = [fusion for fusion in found if fusion is not None and not math.isnan(fusion)]
+        return sum(fusions) / len(fusions) if fusions else None
+
+
+def steganalyze(
+    folder: Path | str,
+    threshold: float = THRESHOLD,
+    fast: bool = False,
+    reporter: Reporter | None = None,
+) -> Steganalysis:
+    """Scores of all images in `folder`, not in those below it, sorted by name.
+
+    `fast` stops with an image as soon as it looks clean (see `score_image`). Files that are no readable
+    images are skipped and named in the result. Raises InputError when there is no readable image, and
+    UsageError for a threshold outside of [0, 1].
+    """
+    folder = Path(folder)
+    if not 0 <= threshold <= 1:
+        raise UsageError(f"expected a threshold from 0 to 1, got {threshold:g}")
+    paths = _files(folder)
+    rows: list[Row] = []
+    skipped: list[str] = []
+    reporter = reporter or SilentReporter()
+    reporter.start(f"steganalyze {folder}", len(paths), 0)
+    try:
+        for done, path in enumerate(paths, start=1):
+            try:
+                rows.append(_row(path, threshold, fast))
+            except InputError:
+                skipped.append(path.name)
+            reporter.update(done, 0, {})
+    finally:
+        reporter.finish()
+    if not rows:
+        raise InputError(f"{folder}: expected images, but none of its files can be read as one")
+    return Steganalysis(rows, skipped)
+
+
+def csv_bytes(rows: Sequence[Row]) -> bytes:
+    """A table in UTF-8: `null` where a detector does not take the image, `NaN` where it finds no solution."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["file", *DETECTORS, "fusion", "flagged", "secret_bytes"])
+    for row in rows:
+        scores = asdict(row.scores)
+        cells = [_spelled(scores[name]) for name in (*DETECTORS, "fusion")]
+        writer.writerow([row.file, *cells, str(row.flagged).lower(), row.secret_bytes])
+    return text.getvalue().encode(errors="surrogateescape")  # file names may be any bytes
+
+
+def _files(folder: Path) -> list[Path]:
+    try:
+        paths = sorted(path for path in folder.iterdir() if path.is_file())
+    except OSError as error:
+        raise InputError(f"{folder}: expected a folder of images: {error.strerror}") from error
+    if not paths:
+        raise InputError(f"{folder}: expected images, but there are no files in it")
+    return paths
+
+
+def _row(path: Path, threshold: float, fast: bool) -> Row:
+    scores = score_file(path, stop_below=threshold if fast else None)
+    fusion = scores.fusion
+    if fusion is None or math.isnan(fusion):
+        return Row(path.name, scores, flagged=False, secret_bytes=0)
+    return Row(path.name, scores, fusion > threshold, math.floor(fusion * path.stat().st_size / 3 + 0.5))
+
+
+def _spelled(score: float | None) -> str:
+    if score is None:
+        return "null"
+    return "NaN" if math.isnan(score) else repr(score)
