@@ -14,7 +14,7 @@ from scipy.stats import wasserstein_distance
 from keyss.core import Gaussians
 from keyss.core.errors import UsageError
 from keyss.measure import against_controls, attribute_distances, distances
-from keyss.measure.features import features
+from keyss.measure.distances import features
 from measure.lifelike import (
     CHANGES,
     doubled_scales,

@@ -130,7 +130,6 @@ def test_readers_that_are_absent_say_so(tmp_path: Path, monkeypatch: pytest.Monk
     def missing(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr(module, "import_module", missing)
     monkeypatch.setattr("keyss.measure.robustness.conversions.import_module", missing)
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
     write_ply(tmp_path / "a.ply", random_gaussians(4))

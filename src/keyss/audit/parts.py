@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
 from keyss.audit.progress import PartProgress, PartResult
@@ -25,7 +23,7 @@ from keyss.measure.leaks.looking import AttackResult, look_for_secret
 from keyss.measure.robustness.survival import breakdown_points
 from keyss.measure.robustness.survival import robustness as measure_robustness
 from keyss.measure.roc import stegexpose_roc
-from keyss.measure.sealwatch_detectors import SealwatchRocs, sealwatch_roc
+from keyss.measure.sealwatch_detectors import sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import SpeedResult
 from keyss.measure.speed import speed as measure_speed
@@ -112,10 +110,15 @@ def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
     plain, stego, control = (
         [image.numpy() for _, image in renders_of(model, subject.cover, views)] for model in models
     )
-    found, missing = [], None
+    found: list[RenderDetection] = []
+    missing = None
     for index, others in enumerate((stego, control)):
         progress(index, 2)
-        sealwatch, missing = _sealwatch(plain, others, seed)
+        sealwatch = None
+        try:
+            sealwatch = sealwatch_roc(plain, others, seed=seed)
+        except BackendError as error:
+            missing = str(error)  # which says how to get it
         found.append(RenderDetection(stegexpose_roc(plain, others), sealwatch))
     names = tuple(picture_name(view.camera) for view in views)
     return PartResult(RendersResult(names, found[0], found[1], missing))
@@ -172,16 +175,6 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
 PARTS: dict[str, AuditPart] = {
     part.__name__: part for part in (images, parameters, stegexpose, leaks, robustness, speed)
 }
-
-
-def _sealwatch(
-    plain: Sequence[npt.NDArray[np.uint8]], others: Sequence[npt.NDArray[np.uint8]], seed: int
-) -> tuple[SealwatchRocs | None, str | None]:
-    """What its detectors find, or how to get them."""
-    try:
-        return sealwatch_roc(plain, others, seed=seed), None
-    except BackendError as error:
-        return None, str(error)
 
 
 def _views_by_source(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -98,7 +98,7 @@ def what_wrong_keys_show(
 ) -> WrongKeys | None:
     """PSNRs of what the decoders make of embeddings [E, 64] that are not theirs; None without decoders."""
     cover = scenes[0]
-    decoders: list[tuple[Callable[[Gaussians, Tensor], Gaussians], Similarity, Scene]] = [
+    decoders = [
         (each.decode, frame_of(each, secret, cover), secret)
         for each, secret in zip(opened, scenes[1:], strict=True)
         if each.decode is not None

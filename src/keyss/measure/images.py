@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -78,11 +78,8 @@ def compare_images(
             f"expected pictures of the same names on both sides, got {len(ours)} and {len(theirs)}; "
             f"without a partner: {', '.join(alone[:5])}{', ...' if len(alone) > 5 else ''}"
         )
-    optional: dict[str, Callable[[Tensor, Tensor], float]] = {}
-    if lpips:
-        optional["lpips_alex"] = lpips_alex
-    if flip:
-        optional["flip"] = _flip
+    known = (("lpips_alex", lpips_alex, lpips), ("flip", _flip, flip))
+    optional = {name: function for name, function, wanted in known if wanted}
     views: dict[str, dict[str, float]] = {}
     missing: dict[str, str] = {}
     for name in sorted(ours):

@@ -14,7 +14,6 @@ from scipy.stats import rankdata
 from keyss.core.errors import UsageError
 from keyss.measure.stegexpose import DETECTORS, Scores, score_image
 
-INTERVAL = "DeLong 1988, on the logit scale, 95 %"
 _Z = 1.959963984540054  # standard normal quantile of 0.975
 
 Score = float | None
@@ -32,7 +31,7 @@ class Roc:
     fpr: tuple[float, ...]  # corners of the curve, from (0, 0) to (1, 1)
     tpr: tuple[float, ...]
     unanswered: tuple[int, int]  # negatives and positives without a score
-    interval: str = INTERVAL
+    interval: str = "DeLong 1988, on the logit scale, 95 %"
 
 
 @dataclass(frozen=True)

@@ -105,14 +105,11 @@ def _mean_rate(attack: Callable[[NDArray[np.uint8]], float], image: Image) -> fl
 def _spam(sealwatch: Any, images: Sequence[Image]) -> Features:
     """Of each image, the mean over its channels."""
     with sealwatch.BACKEND_RUST:
-        return np.array(
-            [
-                np.mean(
-                    [sealwatch.tools.flatten(sealwatch.spam.extract(x)) for x in _channels(image)], axis=0
-                )
-                for image in images
-            ]
-        )
+        rows = [
+            [sealwatch.tools.flatten(sealwatch.spam.extract(x)) for x in _channels(image)] for image in images
+        ]
+    features: Features = np.mean(rows, axis=1)
+    return features
 
 
 def _held_out_votes(

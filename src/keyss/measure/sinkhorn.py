@@ -64,19 +64,15 @@ def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> f
 
 def _magnitudes(gaussians: Gaussians) -> dict[str, Doubles]:
     """[N] non-negative numbers of each attribute, divided by the largest."""
-
-    def share_of_largest(values: Tensor) -> Doubles:
-        array: Doubles = values.numpy()
-        return array / (array.max() or 1.0)
-
     flat = gaussians.detach().to("cpu").map(Tensor.double)
-    return {
-        "opacity": share_of_largest(flat.opacities.nan_to_num(0)),
-        "rotation": share_of_largest(flat.quats.norm(dim=1)),
-        "scale": share_of_largest(flat.scales.norm(dim=1)),
-        "position": share_of_largest(flat.means.norm(dim=1)),
-        "colour": share_of_largest(flat.sh[:, 0].norm(dim=1)),
+    sizes = {
+        "opacity": flat.opacities.nan_to_num(0),
+        "rotation": flat.quats.norm(dim=1),
+        "scale": flat.scales.norm(dim=1),
+        "position": flat.means.norm(dim=1),
+        "colour": flat.sh[:, 0].norm(dim=1),
     }
+    return {name: size.numpy() / (float(size.max()) or 1.0) for name, size in sizes.items()}
 
 
 def _sinkhorn(original: Doubles, other: Doubles) -> float:

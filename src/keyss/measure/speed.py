@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -19,7 +18,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.ply import read_ply, write_ply
 from keyss.fitting.image_metrics import subsample_views
-from keyss.measure.robustness.conversions import find_gsply, transform
+from keyss.measure.robustness.conversions import find_package, transform
 from keyss.measure.robustness.survival import Reopen
 from keyss.rendering import render
 
@@ -162,11 +161,7 @@ def _columns_of(model: Gaussians) -> Columns:
 
 
 def _plyfile(path: Path) -> Columns:
-    try:
-        plyfile = import_module("plyfile")
-    except ImportError as error:
-        raise BackendError("plyfile is not installed (pip install plyfile)") from error
-    vertices = plyfile.PlyData.read(path)["vertex"]
+    vertices = find_package("plyfile").PlyData.read(path)["vertex"]
 
     def columns(*names: str) -> np.ndarray[Any, Any]:
         return np.stack([vertices[name] for name in names], axis=1)
@@ -184,7 +179,7 @@ def _plyfile(path: Path) -> Columns:
 
 
 def _gsply(path: Path) -> Columns:
-    data = find_gsply().plyread(path)
+    data = find_package("gsply").plyread(path)
     count = len(data.means)
     return {
         "means": data.means,

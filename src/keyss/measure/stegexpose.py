@@ -193,6 +193,4 @@ def _row(path: Path, threshold: float, fast: bool) -> Row:
 
 
 def _spelled(score: float | None) -> str:
-    if score is None:
-        return "null"
-    return "NaN" if math.isnan(score) else repr(score)
+    return "null" if score is None else "NaN" if math.isnan(score) else repr(score)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.measure.features import features
+from keyss.measure.distances import features
 from keyss.measure.roc import delong
 
 LEAST, MOST = 100, 10_000  # Gaussians of each model
@@ -49,7 +49,7 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> AucInterval:
     """AUC of boosted trees that tell single Gaussians of `b` from those of `a`.
 
     The mean over five folds, and its 95 % confidence interval by DeLong's method (1988). Trees see
-    `keyss.measure.features.features`, of as many Gaussians of one model as of the other: random subsets (by
+    `keyss.measure.distances.features`, of as many Gaussians of one model as of the other: random subsets (by
     `seed`) of at most 10,000. Folds are made of cells of space. Were they made of single Gaussians, a
     model against itself would score far below 0.5, for the trees would have learnt from the equal of each
     Gaussian held out, with the other label. Raises UsageError for a model of fewer than 100 Gaussians, or

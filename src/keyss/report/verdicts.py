@@ -82,12 +82,10 @@ def headline(lines: Sequence[Verdict]) -> str:
     if not lines:
         return "Nothing was measured that could be judged."
     fine = sum(line.word == "fine" for line in lines)
+    if fine == len(lines) == 1:
+        return "The one measure is within its limit."
     if fine == len(lines):
-        return (
-            f"All {fine} measures are within their limits."
-            if fine > 1
-            else "The one measure is within its limit."
-        )
+        return f"All {fine} measures are within their limits."
     parts = [f"{fine} of {len(lines)} measures are within their limits."]
     for word in ("visible", "missed"):
         names = [line.measure for line in lines if line.word == word]

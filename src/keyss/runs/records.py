@@ -33,7 +33,8 @@ def read_record(path: Path, type: type[T], *, at_most: int = MOST_BYTES) -> T:
     if not path.exists():
         raise InputError(f"{path}: missing; expected a file that keyss wrote")
     data = read_file(path, at_most)
-    expected = _default_version(type)
+    generic: Any = type
+    expected = int(generic.version)  # a field's default is an attribute of its class
     try:
         found = msgspec.json.decode(data, type=_Versioned).version
         if found != expected:
@@ -54,7 +55,3 @@ def write_record(path: Path, record: Any) -> None:
 def record_bytes(record: Any) -> bytes:
     """JSON of a dataclass, for people and programs; NaN and infinite numbers become null."""
     return msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
-
-
-def _default_version(type: Any) -> int:
-    return int(type.version)  # a field's default is an attribute of its class

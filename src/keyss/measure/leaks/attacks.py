@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import get_args
 
@@ -107,18 +108,11 @@ def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed:
     random embeddings do.
     """
 
-    def search(model: Gaussians) -> Shown:
+    def show(model: Gaussians) -> Shown:
         found = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
-            found[name] = search_embeddings(
-                decode,
-                model,
-                restarts=restarts,
-                steps=steps,
-                most=SEARCH_SAMPLE,
-                balance=balance,
-                seed=seed,
-            )
+            search = partial(search_embeddings, decode, model, most=SEARCH_SAMPLE, balance=balance)
+            found[name] = search(restarts=restarts, steps=steps, seed=seed)
         for name, embeddings in found.items():
             for index, embedding in enumerate(embeddings, start=1):
                 yield f"{name}, {index}", decode(model, embedding)
@@ -127,7 +121,7 @@ def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed:
         "decoder without its key",
         "Random embeddings, and those under which the decoder changes most, searched by gradient.",
         {"restarts": restarts, "steps": steps, "seed": seed},
-        search,
+        show,
     )
 
 

@@ -25,7 +25,9 @@ from keyss.fitting.sampling import Shuffle
 from keyss.rendering import render
 from keyss.rendering.contributions import contributions
 
-NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harmonics")
+_FIELDS = {"position": "means", "log scale": "log_scales", "quaternion": "quats"}
+_FIELDS |= {"logit opacity": "opacity_logits"}
+NOISY = (*_FIELDS, "colour", "harmonics")
 VIEWS = 64  # in which purification looks for what is used
 
 
@@ -83,18 +85,12 @@ def noise(attribute: str, strength: float, seed: int = 0) -> Change:
         return values + strength * spread(values) * drawn
 
     def apply(model: Gaussians) -> Gaussians:
-        match attribute:
-            case "position":
-                return replace(model, means=noisy(model.means))
-            case "log scale":
-                return replace(model, log_scales=noisy(model.log_scales))
-            case "quaternion":
-                return replace(model, quats=noisy(model.quats))
-            case "logit opacity":
-                return replace(model, opacity_logits=noisy(model.opacity_logits))
-            case "colour":
-                return replace(model, sh=torch.cat([noisy(model.sh[:, :1]), model.sh[:, 1:]], dim=1))
-        return replace(model, sh=torch.cat([model.sh[:, :1], noisy(model.sh[:, 1:])], dim=1))
+        if attribute in _FIELDS:
+            name = _FIELDS[attribute]
+            return replace(model, **{name: noisy(getattr(model, name))})
+        constant, others = model.sh[:, :1], model.sh[:, 1:]
+        changed = [noisy(constant), others] if attribute == "colour" else [constant, noisy(others)]
+        return replace(model, sh=torch.cat(changed, dim=1))
 
     sentence = f"Normal noise of {strength:g} times its spread is added to the {attribute} of every Gaussian."
     return Change(f"noise on {attribute}", strength, "spreads of the attribute", sentence, apply, seed)

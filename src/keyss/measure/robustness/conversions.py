@@ -100,12 +100,12 @@ def find_splat_transform() -> str:
     return found
 
 
-def find_gsply() -> ModuleType:
-    """The module. Raises BackendError."""
+def find_package(name: str) -> ModuleType:
+    """A Python package of other people's. Raises BackendError."""
     try:
-        return import_module("gsply")
+        return import_module(name)
     except ImportError as error:
-        raise BackendError("gsply is not installed (pip install gsply)") from error
+        raise BackendError(f"{name} is not installed (pip install {name})") from error
 
 
 def transform(source: Path, target: Path, *options: str) -> Path:
@@ -133,14 +133,14 @@ def _through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Pat
 
 
 def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = find_gsply(), folder / "there.compressed.ply", folder / "back.ply"
+    gsply, there, back = find_package("gsply"), folder / "there.compressed.ply", folder / "back.ply"
     gsply.plywrite(there, gsply.plyread(source), compressed=True)
     gsply.plywrite(back, gsply.plyread(there))
     return there, back
 
 
 def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = find_gsply(), folder / "there.spz", folder / "back.ply"
+    gsply, there, back = find_package("gsply"), folder / "there.spz", folder / "back.ply"
     gsply.write_spz(there, gsply.plyread(source), version=3)
     gsply.plywrite(back, gsply.read_spz(there))
     return there, back

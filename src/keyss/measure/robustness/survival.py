@@ -24,7 +24,6 @@ BROKEN_LOSS = 6.0  # dB: four times the squared error
 UNCHANGED = "none"
 
 First = Literal["cover", "secret", "both", "neither"]
-T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
 
 
@@ -227,10 +226,12 @@ def _breakdown_point(attack: str, results: Sequence[ChangeResult], broken_loss: 
     )
 
 
-def _grouped(items: Sequence[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    groups: dict[K, list[T]] = {}
-    for item in items:
-        groups.setdefault(key(item), []).append(item)
+def _grouped(
+    results: Sequence[ChangeResult], key: Callable[[ChangeResult], K]
+) -> dict[K, list[ChangeResult]]:
+    groups: dict[K, list[ChangeResult]] = {}
+    for result in results:
+        groups.setdefault(key(result), []).append(result)
     return groups
 
 
