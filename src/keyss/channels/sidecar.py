@@ -14,6 +14,8 @@ from __future__ import annotations
 import secrets as system_random
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import astuple
 from itertools import combinations
 
 from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
@@ -56,7 +58,7 @@ def encrypt_sidecar(secrets: Sequence[tuple[str, Payload]], *, entropy: bytes | 
     count = -(-len(secrets) // SLOTS) * SLOTS
     packed = [pack_method(payload.method) + payload.data for _, payload in secrets]
     size = max(encrypted_size(compressed_size(data)) for data in packed)
-    header = _pack_header(derivation, count, _WRAPPED + size)
+    header = _HEADER.pack(MAGIC, VERSION, *astuple(derivation), count, _WRAPPED + size)
     slots = []
     for index, (key, data) in enumerate(zip(derived, packed, strict=True)):
         data_key = expand(entropy, f"sidecar/data-key/{index}", DATA_KEY_BYTES)
@@ -78,10 +80,10 @@ def read_header(data: bytes) -> tuple[KeyDerivation, int, int]:
     """(key derivation, slots, bytes of a slot). Raises InputError for anything but a whole sidecar."""
     if len(data) < _HEADER.size or not data.startswith(MAGIC):
         raise InputError("not a sidecar of keyss")
-    _, version, salt, passes, kib, lanes, count, size = _HEADER.unpack_from(data)
+    _, version, *costs, count, size = _HEADER.unpack_from(data)
     if version != VERSION:
         raise InputError(f"sidecar of version {version}; this program reads version {VERSION}")
-    derivation = KeyDerivation(salt=salt, time_cost=passes, memory_kib=kib, parallelism=lanes)
+    derivation = KeyDerivation(*costs)
     if not (1 <= count <= MAX_SLOTS and count % SLOTS == 0):
         raise InputError(f"sidecar: expected a multiple of {SLOTS} slots up to {MAX_SLOTS}, got {count}")
     if not _WRAPPED < size <= 2 * MAX_PAYLOAD_BYTES:
@@ -95,16 +97,13 @@ def read_header(data: bytes) -> tuple[KeyDerivation, int, int]:
 
 def decrypt_slots(data: bytes, key: DerivedKey) -> Payload:
     """The payload in the slot that `key` opens; every slot is tried. Errors as for `decrypt_sidecar`."""
-    _, count, size = read_header(data)
+    _, _, size = read_header(data)
     header, wrapping_key = data[: _HEADER.size], _wrapping_key(key)
     found: list[tuple[bytes, bytes]] = []
-    for index in range(count):
-        start = _HEADER.size + index * size
-        wrapped, sealed = data[start : start + _WRAPPED], data[start + _WRAPPED : start + size]
-        try:
-            found.append((aes_key_unwrap(wrapping_key, wrapped), sealed))
-        except InvalidUnwrap:
-            continue
+    for start in range(_HEADER.size, len(data), size):
+        with suppress(InvalidUnwrap):
+            data_key = aes_key_unwrap(wrapping_key, data[start : start + _WRAPPED])
+            found.append((data_key, data[start + _WRAPPED : start + size]))
     if not found:
         raise WrongKeyError("this key opens nothing here")
     data_key, sealed = found[0]
@@ -113,19 +112,6 @@ def decrypt_slots(data: bytes, key: DerivedKey) -> Payload:
         return Payload(unpack_method(plain), plain[METHOD_BYTES:])
     except ValueError as error:
         raise InputError(f"the encrypted data are damaged: {error}") from error
-
-
-def _pack_header(derivation: KeyDerivation, count: int, size: int) -> bytes:
-    return _HEADER.pack(
-        MAGIC,
-        VERSION,
-        derivation.salt,
-        derivation.time_cost,
-        derivation.memory_kib,
-        derivation.parallelism,
-        count,
-        size,
-    )
 
 
 def _wrapping_key(key: DerivedKey) -> bytes:

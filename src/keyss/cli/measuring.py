@@ -10,14 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from keyss.cli.arguments import (
-    Device,
-    KeyFiles,
-    Overwrite,
-    Resume,
-    checked_seed,
-    optional,
-)
+from keyss.cli.arguments import Device, KeyFiles, Overwrite, Resume, checked_seed, optional
 
 PartName = Literal["images", "parameters", "stegexpose", "leaks", "robustness", "speed"]
 

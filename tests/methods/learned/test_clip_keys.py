@@ -105,8 +105,17 @@ def test_without_transformers_one_sentence_names_the_extra(monkeypatch: pytest.M
         ClipKeys("anywhere")
 
 
-def test_hiding_encrypts_what_clip_gives(encoder: ClipKeys, folder: Path) -> None:
+def test_hiding_encrypts_what_clip_gives(
+    encoder: ClipKeys, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two keys that are the same to CLIP have the same embedding and open different things."""
+    loads, load = [], ClipKeys.__init__
+
+    def counted(self: ClipKeys, model: str) -> None:
+        loads.append(model)
+        load(self, model)
+
+    monkeypatch.setattr(ClipKeys, "__init__", counted)
     fit = FitConfig(iterations=10, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0)
     config = LearnedOptions(fit=fit, key_encoder="clip", clip_model=str(folder))
     scenes, models = (
@@ -115,6 +124,7 @@ def test_hiding_encrypts_what_clip_gives(encoder: ClipKeys, folder: Path) -> Non
     )
     hidden = hide_scenes(scenes, ["Key", "key"], config, plains=models, sidecar=True)
     first, second = (open_secret(hidden.stego, key, hidden.sidecar) for key in ("Key", "key"))
+    assert loads == [str(folder)]  # once for preparing and hiding together
     assert torch.equal(first.embedding, encoder("key"))
     assert torch.equal(second.embedding, encoder("key"))
     assert pack_secret(first) != pack_secret(second)

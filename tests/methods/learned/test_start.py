@@ -42,15 +42,14 @@ def _placed(count: int) -> list[PlacedScene]:
 def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
     config = LearnedOptions(fit=FitConfig(max_gaussians=330))
     start = make_start(_placed(3), config, torch.Generator())
-    assert len(start.gaussians) == 330
-    assert start.remaps is not None
+    assert len(start) == 330
     decoded = []
-    for curve in start.remaps:
+    for secret in range(2):
         decoder = Decoder(DecoderShape())
-        decoder.set_remap(*curve)
-        decoded.append(decoder(start.gaussians, decoder.key.fill_(1)).opacities)
+        decoder.set_remap(*opacity_remap(secret))
+        decoded.append(decoder(start, decoder.key.fill_(1)).opacities)
     first, second = decoded
-    shown = start.gaussians.opacities > 1 / 255
+    shown = start.opacities > 1 / 255
     # Every Gaussian is visible in one scene at most, and the secrets' are not drawn in the cover.
     assert int(shown.sum()) < 330 / 2
     assert not (shown & (first > 1 / 255)).any()
@@ -63,11 +62,10 @@ def test_the_key_brings_back_the_opacities_that_a_warm_start_hides() -> None:
     config = LearnedOptions(fit=FitConfig(max_gaussians=10_000))
     placed = _placed(3)
     start = make_start(placed, config, torch.Generator())
-    assert start.remaps is not None
-    for secret, curve in enumerate(start.remaps, start=1):
+    for secret in (1, 2):
         decoder = Decoder(DecoderShape())
-        decoder.set_remap(*curve)
-        revealed = decoder(start.gaussians, decoder.key.fill_(1))
+        decoder.set_remap(*opacity_remap(secret - 1))
+        revealed = decoder(start, decoder.key.fill_(1))
         own = slice(200 * secret, 200 * (secret + 1))  # nothing had to be left out
         torch.testing.assert_close(
             revealed.opacity_logits[own], placed[secret].plain.opacity_logits, atol=1e-4, rtol=0
@@ -94,12 +92,11 @@ def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
     faint = replace(wall, opacity_logits=torch.full((200,), -9.0))
     both = PlacedScene.of(placed.scene, Gaussians.cat([useless, wall, faint]), Similarity.identity())
     start = make_start([both], LearnedOptions(fit=FitConfig(max_gaussians=150)), torch.Generator())
-    assert (start.gaussians.means.abs() < 100).all()
-    assert (start.gaussians.opacity_logits == 5).all()
+    assert (start.means.abs() < 100).all()
+    assert (start.opacity_logits == 5).all()
 
 
 def test_start_from_points_divides_the_cap_between_the_scenes() -> None:
     config = LearnedOptions(fit=FitConfig(max_gaussians=100), start="points", decoder="network")
     start = make_start(_placed(2), config, torch.Generator().manual_seed(0))
-    assert len(start.gaussians) == 100
-    assert start.remaps is None
+    assert len(start) == 100

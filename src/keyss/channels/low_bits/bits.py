@@ -226,9 +226,7 @@ def _unlikely_copies(count: int) -> int:
     For 2^26 equally likely values there would be count^c / c! / 2^(26 (c - 1)) such sets, here at most 30.
     """
     copies = 3
-    while copies * math.log(max(count, 1)) - math.lgamma(copies + 1) > math.log(
-        30 * 2.0 ** (26 * (copies - 1))
-    ):
+    while count**copies / math.factorial(copies) > 30 * 2 ** (26 * (copies - 1)):
         copies += 1
     return copies
 
@@ -240,24 +238,13 @@ def _words(values: torch.Tensor) -> Words:
 
 def _used(gaussians: Gaussians) -> Words:
     """[N, F] bit patterns of the fields in use; a copy."""
-    return np.concatenate(
-        [
-            _words(gaussians.log_scales),
-            _words(gaussians.quats),
-            _words(gaussians.opacity_logits),
-            _words(gaussians.sh[:, 1:]),
-        ],
-        axis=1,
-    )
+    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
+    return np.concatenate([_words(values) for values in fields], axis=1)
 
 
 def _with_used(gaussians: Gaussians, used: Words) -> Gaussians:
     values = torch.from_numpy(used.view(np.float32)).to(gaussians.device)
-    rest = values[:, _GEOMETRY:].reshape(len(values), -1, 3)
-    return Gaussians(
-        means=gaussians.means,
-        quats=values[:, 3:7].contiguous(),
-        log_scales=values[:, :3].contiguous(),
-        opacity_logits=values[:, 7].contiguous(),
-        sh=torch.cat([gaussians.sh[:, :1], rest], dim=1),
-    )
+    log_scales, quats, opacity_logits, rest = values.split((3, 4, 1, values.shape[1] - _GEOMETRY), dim=1)
+    sh = torch.cat([gaussians.sh[:, :1], rest.reshape(len(values), -1, 3)], dim=1)
+    opacity_logits = opacity_logits[:, 0].contiguous()
+    return Gaussians(gaussians.means, quats.contiguous(), log_scales.contiguous(), opacity_logits, sh)

@@ -17,7 +17,7 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
 from keyss.methods.learned.decoder import Decoder
-from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits
+from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
 from keyss.methods.learned.start import make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
@@ -55,9 +55,8 @@ class JointRun:
         self.shuffles = [Shuffle(len(placed.scene.train), self.generator) for placed in scenes]
         self.extent = scenes[0].scene.extent
 
-        start = make_start(scenes, config, self.generator)
-        self.warm = start.remaps is not None
-        self.parameters = to_parameters(start.gaussians, device)
+        self.warm = config.start == "warm"
+        self.parameters = to_parameters(make_start(scenes, config, self.generator), device)
         self.optimizers = make_optimizers(self.parameters, config.fit, self.extent)
         self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
         if self.warm:
@@ -78,8 +77,8 @@ class JointRun:
             self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
         for decoder, embedding in self._keyed_decoders():
             decoder.prepare(self.gaussians(), embedding)
-        for decoder, remap in zip(self.decoders, start.remaps or (), strict=False):
-            decoder.set_remap(*remap)
+        for secret, decoder in enumerate(self.decoders if self.warm else ()):
+            decoder.set_remap(*opacity_remap(secret))
         self._all_decoders = torch.nn.ModuleList(self.decoders)
         # Opacity remaps have no weights, and an optimizer takes no empty list.
         weights = list(self._all_decoders.parameters()) or [torch.nn.Parameter(torch.zeros(0))]
@@ -168,18 +167,11 @@ class JointRun:
     @torch.no_grad()
     def _largest_opacity(self) -> Tensor:
         """[N] the largest opacity over the cover and all secrets."""
-        gaussians = self.gaussians()
-        opacities = [gaussians.opacities]
-        opacities += [self._decoded(secret, gaussians).opacities for secret in range(len(self.decoders))]
-        return torch.stack(opacities).amax(0)
+        return torch.stack([model.opacities for model in self._models()]).amax(0)
 
     def drawn(self) -> Tensor:
         """[N] whether a Gaussian is drawn in any scene: what is not would only give away where it lies."""
         return self._largest_opacity() >= DRAWN_OPACITY
-
-    def _decoded(self, secret: int, gaussians: Gaussians) -> Gaussians:
-        decoded: Gaussians = self.decoders[secret](gaussians, self.embeddings[secret])
-        return decoded
 
     def gaussians(self) -> Gaussians:
         """The model as it would be published."""
@@ -187,13 +179,15 @@ class JointRun:
 
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
-        gaussians = self.gaussians()
-        numbers = {"cover": mean_psnr(gaussians, self.watched[0], self.backgrounds[0])}
-        for secret in range(1, len(self.scenes)):
-            name = "secret" if len(self.embeddings) == 1 else f"secret {secret}"
-            decoded = self._decoded(secret - 1, gaussians)
-            numbers[name] = mean_psnr(decoded, self.watched[secret], self.backgrounds[secret])
-        return numbers
+        secrets = len(self.embeddings)
+        names = ["cover", *(f"secret {i}" if secrets > 1 else "secret" for i in range(1, secrets + 1))]
+        seen = zip(names, self._models(), self.watched, self.backgrounds, strict=True)
+        return {name: mean_psnr(model, views, background) for name, model, views, background in seen}
+
+    def _models(self) -> list[Gaussians]:
+        """What every key, and none, shows of the model as it would be published."""
+        cover = self.gaussians()
+        return [cover, *(decoder(cover, embedding) for decoder, embedding in self._keyed_decoders())]
 
     def state(self) -> tuple[State, dict[str, Any]]:
         tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)

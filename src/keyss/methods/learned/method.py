@@ -39,6 +39,7 @@ from keyss.methods.learned.targets import PlacedScene
 
 NAME = "learned"
 SIDECAR_ADVICE = "--sidecar writes a file beside it instead"
+_clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
 
 class LearnedMethod:
@@ -148,10 +149,7 @@ def encoder_of(options: LearnedOptions) -> Callable[[str], Tensor] | None:
     """From a key to the embedding [64] that conditions its decoder; None: Argon2id's. Raises BackendError."""
     if options.key_encoder == "argon2":
         return None
-    return _clip(options.clip_model or MODEL)
-
-
-_clip = lru_cache(maxsize=1)(ClipKeys)  # preparing and hiding use the same one
+    return _clip_keys(options.clip_model or MODEL)
 
 
 def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.linalg import block_diag
 
 from keyss.core.colour import OPPONENT
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
@@ -36,6 +37,9 @@ _LEAST_GAP = 2.0**-9
 # of the secret's values to the other. Low bits that are overwritten move opacity logits most: those between
 # 16 and 32 by 2^-10, in bands 2.6 wide.
 _MARGIN = 2.0**-11
+
+# [CHANNELS, CHANNELS] orthonormal: three log scales and three colours become a sum and two differences each.
+_TAKING_APART = block_diag(np.eye(3), OPPONENT, OPPONENT, 1.0)
 
 Table = npt.NDArray[np.float64]
 
@@ -81,7 +85,7 @@ class RankShift:
             before, after = start[channel].double().numpy(), end[channel].double().numpy()
             rank = np.interp(values[:, channel], before, rank_before)
             moved[:, channel] = np.interp((rank + sign * shift[:, channel]) % 1.0, rank_after, after)
-        columns = torch.from_numpy(_together(moved)).float().to(stego.device)
+        columns = torch.from_numpy(moved @ _TAKING_APART).float().to(stego.device)
         means, log_scales, sh = stego.means.clone(), stego.log_scales.clone(), stego.sh.clone()
         opacity_logits = stego.opacity_logits.clone()
         means[hidden], log_scales[hidden], sh[hidden, 0] = columns[:, 0:3], columns[:, 3:6], columns[:, 6:9]
@@ -133,15 +137,8 @@ def _channels(part: Gaussians) -> Table:
     """
     columns = [part.means, part.log_scales, part.sh[:, 0], part.opacity_logits[:, None]]
     values: Table = torch.cat(columns, dim=1).detach().cpu().double().numpy()
-    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ OPPONENT.T, values[:, 6:9] @ OPPONENT.T
-    return values
-
-
-def _together(channels: Table) -> Table:
-    """The inverse of `_channels`: [N, CHANNELS] positions, log scales, colours, opacity logits."""
-    values = channels.copy()
-    values[:, 3:6], values[:, 6:9] = values[:, 3:6] @ OPPONENT, values[:, 6:9] @ OPPONENT
-    return values
+    apart: Table = values @ _TAKING_APART.T
+    return apart
 
 
 def _quantiles(values: Table) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
@@ -11,7 +11,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
-from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits, opacity_remap
+from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
 from keyss.methods.learned.targets import PlacedScene
 from keyss.rendering.contributions import contributions
@@ -19,23 +19,18 @@ from keyss.rendering.contributions import contributions
 SELECTION_VIEWS = 64
 
 
-@dataclass(frozen=True)
-class Start:
-    """Initial Gaussians of the published model."""
-
-    gaussians: Gaussians
-    # For each secret the knots and residuals that its opacity remap starts with, or nothing known yet.
-    remaps: tuple[tuple[list[float], list[float]], ...] | None
-
-
-def make_start(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
-    """The start for the cover (first of `scenes`) and its secrets."""
+def make_start(
+    scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator
+) -> Gaussians:
+    """Initial Gaussians of the published model, for the cover (first of `scenes`) and its secrets."""
     if config.start == "points":
         return _from_points(scenes, config, generator)
     return _from_models(scenes, config)
 
 
-def _from_points(scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator) -> Start:
+def _from_points(
+    scenes: Sequence[PlacedScene], config: LearnedOptions, generator: torch.Generator
+) -> Gaussians:
     """Combined SfM points: an equal share of the cap for every scene, what one leaves goes to the others."""
     fit = config.fit
     chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
@@ -45,10 +40,10 @@ def _from_points(scenes: Sequence[PlacedScene], config: LearnedOptions, generato
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
         for (points, colors), share in zip(clouds, shares, strict=True)
     ]
-    return Start(Gaussians.cat(parts), None)
+    return Gaussians.cat(parts)
 
 
-def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Start:
+def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gaussians:
     """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     # What is never drawn would lie among the hidden.
@@ -63,7 +58,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Start
         replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
         for secret, part in enumerate(chosen[1:])
     ]
-    return Start(Gaussians.cat(parts), tuple(opacity_remap(secret) for secret in range(len(chosen) - 1)))
+    return Gaussians.cat(parts)
 
 
 def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:

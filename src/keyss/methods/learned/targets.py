@@ -23,11 +23,10 @@ CACHE_BYTES = 2 << 30
 
 @dataclass(frozen=True)
 class PlacedScene:
-    """A scene and its plain model, both brought into the cover's frame by `frame`."""
+    """A scene and its plain model, both brought into the cover's frame."""
 
     scene: Scene
     plain: Gaussians
-    frame: Similarity
 
     @staticmethod
     def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
@@ -38,7 +37,7 @@ class PlacedScene:
             test=tuple(_moved(view, frame) for view in scene.test),
             points=frame.apply_points(scene.points),
         )
-        return PlacedScene(moved, frame.apply_gaussians(plain), frame)
+        return PlacedScene(moved, frame.apply_gaussians(plain))
 
 
 def _moved(view: View, frame: Similarity) -> View:
@@ -61,12 +60,8 @@ class CombinedPoses:
 
     def target(self, scene: int, owner: int, index: int) -> Target:
         """What `scene` looks like from training pose `index` of `owner`."""
-        image = (
-            self.scenes[owner].scene.train[index].image
-            if scene == owner
-            else self._render(scene, owner, index)
-        )
-        return Target.of(image.to(self.device))
+        own = self.scenes[owner].scene.train[index].image
+        return Target.of((own if scene == owner else self._render(scene, owner, index)).to(self.device))
 
     def _render(self, scene: int, owner: int, index: int) -> Tensor:
         """Rendered once, kept as 8-bit pixels like the photos while they fit into CACHE_BYTES."""
