@@ -20,8 +20,7 @@ from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
 from keyss.methods.learned.start import make_start
-from keyss.methods.learned.targets import CombinedPoses, PlacedScene
-from keyss.methods.learned.visibility import possibly_seen
+from keyss.methods.learned.targets import CombinedPoses, PlacedScene, possibly_seen
 from keyss.rendering import render_with_meta
 
 LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
