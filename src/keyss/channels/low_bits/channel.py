@@ -167,8 +167,8 @@ class LowBitsReader:
 
     def _payload(self, found: PayloadParameters, data_key: bytes) -> Payload:
         chunks = self._decrypt(_chunk_cipher(data_key, self.sh_degree))
-        sealed = found.spread.decode(chunks, found.size)
-        return Payload(found.method, decrypt(expand(data_key, _PAYLOAD_KEY, 32), sealed, _ASSOCIATED))
+        encrypted = found.spread.decode(chunks, found.size)
+        return Payload(found.method, decrypt(expand(data_key, _PAYLOAD_KEY, 32), encrypted, _ASSOCIATED))
 
     def _records(self, found: RecordParameters, data_key: bytes) -> Records:
         room = self.low.shape[1] // found.cells - TAG_BYTES
@@ -238,9 +238,9 @@ class _Writer:
             data_key = self._data_key(index)
             self._header(keys, data_key, PayloadParameters(content.method, size, plan).pack())
             payload_key = expand(data_key, _PAYLOAD_KEY, 32)
-            sealed = encrypt(payload_key, content.data, _ASSOCIATED, size=size)
+            encrypted = encrypt(payload_key, content.data, _ASSOCIATED, size=size)
             cells = (index + 1) * share - self._next
-            self._whole(_chunk_cipher(data_key, self._degree), plan.encode(sealed, cells))
+            self._whole(_chunk_cipher(data_key, self._degree), plan.encode(encrypted, cells))
 
     def records(self, contents: Sequence[tuple[Sequence[DerivedKey], Records]]) -> None:
         """Headers and records with whole carriers first, then records that divide what is left."""
