@@ -128,8 +128,8 @@ def hide(
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
-    (`LearnedOptions`, `CarryOptions`). What a key opens lies encrypted in the low bits of `stego.ply`; with
-    `LearnedOptions(sidecar=True)` it is in a file `decoder.sealed`. `out` (a folder) gets these,
+    (`LearnedOptions`, `CarryOptions`). The secrets lie encrypted in the low bits of `stego.ply`; with
+    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these,
     `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which
     `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
     """

@@ -106,8 +106,7 @@ def decrypt_slots(data: bytes, key: DerivedKey) -> Payload:
             found.append((data_key, data[start + _WRAPPED : start + size]))
     if not found:
         raise WrongKeyError("this key opens nothing here")
-    data_key, sealed = found[0]
-    plain = decrypt(data_key, sealed, header)
+    plain = decrypt(*found[0], header)
     try:
         return Payload(unpack_method(plain), plain[METHOD_BYTES:])
     except ValueError as error:

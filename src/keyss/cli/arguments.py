@@ -42,11 +42,8 @@ OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder f
 
 def schedule(iterations: int | None, max_gaussians: int | None, seed: int | None) -> dict[str, int]:
     """What was asked for on the command line of the fields of `FitConfig`."""
-    asked = {
-        "iterations": iterations,
-        "max_gaussians": max_gaussians,
-        "seed": None if seed is None else checked_seed(seed),
-    }
+    checked = None if seed is None else checked_seed(seed)
+    asked = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": checked}
     return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -51,17 +51,10 @@ class FitRunConfig:
     config: FitConfig
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Head:
-    """What tells how to read the rest."""
-
-    version: int = RunConfig.version
-    method: str
-
-
 def read_config(path: Path) -> RunConfig[MethodOptions]:
     """The configuration of a hiding, with the options of its method. Raises InputError."""
-    name = read_record(path, _Head).method
+    # Fields that a class does not have are passed over: so every method's can be read as far as its name.
+    name = read_record(path, RunConfig[MethodOptions]).method
     if name not in registry.METHODS:
         known = ", ".join(registry.METHODS)
         raise InputError(f"{path}: method {name!r} is not known; this program has {known}")

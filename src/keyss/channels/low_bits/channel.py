@@ -58,7 +58,7 @@ from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand,
 from keyss.keys.encryption import compressed_size, decrypt, encrypt, encrypted_size
 
 SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
-_ASSOCIATED = b"keyss/v1/low-bits"
+_ASSOCIATED, _PAYLOAD_KEY = b"keyss/v1/low-bits", "payload-key"
 _OPENS_NOTHING = "this key opens nothing here"
 
 
@@ -167,8 +167,8 @@ class LowBitsReader:
 
     def _payload(self, found: PayloadParameters, data_key: bytes) -> Payload:
         chunks = self._decrypt(_chunk_cipher(data_key, self.sh_degree))
-        sealed = found.spread.decode(chunks, found.size)
-        return Payload(found.method, decrypt(_payload_key(data_key), sealed, _ASSOCIATED))
+        encrypted = found.spread.decode(chunks, found.size)
+        return Payload(found.method, decrypt(expand(data_key, _PAYLOAD_KEY, 32), encrypted, _ASSOCIATED))
 
     def _records(self, found: RecordParameters, data_key: bytes) -> Records:
         room = self.low.shape[1] // found.cells - TAG_BYTES
@@ -198,10 +198,8 @@ class LowBitsReader:
 def salts(names: Bytes) -> list[bytes]:
     """Of identities [N, 16] those that may serve as salt, in ascending order."""
     prefixes = names[:, :8].copy().view(">u8")[:, 0]
-    least = np.unique(prefixes)[:SALTS]
-    if not len(least):
-        return []
-    return sorted({row.tobytes() for row in names[prefixes <= least[-1]]})[:SALTS]
+    first = names[np.isin(prefixes, np.unique(prefixes)[:SALTS])]
+    return sorted({row.tobytes() for row in first})[:SALTS]
 
 
 def derivation_of(identity: bytes) -> KeyDerivation:
@@ -239,9 +237,10 @@ class _Writer:
             self._next = index * share
             data_key = self._data_key(index)
             self._header(keys, data_key, PayloadParameters(content.method, size, plan).pack())
-            sealed = encrypt(_payload_key(data_key), content.data, _ASSOCIATED, size=size)
+            payload_key = expand(data_key, _PAYLOAD_KEY, 32)
+            encrypted = encrypt(payload_key, content.data, _ASSOCIATED, size=size)
             cells = (index + 1) * share - self._next
-            self._whole(_chunk_cipher(data_key, self._degree), plan.encode(sealed, cells))
+            self._whole(_chunk_cipher(data_key, self._degree), plan.encode(encrypted, cells))
 
     def records(self, contents: Sequence[tuple[Sequence[DerivedKey], Records]]) -> None:
         """Headers and records with whole carriers first, then records that divide what is left."""
@@ -297,10 +296,6 @@ def _parameter_cipher(data_key: bytes, sh_degree: int) -> CellCipher:
 def _chunk_cipher(data_key: bytes, sh_degree: int) -> CellCipher:
     size = spread.NUMBER_BYTES + spread.chunk_bytes(sh_degree)
     return CellCipher(data_key, "chunk", size, spread.TAG_BYTES)
-
-
-def _payload_key(data_key: bytes) -> bytes:
-    return expand(data_key, "payload-key", 32)
 
 
 def _digest(content: Content) -> bytes:

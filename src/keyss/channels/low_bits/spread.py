@@ -66,12 +66,12 @@ class Spread:
         for number, chunk in zip(numbers.tolist(), chunks[:, NUMBER_BYTES:], strict=True):
             if number < self.blocks * self.n:
                 blocks[number // self.n][number % self.n] = chunk
-        decoded = [reed_solomon.decode(rows, self.k, self.n) for rows in blocks]
+        decoded = (reed_solomon.decode(rows, self.k, self.n) for rows in blocks)
         whole = [block for block in decoded if block is not None]
-        if len(whole) < len(decoded):
+        if lost := self.blocks - len(whole):
             raise InputError(
-                f"the key is right, but too much of the model was removed: {len(decoded) - len(whole)} of "
-                f"{len(decoded)} blocks are lost"
+                f"the key is right, but too much of the model was removed: {lost} of {self.blocks} "
+                "blocks are lost"
             )
         return np.concatenate(whole).tobytes()[:size]
 

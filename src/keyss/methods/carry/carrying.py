@@ -70,8 +70,8 @@ def check_degrees(channel: Channel, cover: Gaussians, secrets: Sequence[Gaussian
         )
 
 
-def encode(model: Gaussians, plan: RecordPlan) -> Records:
-    """The records of a model, as precise as the plan has room for."""
+def _encode(model: Gaussians, plan: RecordPlan) -> Records:
+    """As precise as the plan has room for."""
     table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
     if table is None:
         raise ValueError(f"{plan.record_bytes} bytes are too few for a record of SH degree {model.sh_degree}")
@@ -95,7 +95,7 @@ def decode(records: Records) -> CarriedSecret:
 def encode_all(prepared: PreparedCover, models: Sequence[Gaussians]) -> list[Records]:
     """The records of all models, as they fit into one cover together. Raises UsageError if they do not."""
     plans = prepared.plan_records(record_requests(models))
-    return [encode(model, plan) for model, plan in zip(models, plans, strict=True)]
+    return [_encode(model, plan) for model, plan in zip(models, plans, strict=True)]
 
 
 def subsampled_counts(prepared: PreparedCover, models: Sequence[Gaussians]) -> list[int]:

@@ -38,7 +38,8 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
         columns = values.view(len(values), -1).numpy()
         for column in range(3 if name == "sh" else 0, columns.shape[1]):
             if not _is_natural(columns[:, column]):
-                noise = _uniform(entropy, f"carry/dither/{name}/{column}", len(columns))
+                random = stream(entropy, f"carry/dither/{name}/{column}", 8 * len(columns))
+                noise = np.frombuffer(random, "<u8").astype(np.float64) / 2.0**63 - 1
                 columns[:, column] = _dithered(columns[:, column], noise)
         changed[name] = values
     return Gaussians(means=model.means, **changed)
@@ -71,8 +72,3 @@ def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:
         reach = np.minimum(reach, np.spacing(np.abs(half)).astype(np.float64) / 2)
     moved: Floats = (values + noise * reach[inverse]).astype(np.float32)
     return moved
-
-
-def _uniform(entropy: bytes, label: str, count: int) -> npt.NDArray[np.float64]:
-    words = np.frombuffer(stream(entropy, label, 8 * count), "<u8")
-    return words.astype(np.float64) / 2.0**63 - 1

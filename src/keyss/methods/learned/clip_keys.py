@@ -1,8 +1,8 @@
 """The paper's key encoder: CLIP's text encoder, for comparison (KeySS, section 3.2).
 
-It decides only what conditions the decoder. What seals the payload comes from the key's own text by Argon2id
-all the same, for CLIP is no key derivation: it is fast, it ignores case, and like texts get like embeddings.
-The embedding is kept in the sealed payload, so that revealing needs no CLIP.
+It decides only what conditions the decoder. The key that encrypts the payload comes from the typed text by
+Argon2id all the same, for CLIP is no key derivation: it is fast, it ignores case, and like texts get like
+embeddings. The embedding is kept in the encrypted payload, so that revealing needs no CLIP.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ class Decoder(nn.Module):
     @property
     def band(self) -> OpacityBand:
         """Where the secret's Gaussians lie after a warm start."""
-        return OpacityBand.of_knots(self.knots)
+        return OpacityBand(*self.knots[1:5].tolist())
 
     @property
     def nearly_opaque_logit(self) -> float:
@@ -245,16 +245,10 @@ def _normalised(gaussians: Gaussians, whole: Gaussians) -> Tensor:
 
     The opacities are one vector over the whole model; of every other attribute each Gaussian's is one.
     """
-    return torch.cat(
-        [
-            F.normalize(gaussians.means, dim=1),
-            (gaussians.opacity_logits / whole.opacity_logits.norm())[:, None],
-            F.normalize(gaussians.quats, dim=1),
-            F.normalize(gaussians.log_scales, dim=1),
-            F.normalize(gaussians.sh.flatten(1), dim=1),
-        ],
-        dim=1,
-    )
+    attributes = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh.flatten(1))
+    means, *others = (F.normalize(values, dim=1) for values in attributes)
+    opacities = (gaussians.opacity_logits / whole.opacity_logits.norm())[:, None]
+    return torch.cat([means, opacities, *others], dim=1)
 
 
 def add_residuals(gaussians: Gaussians, residuals: Mapping[str, Tensor], extent: Tensor) -> Gaussians:

@@ -20,8 +20,7 @@ from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
 from keyss.methods.learned.start import make_start
-from keyss.methods.learned.targets import CombinedPoses, PlacedScene
-from keyss.methods.learned.visibility import possibly_seen
+from keyss.methods.learned.targets import CombinedPoses, PlacedScene, possibly_seen
 from keyss.rendering import render_with_meta
 
 LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
@@ -64,11 +63,8 @@ class JointRun:
             # Hidden logits lie close together: a step of theirs moves the shown ones 1 / HIDDEN_SLOPE as far.
             self.rates["opacities"] *= HIDDEN_SLOPE
             self.logit_limits = logit_limits(self.parameters["opacities"].detach(), len(embeddings))
-        self.strategy = CappedStrategy(
-            config.fit,
-            self._largest_opacity if config.prune_by == "all" else None,
-            freeze=config.at_cap == "freeze",
-        )
+        opacities = self._largest_opacity if config.prune_by == "all" else None
+        self.strategy = CappedStrategy(config.fit, opacities, freeze=config.at_cap == "freeze")
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
 
         with torch.random.fork_rng():
@@ -97,9 +93,8 @@ class JointRun:
 
         def loss_of(drawn: Gaussians, scene: int) -> tuple[Tensor, dict[str, Any]]:
             background, target = self.backgrounds[scene], self.poses.target(scene, *poses[scene])
-            image, meta = render_with_meta(
-                drawn, self.poses.camera(*poses[scene]), background, sh_degree=degree
-            )
+            camera = self.poses.camera(*poses[scene])
+            image, meta = render_with_meta(drawn, camera, background, sh_degree=degree)
             return photometric_loss(image, target, config.fit.ssim_weight), meta
 
         cover = to_gaussians(self.parameters)
@@ -236,11 +231,5 @@ def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
         radii[row, where] = meta["radii"][0].float()
     means2d = torch.zeros_like(gradients)
     means2d.grad = gradients
-    return {
-        "means2d": means2d,
-        "radii": radii,
-        "width": width,
-        "height": height,
-        "n_cameras": 1,
-        "gaussian_ids": None,
-    }
+    batch = {"width": width, "height": height, "n_cameras": 1, "gaussian_ids": None}
+    return {"means2d": means2d, "radii": radii, **batch}

@@ -63,7 +63,9 @@ class LearnedMethod:
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context
     ) -> Stego:
-        """Raises UsageError for a model too small for what it has to carry, Interrupted on Ctrl-C, and
+        """Train the model that shows both, then encrypt the decoders into it or into a sidecar.
+
+        Raises UsageError for a model too small for what it has to carry, Interrupted on Ctrl-C, and
         InputError for a checkpoint of another run.
         """
         options = training_options(options)

@@ -38,11 +38,6 @@ class OpacityBand:
         low, high = (_middle(secret) + HIDDEN_SLOPE * logit for logit in SHOWN_LOGITS)
         return OpacityBand(low - 0.5, low - 0.1, high + 0.4, high + 0.5)
 
-    @staticmethod
-    def of_knots(knots: Tensor) -> OpacityBand:
-        """The band of an opacity remap with these knots."""
-        return OpacityBand(*knots[1:5].tolist())
-
     @property
     def outer(self) -> tuple[float, float]:
         """Its ends."""

@@ -173,10 +173,6 @@ PRESETS: dict[str, LearnedOptions] = {
     # The paper as written, and what its authors' code does otherwise: for comparison only.
     "paper": _PAPER,
     "released": replace(
-        _PAPER,
-        fit=FIT_PRESETS["paper"],
-        residuals="one-sided",
-        at_cap="freeze",
-        prune_by="cover",
+        _PAPER, fit=FIT_PRESETS["paper"], residuals="one-sided", at_cap="freeze", prune_by="cover"
     ),
 }
