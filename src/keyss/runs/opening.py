@@ -81,7 +81,7 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
 
 
 def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
-    """What the key opens; see `registry.open_model`. Errors name the sidecar's file."""
+    """The secret that the key opens; see `registry.open_model`. Errors name the sidecar's file."""
     if sidecar is None or isinstance(sidecar, bytes):
         return registry.open_model(stego, key, sidecar=sidecar, decoy=decoy)
     data = read_sidecar(Path(sidecar))

@@ -147,7 +147,7 @@ class LowBitsReader:
         return (DerivedKey(key, derivation_of(identity)) for identity in salts(self.identities)[:most])
 
     def extract(self, key: DerivedKey) -> Content:
-        """What the key opens under its salt. Raises WrongKeyError and InputError.
+        """The content under this key and its salt. Raises WrongKeyError and InputError.
 
         A key that opens nothing makes the same passes over all cells, under a data key that fits nothing.
         """

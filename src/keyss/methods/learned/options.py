@@ -63,7 +63,7 @@ class LearnedOptions(MethodOptions):
     ] = None
     sidecar: Annotated[
         bool,
-        CommandLineOption("Write what a key opens to decoder.sealed, not into the low bits of stego.ply."),
+        CommandLineOption("Write the encrypted payloads to decoder.sealed, not into low bits of stego.ply."),
     ] = False
 
     cover_weight: float = 0.5  # beta_cover
