@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core.errors import UsageError
@@ -67,42 +68,35 @@ def look_for_secret(
     ]
     results, pictures = [], {}
     for each in attacks:
-        found = _look(each, stego, views, secret.background)
-        innocent = [_look(each, model, views, secret.background, found.label) for model in controls]
-        control = LeakScores.combined(fmean, [one.scores for one in innocent])
+        found, count, label, picture = _look(each, stego, views, secret.background)
+        innocent = [_look(each, model, views, secret.background, label) for model in controls]
+        control = LeakScores.combined(fmean, [one for one, *_ in innocent])
         results.append(
             AttackResult(
                 each.name,
                 each.sentence,
                 each.parameters,
                 each.with_key,
-                found.count,
-                found.label,
-                found.scores,
+                count,
+                label,
+                found,
                 control,
-                LeakScores.combined(max, [one.scores for one in innocent]),
-                found.scores - control,
+                LeakScores.combined(max, [one for one, *_ in innocent]),
+                found - control,
             )
         )
-        pictures[each.name] = _beside([found.picture, innocent[0].picture, views[0].image])
+        pictures[each.name] = _beside([picture, innocent[0][-1], views[0].image])
     return results, pictures
-
-
-@dataclass(frozen=True)
-class _AttackView:
-    """What an attack shows of one model."""
-
-    scores: LeakScores  # each the largest over all that is shown
-    count: int  # of what is shown
-    label: str  # of what `picture` shows
-    picture: Tensor  # [H, W, 3] uint8
 
 
 @torch.no_grad()
 def _look(
     attack: Attack, model: Gaussians, views: Sequence[View], background: Tensor, label: str | None = None
-) -> _AttackView:
-    """Look at all that the attack shows; the picture is of `label`, or of what shows most."""
+) -> tuple[LeakScores, int, str, Tensor]:
+    """Look at all that the attack shows of a model: the largest scores, and how many views there are.
+
+    And a picture [H, W, 3] uint8 of the view called `label`, or of the one that shows most, with its label.
+    """
     rows: list[LeakScores] = []
     pictured: tuple[str, Gaussians] | None = None
     for name, shown in attack.show(model):
@@ -111,17 +105,11 @@ def _look(
         if pictured is None or (best if label is None else name == label):
             pictured = name, shown
     assert pictured is not None
-    image = render(pictured[1], views[0].camera, background)
-    return _AttackView(
-        LeakScores.combined(max, rows),
-        len(rows),
-        pictured[0],
-        (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu(),
-    )
+    name, shown = pictured
+    image = render(shown, views[0].camera, background).clamp(0, 1)
+    return LeakScores.combined(max, rows), len(rows), name, (image * 255).round().to(torch.uint8).cpu()
 
 
 def _beside(images: Sequence[Tensor]) -> Tensor:
     """The images [H, W, 3] in a row, with white between."""
-    gap = torch.full((images[0].shape[0], _GAP, 3), 255, dtype=torch.uint8)
-    parts = [part for image in images for part in (gap, image.cpu())]
-    return torch.cat(parts[1:], dim=1)
+    return torch.cat([F.pad(image.cpu(), (0, 0, 0, _GAP), value=255) for image in images], dim=1)[:, :-_GAP]
