@@ -251,8 +251,10 @@ def _mark(axes: Axes, neutral: float, word: str, limit: float, names: Sequence[s
     axes.axvline(neutral, color=_INK, linewidth=1)
     axes.axvline(limit, color=_LIMIT, linewidth=1, linestyle="--")
     for x, text, side, points in ((neutral, word, "right", -3), (limit, "limit", "left", 3)):
-        style: dict[str, Any] = {"ha": side, "va": "bottom", "fontsize": 8.5, "color": _MUTED}
-        axes.annotate(text, (x, 1), (points, 2), ("data", "axes fraction"), "offset points", **style)
+        where, beside = ("data", "axes fraction"), (points, 2)
+        axes.annotate(
+            text, (x, 1), beside, where, "offset points", ha=side, va="bottom", fontsize=8.5, color=_MUTED
+        )
     axes.set_yticks(range(len(names)), [_short(name) for name in names])
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
