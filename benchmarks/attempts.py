@@ -49,9 +49,8 @@ def main() -> None:
     decoder.prepare(plain, random_embeddings(1, generator)[0])
     anchors = choose_anchors(plain, generator)
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
-    packed = pack_secret(secret)
-    stego = LOW_BITS.prepare(plain).embed([(right, Payload("learned", packed))])
-    sidecar = encrypt_sidecar([(right, packed)])
+    contents = [(right, Payload("learned", pack_secret(secret)))]
+    stego, sidecar = LOW_BITS.prepare(plain).embed(contents), encrypt_sidecar(contents)
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"
