@@ -1,0 +1,105 @@
+"""A second reader, written from docs/format.md with other libraries only, opens what this program wrote."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import plyfile
+from argon2.low_level import Type, hash_secret_raw
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
+
+FOLDER = Path(__file__).parents[2] / "vectors"
+EXPECTED = json.loads((FOLDER / "carried.json").read_text())
+WIDTH = 75  # bytes of a Gaussian's low bits at SH degree 3
+
+
+def _hkdf(secret: bytes, label: str, length: int = 32) -> bytes:
+    return HKDFExpand(SHA256(), length, f"keyss/v1/{label}".encode()).derive(secret)
+
+
+def _aes(key: bytes, block: bytes) -> bytes:
+    return Cipher(AES(key), ECB()).encryptor().update(block)
+
+
+def _decrypted(secret: bytes, label: str, identity: bytes, cell: bytes, slot: int = 0) -> bytes | None:
+    tag, hidden = cell[:4], cell[4:]
+    nonce = bytes(a ^ b for a, b in zip(identity, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
+    seed = _aes(_hkdf(secret, f"{label}/seed"), nonce)
+    blocks = range(-(-len(hidden) // 16))
+    stream = b"".join(
+        _aes(_hkdf(secret, f"{label}/stream"), seed[:-1] + bytes([seed[-1] ^ i])) for i in blocks
+    )
+    data = bytes(a ^ b for a, b in zip(hidden, stream, strict=False))
+    message = bytes([slot]) + data
+    message = identity + message.ljust(-(-len(message) // 16) * 16, b"\0")
+    mac = Cipher(AES(_hkdf(secret, f"{label}/tag")), CBC(bytes(16))).encryptor().update(message)[-16:]
+    return data if mac[:4] == tag else None
+
+
+def _gaussians() -> list[tuple[bytes, bytes]]:
+    """Identity and low bits of each."""
+    vertices = plyfile.PlyData.read(FOLDER / "carried.ply")["vertex"]
+    harmonics = [f"f_rest_{15 * colour + k}" for k in range(15) for colour in range(3)]
+    names = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", *harmonics]
+    found = []
+    for index in range(vertices.count):
+        words = [int(np.float32(vertices[name][index]).view(np.uint32)) for name in names]
+        masks = [0x1FE] * 8 + [0x1FFE] * 45
+        kept = [int(np.float32(vertices[axis][index]).view(np.uint32)) for axis in "xyz"]
+        kept += [word & ~mask for word, mask in zip(words, masks, strict=True)]
+        public = struct.pack(f"<{len(kept)}I", *kept)
+        identity = hashlib.blake2b(public, digest_size=16, person=b"keyss/identity").digest()
+        low = [(word & mask) >> 1 for word, mask in zip(words, masks, strict=True)]
+        data = bytes(low[:8])
+        for a, b in zip(low[8::2], [*low[9::2], 0], strict=False):
+            data += bytes([a >> 4, (a & 15) << 4 | b >> 8, b & 255])
+        found.append((identity, data[:WIDTH]))
+    return found
+
+
+def test_a_reader_written_from_the_description_opens_the_carried_model() -> None:
+    gaussians = _gaussians()
+    salt = hashlib.sha256(b"keyss/v1/salt" + min(identity for identity, _ in gaussians)).digest()[:16]
+    master = hash_secret_raw(EXPECTED["key"].encode(), salt, 3, 65_536, 4, 32, Type.ID)
+    key_secret = _hkdf(master, "low-bits/key")
+    data_keys = [_decrypted(key_secret, "key", identity, low[:20]) for identity, low in gaussians]
+    ((data_key, times),) = Counter(filter(None, data_keys)).most_common(1)
+    assert times == 12
+
+    parts = {}
+    for identity, low in gaussians:
+        if (part := _decrypted(data_key, "parameters", identity, low)) is not None:
+            parts[part[0]] = part[1:]
+    packed = b"".join(parts[number] for number in sorted(parts))
+    version, service, method = struct.unpack_from("<BB15s", packed)
+    cells, size, header_bytes = struct.unpack_from("<BHH", packed, 17)
+    assert (version, service, method.rstrip(b"\0")) == (1, 2, b"carry")
+    header = packed[32 : 32 + header_bytes]
+    (count,) = struct.unpack_from("<I", header)
+    assert count == EXPECTED["count"]
+
+    bits = header[4]  # of a coordinate
+    lines = [struct.unpack_from("<3f", header, 12 + 12 * axis) for axis in range(3)]
+    means = set()
+    for identity, low in gaussians:
+        for slot in range(cells):
+            cell = low[slot * (WIDTH // cells) :][: 4 + size]
+            for label in ("record", "copy"):
+                if (record := _decrypted(data_key, label, identity, cell, slot)) is not None:
+                    whole = int.from_bytes(record, "big")
+                    codes = [whole >> 8 * size - bits * (axis + 1) & (1 << bits) - 1 for axis in range(3)]
+                    places = [
+                        centre + spread * np.sinh((2 * code / ((1 << bits) - 1) - 1) * reach)
+                        for code, (centre, spread, reach) in zip(codes, lines, strict=True)
+                    ]
+                    means.add(tuple(float(np.float32(place)) for place in places))
+    np.testing.assert_allclose(sorted(means), sorted(map(tuple, EXPECTED["means"])), atol=1e-6)
