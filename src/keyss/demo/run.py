@@ -94,7 +94,7 @@ def run_demo(
         if not was_there and out.is_dir() and not any(out.iterdir()):
             out.rmdir()
         if isinstance(error, Interrupted):  # there is nothing left to continue from
-            raise KeyboardInterrupt from error
+            raise KeyboardInterrupt(*error.args) from error
         raise
 
 
