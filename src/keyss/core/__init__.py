@@ -1,13 +1,22 @@
 """Plain data: Gaussians, cameras, scenes, similarity transforms, errors.
 
-The names below are loaded at first use (PEP 562): errors must be there without torch, which takes seconds.
+All but errors is loaded at first use (PEP 562): an error must be there without torch, which takes seconds.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from keyss.core.errors import (
+    BackendError,
+    InputError,
+    KeyssError,
+    OutputError,
+    QualityError,
+    UsageError,
+    WrongKeyError,
+)
+
 if TYPE_CHECKING:
-    from keyss.core.errors import BackendError, InputError, KeyssError, OutputError, UsageError, WrongKeyError
     from keyss.core.gaussians import Gaussians
     from keyss.core.scene import Camera, Scene, View
 
@@ -18,17 +27,18 @@ __all__ = [
     "InputError",
     "KeyssError",
     "OutputError",
+    "QualityError",
     "Scene",
     "UsageError",
     "View",
     "WrongKeyError",
 ]
 
+_HOMES = {"Gaussians": "gaussians", "Camera": "scene", "Scene": "scene", "View": "scene"}
+
 
 def __getattr__(name: str) -> Any:
-    for home in ("errors", "gaussians", "scene") if name in __all__ else ():
-        module = importlib.import_module(f"keyss.core.{home}")
-        if hasattr(module, name):
-            globals()[name] = value = getattr(module, name)
-            return value
-    raise AttributeError(f"module 'keyss.core' has no attribute {name!r}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'keyss.core' has no attribute {name!r}")
+    globals()[name] = value = getattr(importlib.import_module(f"keyss.core.{_HOMES[name]}"), name)
+    return value
