@@ -124,7 +124,7 @@ def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
     with pytest.raises(InputError):
         audit(tmp_path, [KEY])
     (run / "private" / "cover.ply").unlink()
-    with pytest.raises(UsageError, match="--original"):
+    with pytest.raises(UsageError, match="`original`"):
         audit(run, [KEY], controls=2)
 
 
