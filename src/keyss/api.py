@@ -124,7 +124,7 @@ def hide(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> HideResult:
-    """Hide every secret in the cover, and measure the result on the test photos.
+    """Hide every secret in the cover, and measure the result on the test views.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
@@ -154,7 +154,8 @@ def hide(
     own, *others = map(Source, scenes, plain)
     stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
 
-    metrics = _measured(chosen, stego, scenes, plain, options, target)
+    photos = tuple(each.photos for each in inputs)
+    metrics = _measured(chosen, stego, scenes, plain, photos, options, target)
     if folder is not None:
         settings = RunConfig(
             method=chosen.name,
@@ -243,7 +244,7 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -298,6 +299,7 @@ def _measured(
     stego: Stego,
     scenes: Sequence[Scene],
     models: Sequence[Gaussians],  # plain ones of the scenes
+    photos: tuple[bool, ...],  # whether the scenes have some
     options: MethodOptions,
     device: torch.device,
 ) -> HideMetrics:
@@ -314,6 +316,7 @@ def _measured(
         **vars(measured),
         method=method.name,
         gaussians=len(stego.gaussians),
+        photos=photos,
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         seconds=round(stego.seconds, 1),

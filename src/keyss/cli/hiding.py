@@ -26,6 +26,7 @@ from keyss.cli.arguments import (
     Seed,
     Width,
     optional,
+    preset_sizes,
     schedule,
 )
 
@@ -155,7 +156,7 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     # Types and defaults by name, for what `hide` leaves open.
     hints: dict[str, Any] = {
         "method": Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")],
-        "preset": Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")],
+        "preset": Annotated[Literal[tuple(method.presets)], arg(help=_preset_help(method))],
     }
     defaults: dict[str, Any] = {"method": method.name, "preset": next(iter(method.presets))}
     for name, (kind, option) in _own_options(method).items():
@@ -180,6 +181,13 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     command.__name__, command.__doc__ = "hide", hide.__doc__
     command.__annotations__ = {name: each.annotation for name, each in parameters.items()}
     return command
+
+
+def _preset_help(method: Method) -> str:
+    """What the presets of a method come to."""
+    sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
+    stages = "each plain model and the joint training" if method.trains else "plain models of photos"
+    return f"Size and kind of the run, for {stages}. {sizes}."
 
 
 def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
