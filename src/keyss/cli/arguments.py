@@ -46,11 +46,9 @@ OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder f
 
 
 def preset_sizes(presets: Mapping[str, FitConfig]) -> str:
-    """Names of presets, with what each trains."""
-    return "; ".join(
-        f"{name}: {fit.iterations:,} steps, at most {fit.max_gaussians:,} Gaussians"
-        for name, fit in presets.items()
-    )
+    """What each preset comes to, as a sentence."""
+    sizes = [f"{name} {fit.iterations:,} and {fit.max_gaussians:,}" for name, fit in presets.items()]
+    return f"Steps of each training, and Gaussians of each model at most: {'; '.join(sizes)}."
 
 
 def schedule(iterations: int | None, max_gaussians: int | None, seed: int | None) -> dict[str, int]:

@@ -10,6 +10,7 @@ import tyro
 
 from keyss.cli import commands
 from keyss.cli.hiding import hide, hide_with_options
+from keyss.cli.models import fit, fit_with_presets
 
 INTERRUPTED = 130  # 128 + SIGINT, as a shell counts
 BROKEN_PIPE = 141  # 128 + SIGPIPE
@@ -32,8 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     app = tyro.extras.SubcommandApp()
     try:
         for command in commands.ALL:
-            hiding = command is hide and arguments[:1] == ["hide"]
-            app.command(hide_with_options(arguments) if hiding else command)
+            if command is hide and arguments[:1] == ["hide"]:
+                app.command(hide_with_options(arguments))
+            elif command is fit and arguments[:1] == ["fit"]:
+                app.command(fit_with_presets())
+            else:
+                app.command(command)
         app.cli(prog="keyss", description=_ABOUT, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
         sys.stdout.flush()
         return 0

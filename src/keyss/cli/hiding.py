@@ -52,11 +52,11 @@ def hide(
     width: Width = None,
     background: Background = None,
     cover_model: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
+        Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
     ] = None,
     secret_model: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
+        optional("FILE", "Plain model of a secret, once for each secret.", "they are fitted"),
     ] = (),
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
@@ -192,8 +192,7 @@ def _with_options_of(method: Method) -> Callable[..., None]:
 def _preset_help(method: Method) -> str:
     """What the presets of a method come to."""
     sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
-    stages = "each plain model and the joint training" if method.trains else "plain models of photos"
-    return f"Size and kind of the run, for {stages}. {sizes}."
+    return f"Size and kind of a run on photos; .ply models bring their size along. {sizes}"
 
 
 def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:

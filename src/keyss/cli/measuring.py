@@ -85,7 +85,7 @@ def audit(
     *,
     key_file: KeyFiles = (),
     original: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover to compare with.", "the run's own")
+        Path | None, optional("FILE", "Plain model of the cover to compare with.", "the run's own")
     ] = None,
     controls: Annotated[
         int, arg(metavar="N", help="Plain models of the cover from other seeds, to compare with; 2 or more.")

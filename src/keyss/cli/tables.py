@@ -66,7 +66,9 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool
         size = "its own number of Gaussians" if sizes_differ else "as many Gaussians"
         lines.append(f"Baseline: the scene's plain model (3DGS with nothing hidden), which has {size}.")
     if metrics.chance_level:
-        lines.append("Chance level: the stego model itself against the secret. No wrong key should get above.")
+        lines.append(
+            "Chance level: the stego model itself against the secret. No wrong key should get above."
+        )
     return lines
 
 
@@ -122,7 +124,14 @@ def _scene_row(
 ) -> list[str]:
     """Cells of one scene: PSNR, SSIM, PSNR of its plain model, the loss, and the numbers of Gaussians."""
     beside = ["", ""] if plain is None else [f"{plain.psnr:.2f}", f"{plain.psnr - found.psnr:.2f}"]
-    return [name, f"{found.psnr:.2f}", f"{found.ssim:.3f}", *beside, f"{gaussians:,}", f"{baselines:,}" if baselines else ""]
+    return [
+        name,
+        f"{found.psnr:.2f}",
+        f"{found.ssim:.3f}",
+        *beside,
+        f"{gaussians:,}",
+        f"{baselines:,}" if baselines else "",
+    ]
 
 
 def _table(*names: str, texts: int = 0) -> Table:
