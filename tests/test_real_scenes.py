@@ -48,7 +48,7 @@ def test_plain_models_are_as_good_as_measured(run: Path) -> None:
 def test_an_audit_finds_nothing_of_the_fox(run: Path) -> None:
     audit(run, ["a key for a fox"], controls=2, only=["leaks", "robustness"])
     words = {line.measure: line.word for line in verdicts(read_audit(run))}
-    assert words["the secret's shapes in them"] == "fine"
+    assert words["leaks without the key"] == "fine"
     assert words["loss of a random 25% of the Gaussians"] == "fine"
 
 

@@ -135,7 +135,7 @@ def hide(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> HideResult:
-    """Hide every secret in the cover, and measure the result on the test photos.
+    """Hide every secret in the cover, and measure the result on the test views.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
@@ -198,7 +198,8 @@ def hide(
             for model, original, scene in zip(shown, plain, scenes, strict=True)
         )
         _check_quality(against_plain, min_psnr)
-        metrics = _measured(chosen, stego, scenes, plain, options, against_plain, target)
+        photos = tuple(each.photos for each in inputs)
+        metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
         if folder:
             payloads = tuple(each.fingerprint() for each in stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
@@ -278,7 +279,7 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -350,6 +351,7 @@ def _measured(
     stego: Stego,
     scenes: Sequence[Scene],
     models: Sequence[Gaussians],  # plain ones of the scenes
+    photos: tuple[bool, ...],  # whether the scenes have some
     options: MethodOptions,
     against_plain: tuple[RenderFidelity, ...],
     device: torch.device,
@@ -367,6 +369,7 @@ def _measured(
         **vars(measured),
         method=method.name,
         gaussians=len(stego.gaussians),
+        photos=photos,
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         seconds=round(stego.seconds, 1),

@@ -59,7 +59,7 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def without_sealwatch(data: dict[str, Any]) -> dict[str, Any]:
     """As where it is not installed."""
-    for pair in ("published", "control"):
+    for pair in ("stego", "control"):
         data["stegexpose"][pair]["sealwatch"] = None
     data["stegexpose"]["sealwatch_missing"] = "get it with `pip install sealwatch`"
     return data
@@ -91,7 +91,7 @@ def test_what_was_hidden_where(page: Parsed, data: dict[str, Any]) -> None:
     for fact in (
         f"{data['run']['gaussians']} ",
         "40 pixels wide",
-        "2 plain 3DGS models, seeds 1, 2",
+        "2 plain models of the cover, seeds 1, 2",
         f"keyss {data['keyss']}, took ",
         "measures are within their limits.",
         "fit.iterations 20",
@@ -107,7 +107,7 @@ def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> 
     shown += [f"{data['wrong_key']['shown']['vs_secrets'][1]['max']:.2f}"]
     shown += [f"{data['leaks']['secrets'][1][0]['scores']['gradient']:.3f}"]
     shown += [f"{parameters['sinkhorn']['stego']['sum']:.4f}", f"{parameters['sinkhorn']['score']:.2f}"]
-    shown += [f"{data['stegexpose']['published']['stegexpose']['plain'][3]['rs']:.4f}"]
+    shown += [f"{data['stegexpose']['stego']['stegexpose']['plain'][3]['rs']:.4f}"]
     shown += [f"{robustness['changes'][1]['secrets'][1]['psnr']:.2f}"]
     shown += [f"{data['speed']['render'][0]['ratio']:.2f}×", "does not open", "Mean of 3 draws."]
     assert [number for number in shown if number.replace("-", "−") not in page.text] == []

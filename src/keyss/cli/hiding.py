@@ -26,6 +26,7 @@ from keyss.cli.arguments import (
     Seed,
     Width,
     optional,
+    preset_sizes,
     schedule,
 )
 
@@ -51,11 +52,11 @@ def hide(
     width: Width = None,
     background: Background = None,
     cover_model: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
+        Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
     ] = None,
     secret_model: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
+        optional("FILE", "Plain model of a secret, once for each secret.", "they are fitted"),
     ] = (),
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
@@ -161,7 +162,7 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     # Types and defaults by name, for what `hide` leaves open.
     hints: dict[str, Any] = {
         "method": Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")],
-        "preset": Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")],
+        "preset": Annotated[Literal[tuple(method.presets)], arg(help=_preset_help(method))],
     }
     defaults: dict[str, Any] = {"method": method.name, "preset": next(iter(method.presets))}
     for name, (kind, option) in _own_options(method).items():
@@ -186,6 +187,12 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     command.__name__, command.__doc__ = "hide", hide.__doc__
     command.__annotations__ = {name: each.annotation for name, each in parameters.items()}
     return command
+
+
+def _preset_help(method: Method) -> str:
+    """What the presets of a method come to."""
+    sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
+    return f"Size and kind of a run on photos; .ply models bring their size along. {sizes}"
 
 
 def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
