@@ -12,8 +12,7 @@ A record holds everything that renders: position, log scales, opacity logit, dir
 
 Lines are fitted to the bulk. A Gaussian with a number far outside of it is an *outlier*: one bit of its record
 says so, and its numbers go through the same lines with a longer reach. So outliers cost the bulk nothing but
-that bit, whatever their numbers are. Where numbers are so large that nothing can be drawn, or drawn
-differently, `_Limits` are put in their place.
+that bit, whatever their numbers are. Numbers so large that nothing is drawn, or nothing else, are clamped.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ import torch
 
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
 from keyss.methods.carry.table import BANDS, CHROMA_FEWER, Table
 
 Floats = npt.NDArray[np.float64]
@@ -38,12 +37,8 @@ Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
-# Beyond these nothing is drawn, for numbers of single precision overflow.
-MAX_COORDINATE = 1e15
-MAX_LOG_SCALE = 40.0
-_MAX_COLOUR = 1e12
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is drawn at all
-_MIN_LENGTH, _MAX_LENGTH = 1e-12, 1.8e19  # of quaternions: a shorter one turns nothing, a longer one is not drawn
+_MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
 _BULK = 0.95  # quantile of the distances from the median that tells how far the bulk reaches
 _FURTHEST = 1e30  # no value that a line may give is larger
 _CHUNK = 1 << 14  # Gaussians at a time when packing: every bit takes a byte meanwhile
@@ -261,7 +256,7 @@ def outliers(gaussians: Gaussians) -> Mask:
 
 def out_of_range(gaussians: Gaussians) -> int:
     """How many Gaussians have a number that a record cannot hold, and that nothing drawn depends on."""
-    beyond = _never_drawn(gaussians) | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
+    beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
     return int((beyond | (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)).sum())
 
 
@@ -328,21 +323,13 @@ def _numbers(gaussians: Gaussians, table: Table) -> Iterator[_Numbers]:
         yield _Numbers(positions[:, axis : axis + 1], means, _POSITION)
     sizes = _doubles(gaussians.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
     yield _Numbers(sizes, log_scales, _EVEN)
-    logits = gaussians.opacity_logits.masked_fill(_never_drawn(gaussians), -MAX_LOGIT)
+    logits = gaussians.opacity_logits.masked_fill(gaussians.overflow, -MAX_LOGIT)
     yield _Numbers(_doubles(logits.clamp(-MAX_LOGIT, MAX_LOGIT))[:, None], opacity, _EVEN)
     for band, bits in enumerate(colours):
         harmonics = gaussians.sh[:, band**2 : (band + 1) ** 2].clamp(-_MAX_HARMONIC, _MAX_HARMONIC)
         rotated, kind = _doubles(harmonics) @ OPPONENT.T, _HARMONIC if band > 0 else _COLOUR
         yield _Numbers(rotated[:, :, 0], bits, kind)
         yield _Numbers(rotated[:, :, 1:].reshape(len(rotated), -1), bits - CHROMA_FEWER, kind)
-
-
-def _never_drawn(gaussians: Gaussians) -> torch.Tensor:
-    """[N] which Gaussians have numbers so large that rasterizers leave them out."""
-    far = (gaussians.means.abs() > MAX_COORDINATE).any(1)
-    large = (gaussians.log_scales > MAX_LOG_SCALE).any(1)
-    long = gaussians.quats.double().norm(dim=1) > _MAX_LENGTH
-    return far | large | long | (gaussians.sh.abs() >= _MAX_COLOUR).flatten(1).any(1)
 
 
 def _doubles(values: torch.Tensor) -> Floats:
