@@ -15,6 +15,7 @@ import pytest
 
 from files.scene_files import frames, mutations, photo, save, write_json, write_nerfstudio
 from keyss.core import InputError
+from keyss.core.errors import KeyssWarning
 from keyss.files import load_scene
 from keyss.files.lens import undistortion
 from keyss.files.ply_table import read_point_cloud
@@ -94,6 +95,27 @@ def test_splits(tmp_path: Path) -> None:
     assert names(write_nerfstudio(tmp_path, 4, test_filenames=path[:3])) == (["3"], ["0", "1", "2"])
 
 
+@pytest.mark.parametrize("others", [{}, {"test_filenames": [], "val_filenames": []}])
+def test_every_eighth_photo_is_for_testing_where_all_are_for_training(
+    tmp_path: Path, others: dict[str, object]
+) -> None:
+    everything = [f"images/frame_{i:05}.png" for i in range(10)]
+    folder = write_nerfstudio(tmp_path, 10, train_filenames=everything, **others)
+    with pytest.warns(KeyssWarning, match="`train_filenames` has all photos; every 8th"):
+        assert names(folder) == ([*"1234567", "9"], ["0", "8"])
+
+
+def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
+    path = [f"images/frame_{i:05}.png" for i in range(6)]
+    folder = write_nerfstudio(tmp_path, 6, train_filenames=path[:4])
+    for gone in (path[0], path[4]):
+        (folder / gone).unlink()
+    with pytest.warns(KeyssWarning, match=r"2 of 6 .* images/frame_00000.png, images/frame_00004.png$"):
+        layout = read_nerfstudio(folder, skip_missing=True)
+    assert [p.name for p in layout.train] == path[1:4]
+    assert [p.name for p in layout.test] == path[5:]
+
+
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
@@ -102,7 +124,10 @@ def test_splits(tmp_path: Path) -> None:
             r"Expected `array.*`, got `str` - at `\$\.train_filenames`",
         ),
         ({"train_filenames": [3]}, r"Expected `str`, got `int` - at `\$\.train_filenames\[0\]`"),
-        ({"train_filenames": ["images/none.png"]}, "none.png: expected an image"),
+        (
+            {"train_filenames": ["images/none.png"]},
+            "expected lists of frames, found 'images/none.png', which",
+        ),
         (
             {"train_filenames": ["images/frame_00000.png"], "test_filenames": ["images/frame_00000.png"]},
             "found 'images/frame_00000.png' in both",

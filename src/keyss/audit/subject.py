@@ -21,7 +21,7 @@ from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
 from keyss.measure.robustness.survival import Reopener
 from keyss.methods import registry
-from keyss.runs.opening import HidingRun
+from keyss.runs.opening import HidingRun, as_model
 
 CONTROLS = "private/controls"  # plain models of the cover from other seeds, in a run's folder
 
@@ -77,7 +77,7 @@ def subject_of(
     scenes = run.scenes()
     plain, *baselines = run.plain_models()
     if original is not None:
-        plain = read_model(original)
+        plain = as_model(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
     stego, folder = run.stego.to(device), run.folder / CONTROLS

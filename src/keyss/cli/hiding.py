@@ -24,6 +24,7 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
     optional,
     schedule,
@@ -50,6 +51,7 @@ def hide(
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     cover_model: Annotated[
         Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
     ] = None,
@@ -102,6 +104,7 @@ def hide(
         method=options,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         cover_model=cover_model,
         device=device,
         out=out,
