@@ -45,7 +45,8 @@ FILES = {  # name and content, and what they are
     "e.dat": (pictured("JPEG"), "a picture"),
     "f": (b"ply\nformat ascii 1.0\n", "a PLY file under another name; rename it to end in .ply"),
     "transforms.json": (b"{}", "a JSON file; give the folder that it lies in"),
-    "g.bin": (b"\x01\x02", r"a file that begins with b'\x01\x02'"),
+    "g.bin": (b"\x01\x02", "a file of no kind that keyss knows"),
+    "key.txt": (b"q7Rv2LxT9bWm4KzD", "a file of no kind that keyss knows"),
     "h.spz": (b"", "an empty file"),
 }
 
@@ -55,6 +56,7 @@ def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
     content, found = FILES[name]
     (tmp_path / name).write_bytes(content)
     assert what_it_is(tmp_path / name).startswith(found)
+    assert "q7R" not in what_it_is(tmp_path / name)
     with pytest.raises(InputError) as refused:
         load_scene(tmp_path / name)
     assert f"{tmp_path / name}: expected a scene folder, found {found}" in str(refused.value)

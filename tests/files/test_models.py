@@ -70,7 +70,7 @@ def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
     ("data", "found"),
     [
         (b"", "an empty file"),
-        (b"pl", "a file that begins with b'pl'"),
+        (b"pl", "a file of no kind that keyss knows"),
         (b"\x89PNG\r\n", "a picture; a scene is"),
     ],
 )

@@ -64,7 +64,7 @@ def what_it_is(path: Path) -> str:
     by_magic = (kind for kind in _KINDS if start.startswith(kind.magic))
     kind = next(by_suffix, None) or next(by_magic, None)
     if kind is None:
-        return f"a file that begins with {start!r}"
+        return "a file of no kind that keyss knows"  # none of its bytes: it may be a key
     if kind.advice == CONVERT:
         return f"{kind.name}, which keyss does not read yet; {CONVERT}"
     return f"{kind.name}; {kind.advice}"

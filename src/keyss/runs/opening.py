@@ -137,7 +137,7 @@ def as_scene(
 
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
-    """A model, or the one in a `.ply`, on the CPU. Raises InputError, which names the file in a run's folder."""
+    """A model, or the one in a `.ply`, on the CPU. Raises InputError, which knows folders of runs."""
     if isinstance(source, Gaussians):
         return source.to("cpu")
     if inside := model_in(Path(source)):
