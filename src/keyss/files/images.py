@@ -67,7 +67,7 @@ def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]
     """
     with open_image(path) as image:
         try:
-            if image.mode == "F" or (image.mode == "I" and max(image.getextrema()) > 65535):
+            if image.mode == "F" or (image.mode == "I" and np.max(image.getextrema()) > 65535):
                 raise ValueError("its pixels have 32 bits; convert it to 8 or 16")
             return _to_rgb(image, background)
         except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
