@@ -189,7 +189,7 @@ def test_colmap_without_points_starts_from_random_ones(keyss: Keyss, tmp_path: P
     (scene / "sparse/0/points3D.bin").unlink()
     for out, seed in (("one", 3), ("two", 3), ("three", 4)):
         (warning,) = warnings_of(fitted(keyss, scene, tmp_path / out, "--seed", seed))
-        assert "points3D.bin: there are no points; training starts from random ones" in warning
+        assert "points3D.bin: there are no points; a fit starts from random ones" in warning
     first, again, other = ((tmp_path / out / "model.ply").read_bytes() for out in ("one", "two", "three"))
     assert first == again
     assert first != other

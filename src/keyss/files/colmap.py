@@ -241,7 +241,7 @@ def _points(path: Path, read: Callable[[Path], PointCloud]) -> PointCloud:
     points = read(path) if path.exists() else NO_POINTS
     if not len(points.xyz):
         warnings.warn(
-            f"{path}: there are no points; training starts from random ones around what the cameras look at",
+            f"{path}: there are no points; a fit starts from random ones around what the cameras look at",
             KeyssWarning,
             stacklevel=2,
         )
