@@ -80,7 +80,7 @@ def subject_of(
     if original is not None:
         plain = as_model(original)
     if plain is None:
-        raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
+        raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
     stego = run.stego.to(device)
     config = run.config.options.fit
     if original is not None or run.config.models_given[0]:  # whose size is not that of this run

@@ -77,7 +77,7 @@ def hide(
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
     """
     from keyss import api
-    from keyss.cli.keys import keys, warn_of_weak_keys
+    from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding
     from keyss.core.errors import UsageError
     from keyss.methods import registry
@@ -100,7 +100,7 @@ def hide(
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
-    warn_of_weak_keys(opening)
+    warn_of_doubtful_keys(opening)
     result = api.hide(
         cover,
         [api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)],
@@ -215,8 +215,9 @@ def reveal(
     stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply.")],
     *,
     key_file: Annotated[
-        Path | None, optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt")
-    ] = None,
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt"),
+    ] = (),
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
     decoder: Annotated[
         Path | None,
@@ -237,18 +238,19 @@ def reveal(
     example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
 
-    (key,) = keys((key_file,) if key_file else (), 1)
-    revealed = api.reveal(
-        stego,
-        key,
-        decoder=decoder,
-        frame=frame,
-        decoy=decoy,
-        force=force,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-    )
+    (key,) = keys(key_file, 1)
+    with hinting_at_white_space([key]):
+        revealed = api.reveal(
+            stego,
+            key,
+            decoder=decoder,
+            frame=frame,
+            decoy=decoy,
+            force=force,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
     print(f"{out}: {len(revealed):,} Gaussians")

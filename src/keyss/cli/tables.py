@@ -6,13 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console as RichConsole
 from rich.table import Table
 
 if TYPE_CHECKING:
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
+
+
+class Console(RichConsole):
+    """Leaves it to the entry point what to do when whoever reads has left."""
+
+    def on_broken_pipe(self) -> None:
+        raise  # what is being handled
 
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
