@@ -72,6 +72,7 @@ def fit(
     config: FitConfig | None = None,
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -80,14 +81,19 @@ def fit(
 ) -> FitResult:
     """Train plain 3DGS on a scene.
 
-    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply` and
-    `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
+    `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
+    `resume` goes on.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or FitConfig()
     target = resolve_device(device)
     settings = FitRunConfig(
-        scene=path_of(scene), width=width, background=colour_of(background), config=config
+        scene=path_of(scene),
+        width=width,
+        background=colour_of(background),
+        skip_missing=skip_missing,
+        config=config,
     )
     folder = None
     if out is not None:
@@ -95,7 +101,7 @@ def fit(
         folder = RunFolder(
             out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
         )
-    loaded = as_scene(scene, width, background)
+    loaded = as_scene(scene, width, background, skip_missing=skip_missing)
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,
@@ -127,6 +133,7 @@ def hide(
     method: str | MethodOptions = "learned",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
     min_psnr: float = MIN_PSNR,
     device: Backend = "auto",
@@ -139,10 +146,11 @@ def hide(
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
-    (`LearnedOptions`, `CarryOptions`). The secrets lie encrypted in the low bits of `stego.ply`; with
-    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these in
-    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
-    checkpoints from which `resume` goes on.
+    (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
+
+    The secrets lie encrypted in the low bits of `stego.ply`; with `LearnedOptions(sidecar=True)` they are in
+    a file `decoder.sealed`. `out` (a folder) gets these in `publish/`, and `private/` with the plain models,
+    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
 
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
@@ -168,6 +176,7 @@ def hide(
         ),
         width=width,
         background=colour_of(background),
+        skip_missing=skip_missing,
         payloads=(),
         options=options,
     )
@@ -180,7 +189,10 @@ def hide(
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
     trains = chosen.trains or any(each.model is None for each in inputs)
-    scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
+    scenes = [
+        as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
+        for source in sources
+    ]
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
@@ -251,18 +263,20 @@ def render(
     split: Split = "test",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> list[tuple[str, Tensor]]:
     """Pictures of a model from a scene's cameras: their names and uint8 images [H, W, 3].
 
-    `out` (a folder) gets a PNG per camera.
+    `width`, `background`, `skip_missing`: see `load_scene`; a photo that is left out has no camera. `out` (a
+    folder) gets a PNG per camera.
     """
     target = resolve_device(device)
     folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
-    scene = as_scene(cameras, width, background)
+    scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, views[split])
     if folder:

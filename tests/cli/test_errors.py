@@ -89,7 +89,7 @@ def _without_clip(folder: Path) -> list[object]:
 
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
-    "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden", "-o", f / "out"]),
+    "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
     "truncated points": (4, "points3D", _scene_with(lambda s: _keep(s / "sparse/0/points3D.bin", 40))),
     "image missing": (4, "01.png", _scene_with(lambda s: (s / "images/01.png").unlink())),
     "image of another size": (

@@ -24,6 +24,7 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
     optional,
     preset_sizes,
@@ -51,6 +52,7 @@ def hide(
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     cover_model: Annotated[
         Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
     ] = None,
@@ -106,6 +108,7 @@ def hide(
         method=options,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         cover_model=cover_model,
         min_psnr=min_psnr,
         device=device,
