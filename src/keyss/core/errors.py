@@ -39,3 +39,10 @@ class BackendError(KeyssError):
     """A backend or an optional dependency that is not there."""
 
     exit_status = 6
+
+
+class KeyssWarning(UserWarning):
+    """What a person should know of a result that comes all the same; for `warnings.warn`.
+
+    The command line prints it as one line.
+    """

@@ -26,7 +26,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.base import Frame
+from keyss.methods.base import Frame, Remains
 from keyss.methods.learned.decoder import Decoder, DecoderShape, parse_mask
 from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift
 
@@ -81,6 +81,7 @@ class HiddenSecret:
     # opacities to nothing, and some drop the colours of what is transparent.
     faint: Tensor | None = None
     count: int = 0  # Gaussians that the secret has when it is revealed from a whole file; 0: not known
+    chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
@@ -95,8 +96,8 @@ class HiddenSecret:
             stego = self.with_faint(stego)
         decoded = self.decode(stego, self.embedding)
         if (drawn := decoded.opacities >= DRAWN_OPACITY).any():
-            decoded = decoded[drawn]
-        decoded = compensate_pruning(decoded, self.count).to("cpu")
+            decoded = compensate_pruning(decoded[drawn], self.count)
+        decoded = decoded.to("cpu")
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
@@ -108,6 +109,11 @@ class HiddenSecret:
             stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device)
         )
         return decoded
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        """None where nothing of what was revealed is ever drawn."""
+        found = int((revealed.opacities >= DRAWN_OPACITY).sum())
+        return Remains(found, self.count, self.chunks)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(pack_secret(self)).hexdigest()[:16]
@@ -140,7 +146,7 @@ class HiddenSecret:
             raise InputError(
                 f"this decoder was made for another model: {found:.0%} of its anchors are in this PLY, "
                 f"at least {ANCHORS_NEEDED:.0%} expected "
-                "(quantising the positions does that too: --force tries all the same)"
+                "(quantising the positions does that too: `force=True` tries all the same)"
             )
 
 
