@@ -11,7 +11,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
-from keyss.cli.hiding import hide, reveal
+from keyss.cli.hiding import hide, reveal, verify
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import fit, info, render
 
@@ -70,4 +70,4 @@ def demo(
     )
 
 
-ALL = (keygen, fit, hide, reveal, render, evaluate, audit, report, steganalyze, info, demo)
+ALL = (keygen, fit, hide, reveal, verify, render, evaluate, audit, report, steganalyze, info, demo)

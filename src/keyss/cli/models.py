@@ -70,7 +70,7 @@ def fit(
 
 
 def render(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply.")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
     *,
     cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
     out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
@@ -101,7 +101,8 @@ def render(
 
 def info(
     path: Annotated[
-        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a sidecar or a result folder.")
+        Positional[Path],
+        arg(metavar="FILE", help="A .ply (- for stdin), a scene folder, a sidecar or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,

@@ -130,5 +130,5 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case list() | tuple():
-            return ", ".join(_text(item) for item in value)
+            return ", ".join(_text(item) for item in value) or "none"
     return str(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 from collections.abc import Iterator
@@ -10,15 +11,23 @@ from pathlib import Path
 from typing import BinaryIO
 
 from keyss.core.errors import OutputError
+from keyss.files.streams import StandardOutput
 
 
 @contextmanager
-def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
+def atomic_write(path: Path | str | StandardOutput) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; on success fsync it and rename it to `path`.
+
+    What goes to standard output is held in memory until it is whole.
 
     On any failure the temporary file is removed and `path` is as it was. Raises OutputError when the
     system refuses (disk full, no permission, missing folder).
     """
+    if isinstance(path, StandardOutput):
+        buffer = io.BytesIO()
+        yield buffer
+        path.write(buffer.getbuffer())
+        return
     path = Path(path)
     try:
         descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)

@@ -73,8 +73,8 @@ class KeyDerivation:
         work, most = self.time_cost * self.memory_kib, MOST * TIME_COST * MEMORY_KIB
         if work > most:
             raise InputError(
-                f"key derivation: expected passes times KiB of at most {most:,}, {MOST} times what this program "
-                f"asks for, got {self.time_cost} times {self.memory_kib:,}"
+                f"key derivation: expected passes times KiB of at most {most:,}, {MOST} times what this "
+                f"program asks for, got {self.time_cost} times {self.memory_kib:,}"
             )
 
 
@@ -116,8 +116,8 @@ class DerivedKey:
             )
         except HashingError as error:
             raise InputError(
-                f"deriving a key takes {derivation.memory_kib // 1024} MiB of memory, which the system does not "
-                f"give: {error}"
+                f"deriving a key takes {derivation.memory_kib // 1024} MiB of memory, which the system does "
+                f"not give: {error}"
             ) from error
 
     @staticmethod

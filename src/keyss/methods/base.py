@@ -67,11 +67,17 @@ class Remains:
     found: int  # Gaussians
     hidden: int  # Gaussians that there were; 0: not known
     chunks: tuple[int, int] | None = None  # of its payload: those left and those there were; None: no chunks
+    slack: float = 0.0  # share by which the numbers may differ although nothing was lost
 
     @property
     def share(self) -> float:
         """Of the hidden Gaussians those found: 0 to 1, more where Gaussians were added."""
         return self.found / self.hidden if self.hidden else float(self.found > 0)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was lost or added."""
+        return abs(self.share - 1) <= self.slack and (self.chunks is None or self.chunks[0] == self.chunks[1])
 
 
 class Opened(Protocol):

@@ -35,6 +35,7 @@ ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
 _ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
+_SLACK = 0.01  # of the Gaussians: rounding takes some over the limit of what is drawn, and others back
 _WEIGHTS = "decoder."
 # What reading a damaged header or damaged weights can raise.
 _LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
@@ -113,7 +114,7 @@ class HiddenSecret:
     def remains(self, revealed: Gaussians) -> Remains:
         """None where nothing of what was revealed is ever drawn."""
         found = int((revealed.opacities >= DRAWN_OPACITY).sum())
-        return Remains(found, self.count, self.chunks)
+        return Remains(found, self.count, self.chunks, _SLACK)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(pack_secret(self)).hexdigest()[:16]
