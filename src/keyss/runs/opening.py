@@ -26,8 +26,8 @@ from keyss.runs.records import read_record
 MOST_SIDECAR_BYTES = 1 << 30
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
-    f"(converted or quantised, moved, scaled, edited or trained on); its sidecar ({SIDECAR}) may be missing "
-    "or another one; or nothing is hidden here"
+    "(converted or quantised, moved, scaled, edited or trained on); its sidecar "
+    f"({Path(SIDECAR).name}) may be missing or another one; or nothing is hidden here"
 )
 
 
@@ -111,7 +111,7 @@ def sidecar_beside(stego: Path) -> Path | None:
     """The sidecar beside a model's file, if there is one."""
     if is_standard(stego):
         return None
-    path = stego.with_name(SIDECAR)
+    path = stego.with_name(Path(SIDECAR).name)
     return path if path.exists() else None
 
 

@@ -35,7 +35,7 @@ class RevealResult:
         if self.remains.share < LEAST_LEFT:
             raise InputError(
                 f"{_count(self.remains)}, too little to be seen (at least {LEAST_LEFT:.0%} expected): the "
-                f"others {_CAUSE}; reveal it from the file as it was published, or `force=True` gives what there is"
+                f"others {_CAUSE}; take the file as it was published, or `force=True` gives what there is"
             )
 
 
