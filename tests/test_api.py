@@ -22,6 +22,7 @@ from keyss import FitConfig, LearnedOptions, Secret
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
 from keyss.runs.config import read_config
+from keyss.runs.files import STEGO
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = LearnedOptions(
@@ -130,7 +131,7 @@ def test_existing_models_are_bounds_and_are_not_fitted_again(
     given = run / "private" / "cover.ply"
     secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
     keyss.hide(folders[0], [secret], method=SIDECAR, cover_model=given, out=tmp_path / "again")
-    assert (tmp_path / "again" / "publish" / "stego.ply").read_bytes() == (run / "publish" / "stego.ply").read_bytes()
+    assert (tmp_path / "again" / STEGO).read_bytes() == (run / STEGO).read_bytes()
 
 
 def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from keyss.audit.run import audit as audit
-from keyss.core.errors import QualityError, UsageError
+from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import png_bytes
@@ -41,6 +42,8 @@ from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
 from keyss.runs.records import write_record
+from keyss.runs.revealing import RevealResult, reveal_model
+from keyss.runs.verifying import Verification, check_model, check_secret
 
 WRONG_KEYS = 32
 MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
@@ -237,23 +240,89 @@ def reveal(
     Which method hid it shows itself. `frame`: "secret" gives it in its own frame, so that its cameras fit it;
     "cover" leaves it where it was hidden, which a carried one never was. If Gaussians were lost, the others
     make up for them (`keyss.core.pruning_compensation`). `force` is for models that were quantised: it skips
-    the check that the secret belongs to this one.
+    the check that the secret belongs to this one, and takes as little of it as there is.
 
-    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
-    lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
-    opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for files that
-    are not what they should be or do not belong together.
+    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if it opens and belongs to
+    it, else what lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for
+    a key that opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for
+    files that are not what they should be or do not belong together, and where less than a tenth of the
+    secret is left. Warns (KeyssWarning) of more than a hundredth that is missing, and of a sidecar beside
+    the file that was passed over. `reveal_counted` and `verify` tell how much there is.
     """
+    found = reveal_counted(
+        stego,
+        key,
+        decoder=decoder,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
+    return found.gaussians
+
+
+def reveal_counted(
+    stego: PathLike | Gaussians,
+    key: str,
+    *,
+    decoder: PathLike | bytes | None = None,
+    frame: Frame = "secret",
+    decoy: bool = False,
+    force: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> RevealResult:
+    """`reveal`, with the number of Gaussians that were hidden and its warnings in the result."""
     target = resolve_device(device)
-    path = None if out is None else check_model_output(out, overwrite)
-    model = as_model(stego)
-    if decoder is None and not isinstance(stego, Gaussians):
-        decoder = sidecar_beside(Path(stego))
-    secret = open_file(model, key, decoder, decoy=decoy)
-    found = secret.reveal(model.to(target), frame=frame, force=force)
+    beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
+    inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
+    path = None if out is None else check_model_output(out, overwrite, inputs)
+    found = reveal_model(
+        as_model(stego),
+        key,
+        device=target,
+        decoder=decoder,
+        beside=beside,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+    )
+    if not force:
+        found.check_usable()
     if path is not None:
-        write_model(path, found)
+        write_model(path, found.gaussians)
     return found
+
+
+def verify(
+    model: PathLike | Gaussians,
+    key: str | None = None,
+    *,
+    decoder: PathLike | bytes | None = None,
+    device: Backend = "auto",
+) -> Verification:
+    """Whether a model is sound and, with a key, whether all is there that the key opens; nothing is written.
+
+    Without a key, nothing that comes back says whether something is hidden. `decoder`: see `reveal`. Raises
+    InputError for a file that is no whole and finite model or not the one the secret was hidden in,
+    WrongKeyError for a key that opens nothing, UsageError for a decoder without a key.
+    """
+    if key is None and decoder is not None:
+        raise UsageError("a sidecar is verified with its key: give `key`, or leave out `decoder`")
+    target = resolve_device(device)
+    name = "model" if isinstance(model, Gaussians) else str(model)
+    gaussians = as_model(model)
+    secret = None
+    if key is not None:
+        beside = None if isinstance(model, Gaussians) else sidecar_beside(Path(model))
+        found = reveal_model(gaussians, key, device=target, decoder=decoder, beside=beside)
+        secret = check_secret(found)
+    return Verification(name, check_model(gaussians), secret)
 
 
 def render(
@@ -293,7 +362,8 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the test views; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its
+    `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -355,8 +425,8 @@ def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
         if least > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
             raise QualityError(
                 f"{who} comes out at {each.psnr:.1f} dB against its plain model, and empty pictures "
-                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and "
-                "with `resume=True` nothing is trained again"
+                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, "
+                "and with `resume=True` nothing is trained again"
             )
 
 

@@ -13,6 +13,8 @@ import pytest
 from cli.said import SMALL, Said, assert_refused, listing
 from files.scene_files import photo, save, write_colmap
 
+STEGO = "hidden/publish/stego.ply"
+
 
 def _scene_with(change: Callable[[Path], None]) -> Callable[[Path], list[object]]:
     """`fit` on a COLMAP scene after `change`."""
@@ -106,7 +108,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
     "key file empty": (4, "keyss keygen", _empty_key),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
-    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / "hidden/publish/stego.ply", "-o", f / "s.ply"]),
+    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / STEGO, "-o", f / "s.ply"]),
     "header truncated": (4, "stego.ply", _ply_with(lambda data: data[:100])),
     "data truncated": (4, "stego.ply", _ply_with(lambda data: data[:-1])),
     "negative count": (4, "stego.ply", _ply_with(_with_count("-3"))),
@@ -126,17 +128,17 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         "--overwrite",
         lambda f: [
             "reveal",
-            f / "hidden/publish/stego.ply",
+            f / STEGO,
             "--key-file",
             f / "key.txt",
             "-o",
-            f / "hidden/publish/stego.ply",
+            f / STEGO,
         ],
     ),
     "folder of the file missing": (
         5,
         "nowhere",
-        lambda f: ["reveal", f / "hidden/publish/stego.ply", "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
+        lambda f: ["reveal", f / STEGO, "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
     ),
     "evaluate without a run": (
         4,

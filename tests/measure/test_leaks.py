@@ -163,7 +163,8 @@ def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_phot
 
 
 def test_the_picture_shows_the_variant_that_is_judged() -> None:
-    """One variant is a flat haze as bright as the photo, which PSNR likes; the other has the secret's shapes."""
+    """One variant is a flat haze as bright as the photo, which PSNR likes; the other has the secret's
+    shapes."""
     shown = {"shapes": HIDDEN, "haze": random_gaussians(1500, seed=7)}
     attack = Attack(
         "planted",

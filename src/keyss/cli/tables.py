@@ -31,8 +31,8 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
     differ = any(other not in (own, None) for own, other in sizes)
     rows = [
-        _scene_row(name, *qualities, own, other if differ else None)
-        for name, *qualities, (own, other) in zip(names, found, plain, sizes, strict=True)
+        _scene_row(name, quality, baseline, own, other if differ else None)
+        for name, quality, baseline, (own, other) in zip(names, found, plain, sizes, strict=True)
     ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
@@ -172,5 +172,5 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case list() | tuple():
-            return ", ".join(_text(item) for item in value)
+            return ", ".join(_text(item) for item in value) or "none"
     return str(value)

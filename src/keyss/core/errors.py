@@ -58,7 +58,8 @@ class KeyssWarning(UserWarning):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or another signal during long work, after saving to `checkpoint` (None: there was none to write).
+    """Ctrl-C or another signal during long work, after saving to `checkpoint` (None: there was none to
+    write).
 
     `iteration`: how many steps are done.
     """

@@ -19,7 +19,7 @@ from keyss.channels.base import Channel, PreparedCover, RecordPlan, RecordReques
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
-from keyss.methods.base import Frame
+from keyss.methods.base import Frame, Remains
 from keyss.methods.carry.quantise import Codec
 from keyss.methods.carry.table import Table
 
@@ -44,6 +44,12 @@ class CarriedSecret:
                 'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
             )
         return compensate_pruning(self.gaussians, self.count)
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), self.count)
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        """It does: every record is bound to the Gaussian that it came out of."""
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]

@@ -140,7 +140,7 @@ class LearnedMethod:
         """A decoder, and where the secret lies. Raises InputError for damage."""
         if not isinstance(content, Payload):
             raise InputError("the hidden secret is damaged: expected one payload, got records")
-        return unpack_secret(content.data)
+        return replace(unpack_secret(content.data), chunks=content.chunks)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """The opacity remaps of a warm start are in the source; nothing else is known without a key."""
