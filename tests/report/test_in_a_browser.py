@@ -35,7 +35,7 @@ def report(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = run_with(run_folder, tmp_path_factory.mktemp("coloured"), data)
     items = {item["label"]: item["file"] for item in data["images"]["pictures"][0]["items"]}
     for label, colour in {"photo": RED, "stego model": BLUE, "plain model": GREEN}.items():
-        Image.new("RGB", (40, 30), colour).save(run / "audit" / items[label])
+        Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / items[label])
     return write_report(run)
 
 

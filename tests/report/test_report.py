@@ -127,7 +127,7 @@ def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]
 
 def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> None:
     assert page.loads() == []
-    html = (run_folder / "report.html").read_text()
+    html = (run_folder / "private" / "report.html").read_text()
     assert "@import" not in html
     assert all(url.startswith("#") for url in re.findall(r"url\(([^)]*)\)", html))
     assert set(re.findall(r"https?://[^\"' <]*", html)) == {
@@ -171,17 +171,17 @@ def test_an_empty_audit_says_how_to_fill_it(run_folder: Path, data: dict[str, An
 
 def test_a_broken_audit_leaves_the_old_report(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     run = run_with(run_folder, tmp_path, data | {"images": "none"})
-    (run / "report.html").write_text("old")
+    (run / "private" / "report.html").write_text("old")
     with pytest.raises(InputError, match=r"audit\.json: .*`\$\.images`"):
         write_report(run)
-    assert (run / "report.html").read_text() == "old"
-    assert sorted(path.name for path in run.iterdir()) == ["audit", "report.html"]
+    assert (run / "private" / "report.html").read_text() == "old"
+    assert sorted(path.name for path in (run / "private").iterdir()) == ["audit", "report.html"]
 
 
 @pytest.mark.usefixtures("without_drawing")
 def test_a_report_that_cannot_be_written(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     run = run_with(run_folder, tmp_path, data)
-    (run / "report.html").mkdir()
+    (run / "private" / "report.html").mkdir()
     with pytest.raises(OutputError, match=r"report\.html"):
         write_report(run)
 
@@ -196,9 +196,9 @@ def test_a_configuration_may_be_nested_but_not_without_end(
     def nested(depth: int) -> str:
         return text.replace('"HERE"', '{"a": ' * depth + "1" + "}" * depth)
 
-    (run / "audit" / "audit.json").write_text(nested(300))
+    (run / "private" / "audit" / "audit.json").write_text(nested(300))
     assert "a.a.a.a.a.a.a.a.a.a.a …" in parsed(run).text
-    (run / "audit" / "audit.json").write_text(nested(50_000))
+    (run / "private" / "audit" / "audit.json").write_text(nested(50_000))
     with pytest.raises(InputError):
         write_report(run)
 
