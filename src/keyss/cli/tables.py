@@ -31,8 +31,8 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
     differ = any(other not in (own, None) for own, other in sizes)
     rows = [
-        _scene_row(name, quality, baseline, own, other if differ else None)
-        for name, quality, baseline, (own, other) in zip(names, found, plain, sizes, strict=True)
+        _scene_row(name, own, other, size, others if differ else None)
+        for name, own, other, (size, others) in zip(names, found, plain, sizes, strict=True)
     ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
