@@ -6,7 +6,9 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
@@ -15,18 +17,17 @@ import torch
 from torch import Tensor
 
 from keyss.audit.run import audit as audit
-from keyss.core.errors import UsageError
+from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import png_bytes
-from keyss.files.models import check_model_output, write_model
-from keyss.files.output import OutputFolder
+from keyss.files.models import check_model_output, read_model, write_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.measure.hiding import measure_hiding
+from keyss.measure.hiding import RenderFidelity, measure_hiding, render_fidelity
 from keyss.measure.images import renders_of
 from keyss.methods import registry
 from keyss.methods.base import Context, Frame, KeyedSource, Method, MethodOptions, SceneInput, Source, Stego
@@ -36,11 +37,14 @@ from keyss.rendering.orbit import is_model
 from keyss.report.page import write_report as write_report
 from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
 from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names, writers
+from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
-from keyss.runs.opening import as_model, as_scene, open_file, open_run, sidecar_beside
+from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
 from keyss.runs.records import write_record
 
 WRONG_KEYS = 32
+MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
+_BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; of dark or small objects, empty pictures may pass for good ones
 Split = Literal["test", "train", "all"]
 
 
@@ -76,37 +80,43 @@ def fit(
 ) -> FitResult:
     """Train plain 3DGS on a scene.
 
-    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply`,
-    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply` and
+    `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or FitConfig()
     target = resolve_device(device)
-    folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
-    loaded = as_scene(scene, width, background)
-    result = fit_scene(
-        loaded,
-        config,
-        device=target,
-        title=f"fit {loaded.name}",
-        checkpoint=folder.checkpoints() / "fit.safetensors" if folder else None,
-        resume=resume,
-        reporter=reporter,
+    settings = FitRunConfig(
+        scene=path_of(scene), width=width, background=colour_of(background), config=config
     )
-    if folder is not None:
-        test = quality(result.gaussians.to(target), loaded.test, loaded.background.to(target))
-        metrics = FitMetrics(
-            **asdict(test),
-            gaussians=len(result.gaussians),
-            iterations=config.iterations,
-            seconds=round(result.seconds, 1),
-            width=_width(loaded),
-            seed=config.seed,
+    folder = None
+    if out is not None:
+        told = asdict(settings) | {"device": target.type}
+        folder = RunFolder(
+            out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
         )
-        settings = FitRunConfig(
-            scene=path_of(scene), width=width, background=colour_of(background), config=config
+    loaded = as_scene(scene, width, background)
+    with folder.work() if folder else nullcontext():
+        result = fit_scene(
+            loaded,
+            config,
+            device=target,
+            title=f"fit {loaded.name}",
+            checkpoint=folder.checkpoints / "fit.safetensors" if folder else None,
+            resume=resume,
+            reporter=reporter,
         )
-        folder.fill(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
+        if folder:
+            test = quality(result.gaussians.to(target), loaded.test, loaded.background.to(target))
+            metrics = FitMetrics(
+                **asdict(test),
+                gaussians=len(result.gaussians),
+                iterations=config.iterations,
+                seconds=round(result.seconds, 1),
+                width=_width(loaded),
+                seed=config.seed,
+            )
+            folder.write(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
     return result
 
 
@@ -118,6 +128,7 @@ def hide(
     width: int | None = None,
     background: Background = None,
     cover_model: PathLike | Gaussians | None = None,
+    min_psnr: float = MIN_PSNR,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -129,9 +140,13 @@ def hide(
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
     (`LearnedOptions`, `CarryOptions`). The secrets lie encrypted in the low bits of `stego.ply`; with
-    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these,
-    `config.json`, `metrics.json` and `private/` with the plain models; while it runs, checkpoints from which
-    `resume` goes on. Raises KeyssError and its children; Interrupted on Ctrl-C.
+    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these in
+    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
+    checkpoints from which `resume` goes on.
+
+    At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
+    to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
+    is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
     chosen, options = _method(method)
     if not 1 <= len(secrets) <= chosen.most_secrets:
@@ -141,35 +156,54 @@ def hide(
     keys = [secret.key for secret in secrets]
     _check_keys(keys)
     target = resolve_device(device)
-    folder = OutputFolder(out, overwrite=overwrite, resume=resume) if out is not None else None
-
     sources = [cover, *(secret.scene for secret in secrets)]
     models = [cover_model, *(secret.model for secret in secrets)]
+    settings = RunConfig(
+        method=chosen.name,
+        cover=path_of(cover),
+        secrets=tuple(path_of(secret.scene) for secret in secrets),
+        models_given=tuple(
+            model is not None or (not isinstance(source, Scene) and is_model(source))
+            for source, model in zip(sources, models, strict=True)
+        ),
+        width=width,
+        background=colour_of(background),
+        payloads=(),
+        options=options,
+    )
+    folder = None
+    if out is not None:
+        told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
+        folder = RunFolder(
+            out, "hide", told, onto=("scenes",), writes=(STEGO, CONFIG), overwrite=overwrite, resume=resume
+        )
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
     trains = chosen.trains or any(each.model is None for each in inputs)
     scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
-    context = Context(target, folder.checkpoints() if folder and trains else None, resume, reporter)
-    plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
-    own, *others = map(Source, scenes, plain)
-    stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
-
-    metrics = _measured(chosen, stego, scenes, plain, options, target)
-    if folder is not None:
-        settings = RunConfig(
-            method=chosen.name,
-            cover=path_of(cover),
-            secrets=tuple(path_of(secret.scene) for secret in secrets),
-            models_given=tuple(each.model is not None for each in inputs),
-            width=width,
-            background=colour_of(background),
-            payloads=tuple(each.fingerprint() for each in stego.opened),
-            options=options,
+    with folder.work() if folder else nullcontext():
+        context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
+        plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
+        own, *others = map(Source, scenes, plain)
+        stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
+        published, sidecar = stego.gaussians, stego.sidecar
+        if folder:
+            there = folder.write(writers({STEGO: published} | ({SIDECAR: sidecar} if sidecar else {})))
+            published = read_model(there / STEGO)
+            sidecar = read_sidecar(there / SIDECAR) if sidecar else None
+        shown = [published.to(target)]
+        shown += [open_file(published, key, sidecar).reveal(published).to(target) for key in keys]
+        against_plain = tuple(
+            render_fidelity(model, original.to(target), scene)
+            for model, original, scene in zip(shown, plain, scenes, strict=True)
         )
-        contents: dict[str, object] = {STEGO: stego.gaussians, CONFIG: settings, METRICS: metrics}
-        if stego.sidecar is not None:
-            contents[SIDECAR] = stego.sidecar
-        folder.fill(writers(contents | dict(zip(plain_names(len(secrets)), plain, strict=True))))
+        _check_quality(against_plain, min_psnr)
+        metrics = _measured(chosen, stego, scenes, plain, options, against_plain, target)
+        if folder:
+            payloads = tuple(each.fingerprint() for each in stego.opened)
+            made = dict(zip(plain_names(len(secrets)), plain, strict=True))
+            settings = replace(settings, options=options, payloads=payloads)
+            folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
     return HideResult(stego.gaussians, stego.sidecar, metrics)
 
 
@@ -225,13 +259,14 @@ def render(
     `out` (a folder) gets a PNG per camera.
     """
     target = resolve_device(device)
-    folder = OutputFolder(out, overwrite=overwrite) if out is not None else None
+    folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
     scene = as_scene(cameras, width, background)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, views[split])
-    if folder is not None:
-        folder.fill(writers({name: png_bytes(image) for name, image in pictures}))
+    if folder:
+        with folder.work():
+            folder.write(writers({name: png_bytes(image) for name, image in pictures}))
     return pictures
 
 
@@ -265,7 +300,7 @@ def evaluate(
         seed=seed or 0,
     )
     metrics = replace(opened.metrics, **vars(measured))
-    write_record(opened.folder / METRICS, metrics)
+    write_again(opened.folder, "hide", METRICS, partial(write_record, record=metrics))
     return metrics
 
 
@@ -293,12 +328,30 @@ def _check_keys(keys: Sequence[str]) -> None:
         raise UsageError("two secrets have the same key: each needs its own")
 
 
+def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
+    """Raise QualityError where the cover or a secret does not come out as it should."""
+    for index, each in enumerate(found):
+        who = "the cover" if index == 0 else "the secret" if len(found) == 2 else f"secret {index}"
+        if each.psnr < least:
+            raise QualityError(
+                f"{who} comes out at {each.psnr:.1f} dB against its plain model, below {least:g} dB: nothing "
+                "was published; `min_psnr` sets the limit, and with `resume=True` nothing is trained again"
+            )
+        if least > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
+            raise QualityError(
+                f"{who} comes out at {each.psnr:.1f} dB against its plain model, and empty pictures "
+                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and "
+                "with `resume=True` nothing is trained again"
+            )
+
+
 def _measured(
     method: Method,
     stego: Stego,
     scenes: Sequence[Scene],
     models: Sequence[Gaussians],  # plain ones of the scenes
     options: MethodOptions,
+    against_plain: tuple[RenderFidelity, ...],
     device: torch.device,
 ) -> HideMetrics:
     """What `stego` comes to."""
@@ -319,6 +372,7 @@ def _measured(
         seconds=round(stego.seconds, 1),
         width=_width(scenes[0]),
         seed=options.fit.seed,
+        against_plain=against_plain,
         details=stego.details,
     )
 

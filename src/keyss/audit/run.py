@@ -6,6 +6,7 @@ import platform
 import time
 from collections.abc import Sequence
 from importlib.metadata import version as version_of
+from pathlib import Path
 
 import msgspec
 
@@ -14,10 +15,9 @@ from keyss.audit.parts import PARTS
 from keyss.audit.progress import FinishedParts, PartProgress
 from keyss.audit.subject import AuditSubject, subject_of
 from keyss.core.errors import UsageError
-from keyss.files.output import OutputFolder
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.rendering import Backend, resolve_device
-from keyss.report import write_report
+from keyss.report.page import report_bytes
 from keyss.runs.audit_record import (
     AUDIT_FILE,
     AUDIT_FOLDER,
@@ -28,10 +28,12 @@ from keyss.runs.audit_record import (
     WrongKeyResult,
 )
 from keyss.runs.config import PathLike
-from keyss.runs.files import writers
+from keyss.runs.files import REPORT, writers
+from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun, open_run
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
+KEPT = ("hide", "demo", "controls")  # what an audit leaves where it is
 
 
 def audit(
@@ -52,9 +54,9 @@ def audit(
     `keys`: those of all its secrets, in any order. `original`: a plain model of the cover, by default the
     run's own. `controls`: number of plain models of the cover to compare with, trained from other seeds and
     kept in `private/controls/`; at least 2. `only`: names of parts, by default all. The folder gets
-    `audit/audit.json`, which is also returned, `audit/pictures/` and `report.html`; while it runs, finished
-    parts are kept, and `resume` goes on after them. Raises KeyssError and its children, Interrupted on
-    Ctrl-C.
+    `private/audit/` with `audit.json`, which is also returned, and pictures, and `private/report.html`; while
+    it runs, finished parts are kept, and `resume` goes on after them. Raises KeyssError and its children,
+    Interrupted on Ctrl-C.
     """
     if controls < 2:
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
@@ -62,36 +64,47 @@ def audit(
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
     started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
-    output = OutputFolder(opened.folder / AUDIT_FOLDER, overwrite=overwrite, resume=resume)
-    subject = subject_of(opened, original, controls, seed, resolve_device(device), reporter)
-    finished = FinishedParts(output.checkpoints(), _inputs(subject, seed))
-    sections = {}
-    pictures: dict[str, bytes] = {}
-    chosen = [name for name in PARTS if not only or name in only]
-    for index, name in enumerate(chosen):
-        if not finished.has(name):
-            progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
-            try:
-                finished.keep(name, PARTS[name](subject, seed, progress))
-            except KeyboardInterrupt as error:
-                raise Interrupted(finished.folder, index) from error
-            finally:
-                progress.finish(finished.has(name))
-        sections[name], own = finished.take(name)
-        pictures |= own
-    shown = opened.metrics.wrong_key
-    wrong_key = None if shown is None else WrongKeyResult(shown, opened.metrics.chance_level)
-    found = Audit(
-        keyss=__version__,
-        seconds=round(time.monotonic() - started, 1),
-        run=_audited_run(opened),
-        controls=Controls(controls, subject.seeds),
-        wrong_key=wrong_key,
-        **sections,
+    target = resolve_device(device)
+    asked = {"original": original and str(Path(original).resolve()), "controls": controls, "only": only}
+    folder = RunFolder(
+        opened.folder,
+        "audit",
+        asked | {"seed": seed, "device": target.type, "payloads": opened.config.payloads},
+        onto=KEPT,
+        writes=(f"{AUDIT_FOLDER}/{AUDIT_FILE}", REPORT),
+        overwrite=overwrite,
+        resume=resume,
     )
-    files = {f"{PICTURES}/{name}": data for name, data in pictures.items()}
-    output.fill(writers({AUDIT_FILE: found, **files}))
-    write_report(opened.folder)
+    with folder.work():
+        subject = subject_of(opened, original, controls, seed, target, reporter, folder)
+        finished = FinishedParts(folder.checkpoints, _inputs(subject, seed))
+        sections = {}
+        pictures: dict[str, bytes] = {}
+        chosen = [name for name in PARTS if not only or name in only]
+        for index, name in enumerate(chosen):
+            if not finished.has(name):
+                progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
+                try:
+                    finished.keep(name, PARTS[name](subject, seed, progress))
+                except KeyboardInterrupt as error:
+                    raise Interrupted(finished.folder, index) from error
+                finally:
+                    progress.finish(finished.has(name))
+            sections[name], own = finished.take(name)
+            pictures |= own
+        shown = opened.metrics.wrong_key
+        wrong_key = None if shown is None else WrongKeyResult(shown, opened.metrics.chance_level)
+        found = Audit(
+            keyss=__version__,
+            seconds=round(time.monotonic() - started, 1),
+            run=_audited_run(opened),
+            controls=Controls(controls, subject.seeds),
+            wrong_key=wrong_key,
+            **sections,
+        )
+        files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
+        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": found, **files}))
+        folder.write(writers({REPORT: report_bytes(found, there)}))
     return found
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from keyss.core.errors import OutputError, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -21,9 +21,9 @@ from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
 from keyss.measure.robustness.survival import Reopener
 from keyss.methods import registry
+from keyss.runs.files import CONTROLS
+from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun
-
-CONTROLS = "private/controls"  # plain models of the cover from other seeds, in a run's folder
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,9 @@ def subject_of(
     seed: int,
     device: torch.device,
     reporter: Reporter,
+    folder: RunFolder,
 ) -> AuditSubject:
-    """Read, reveal and fit what the audit needs; plain models are kept in the run's folder and used again.
+    """Read, reveal and fit what the audit needs; plain models are kept in the run's `folder` and used again.
 
     `original`: a plain model of the cover, by default the run's own. `controls`: how many are trained, from
     the seeds after the run's own and `seed`. Raises UsageError without a plain model of the cover.
@@ -80,7 +81,7 @@ def subject_of(
         plain = read_model(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give --original")
-    stego, folder = run.stego.to(device), run.folder / CONTROLS
+    stego = run.stego.to(device)
     config = run.config.options.fit
     if original is not None or run.config.models_given[0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
@@ -105,18 +106,15 @@ def subject_of(
 
 
 def _plain_model(
-    scene: Scene, config: FitConfig, folder: Path, device: torch.device, reporter: Reporter
+    scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
 ) -> Gaussians:
-    """A plain model of a scene, from `folder` if one was made there of the same, as its name tells."""
+    """A plain model of a scene, from the run's folder if its name tells that one is there."""
     made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
     name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
-    model, checkpoint = folder / f"{name}.ply", folder / f"{name}.safetensors"
-    if model.exists():
-        return read_model(model)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot create {folder}: {error.strerror}") from error
+    model = f"{CONTROLS}/{name}.ply"
+    if (folder.path / model).exists():
+        return read_model(folder.path / model)
+    checkpoint = folder.checkpoints / f"{name}.safetensors"
     result = fit_scene(
         scene,
         config,
@@ -126,6 +124,6 @@ def _plain_model(
         resume=True,
         reporter=reporter,
     )
-    write_model(model, result.gaussians)
+    folder.keep("controls", model, partial(write_model, model=result.gaussians))
     checkpoint.unlink(missing_ok=True)
     return result.gaussians

@@ -1,6 +1,14 @@
 """Plain data: Gaussians, cameras, scenes, similarity transforms, errors."""
 
-from keyss.core.errors import BackendError, InputError, KeyssError, OutputError, UsageError, WrongKeyError
+from keyss.core.errors import (
+    BackendError,
+    InputError,
+    KeyssError,
+    OutputError,
+    QualityError,
+    UsageError,
+    WrongKeyError,
+)
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 
@@ -11,6 +19,7 @@ __all__ = [
     "InputError",
     "KeyssError",
     "OutputError",
+    "QualityError",
     "Scene",
     "UsageError",
     "View",

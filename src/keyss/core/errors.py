@@ -35,6 +35,12 @@ class OutputError(KeyssError):
     exit_status = 5
 
 
+class QualityError(KeyssError):
+    """What was made is not good enough to be given out."""
+
+    exit_status = 7
+
+
 class BackendError(KeyssError):
     """A backend or an optional dependency that is not there."""
 

@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from keyss.core.errors import UsageError
+from keyss.core.errors import OutputError, UsageError
 from keyss.demo.ray_shapes import Floats, Vector
 from keyss.demo.ray_tracer import World, trace
 from keyss.demo.worlds import golden_knot, tea_table
 from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
-from keyss.files.output import OutputFolder
 from keyss.files.ply_table import ply_header
 
 _POINTS = 3000
@@ -70,7 +68,9 @@ def write_demo_scene(
         raise UsageError(f"expected at least 8 views of 16 x 16 pixels, got {views} of {width} x {height}")
     if seed < 0:
         raise UsageError(f"expected a seed of 0 or more, got {seed}")
-    output = OutputFolder(folder)
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder} exists: choose another folder")
     make_world, target = _DEMOS[which]
     rng = np.random.default_rng(seed)
     studio = _Studio(make_world(seed), _poses(target, views, rng), width, height)
@@ -78,7 +78,12 @@ def write_demo_scene(
     names = [f"images/{index:04d}.png" for index in range(views)]
     files = {name: png_bytes(torch.from_numpy(image)) for name, image in zip(names, images, strict=True)}
     files |= {"points.ply": studio.points(images, rng), "transforms.json": studio.transforms(names)}
-    output.fill({name: partial(write_bytes, data=data) for name, data in files.items()})
+    try:
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot create {folder}: {error.strerror}") from error
+    for name, data in files.items():
+        write_bytes(folder / name, data)
 
 
 def _poses(target: Vector, views: int, rng: np.random.Generator) -> NDArray[np.float64]:

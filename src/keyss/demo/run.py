@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
-import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +17,13 @@ from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.demo.photographs import write_demo_scene
-from keyss.files.atomic import write_bytes
-from keyss.files.output import OutputFolder
 from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
 from keyss.methods.registry import LearnedOptions
 from keyss.rendering import Backend
-from keyss.runs.files import CONFIG, METRICS, PRIVATE, SIDECAR, STEGO
+from keyss.runs.files import STEGO, writers
+from keyss.runs.folder import RunFolder, clear
 from keyss.runs.metrics import HideMetrics
 
 COVER, SECRET = "tea-table", "golden-knot"
@@ -32,7 +31,6 @@ VIEWS, WIDTH, HEIGHT = 48, 160, 120
 OPTIONS = LearnedOptions(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
-_RESULTS = (STEGO, SIDECAR, CONFIG, METRICS, PRIVATE, SECRET_PLY, COMPARISON, KEY, SCENES)
 
 
 @dataclass(frozen=True)
@@ -62,61 +60,51 @@ def run_demo(
     nothing of the demo stays in the folder.
     """
     out, reporter = Path(out), reporter or SilentReporter()
-    OutputFolder(out, overwrite=overwrite)
-    was_there = out.exists()
-    _clear(out)
+    # Of all stages what an earlier demo left is replaced, and what was made of it since.
+    scenes = RunFolder(out, "scenes", {"seed": seed}, overwrite=overwrite)
     try:
-        cover, secret = (
-            _scene(out / SCENES / which, views, reporter, width=width, height=height, seed=seed)
-            for which in (COVER, SECRET)
-        )
+        with scenes.work():
+            size = {"views": views, "width": width, "height": height, "seed": seed}
+            scenes.write(
+                {f"{SCENES}/{which}": partial(_photograph, reporter, size) for which in (COVER, SECRET)}
+            )
+        cover, secret = (load_scene(out / SCENES / which) for which in (COVER, SECRET))
         key = f"demo-key-{seed}"
         verbs.hide(
             out / SCENES / COVER,
             [verbs.Secret(out / SCENES / SECRET, key)],
             method=options.with_fit(seed=seed),
+            min_psnr=0,  # no result of a demo gets lost for being a quick one
             device=device,
             out=out,
-            overwrite=True,
             reporter=reporter,
         )
-        verbs.reveal(out / STEGO, key, device=device, out=out / SECRET_PLY)
-        refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
         metrics = verbs.evaluate(out, [key], seed=seed, device=device)
-        picture = io.BytesIO()
-        _comparison(out, cover, secret, metrics, device).save(picture, "PNG", optimize=True)
-        write_bytes(out / COMPARISON, picture.getvalue())
-        write_bytes(out / KEY, f"{key}\n".encode())
+        results = RunFolder(out, "demo", onto=("scenes", "hide"))
+        with results.work():
+            revealed = verbs.reveal(out / STEGO, key, device=device)
+            refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
+            picture = io.BytesIO()
+            comparison = _comparison(out / STEGO, revealed, cover, secret, metrics, device)
+            comparison.save(picture, "PNG", optimize=True)
+            files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
+            results.write(writers(files))
         return DemoResult(metrics, refused)
     except BaseException as error:
-        _clear(out)
-        shutil.rmtree(out / "checkpoint", ignore_errors=True)
-        if not was_there and out.is_dir() and not any(out.iterdir()):
-            out.rmdir()
+        clear(out)
         if isinstance(error, Interrupted):  # there is nothing left to continue from
             raise KeyboardInterrupt from error
         raise
 
 
-def _clear(out: Path) -> None:
-    """Remove what an earlier demo left in the folder, and nothing else."""
-    for name in _RESULTS:
-        path = out / name
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
-
-
-def _scene(folder: Path, views: int, reporter: Reporter, **size_and_seed: int) -> Scene:
-    reporter.start(f"photos of the {folder.name}", views, 0)
+def _photograph(reporter: Reporter, size: Mapping[str, int], folder: Path) -> None:
+    reporter.start(f"photos of the {folder.name}", size["views"], 0)
 
     def progress(done: int, _: int) -> None:
         reporter.update(done, 0, {})
 
-    write_demo_scene(folder, folder.name, views=views, progress=progress, **size_and_seed)
+    write_demo_scene(folder, folder.name, progress=progress, **size)
     reporter.finish()
-    return load_scene(folder)
 
 
 def _is_refused(stego: Path, key: str, device: Backend) -> bool:
@@ -127,7 +115,9 @@ def _is_refused(stego: Path, key: str, device: Backend) -> bool:
     return False
 
 
-def _comparison(out: Path, cover: Scene, secret: Scene, metrics: HideMetrics, device: Backend) -> Image.Image:
+def _comparison(
+    stego: Path, revealed: Gaussians, cover: Scene, secret: Scene, metrics: HideMetrics, device: Backend
+) -> Image.Image:
     """Photos and renders of three test views side by side."""
     count = len(cover.test)
     rows = sorted({count // 6, count // 2, count - 1 - count // 6})
@@ -140,13 +130,13 @@ def _comparison(out: Path, cover: Scene, secret: Scene, metrics: HideMetrics, de
         return [images[row][1].numpy() for row in rows]
 
     assert metrics.wrong_key is not None
-    decoy = verbs.reveal(out / STEGO, WRONG_KEYS[0], decoy=True, device=device)
+    decoy = verbs.reveal(stego, WRONG_KEYS[0], decoy=True, device=device)
     shown, opened, wrong = metrics.cover.psnr, metrics.secrets[0].psnr, metrics.wrong_key.vs_cover.mean
     columns = [
         ("cover: photo", "", photos(cover)),
-        ("cover: published model", f"{shown:.1f} dB", renders(out / STEGO, cover)),
+        ("cover: published model", f"{shown:.1f} dB", renders(stego, cover)),
         ("secret: photo", "", photos(secret)),
-        ("opened with the key", f"{opened:.1f} dB", renders(out / SECRET_PLY, secret)),
+        ("opened with the key", f"{opened:.1f} dB", renders(revealed, secret)),
         ("with a wrong key", f"{wrong:.1f} dB against the cover", renders(decoy, cover)),
     ]
     return contact_sheet(columns)

@@ -14,9 +14,12 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import ImageQuality, mean_psnr, quality
+from keyss.fitting.image_metrics import ImageQuality, mean_psnr, quality, subsample_views
 from keyss.keys import random_embeddings
 from keyss.methods.base import Opened
+from keyss.rendering import render
+
+_FIDELITY_VIEWS = 8
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,14 @@ class WrongKeys:
     keys: int
     vs_cover: PsnrRange  # means over the decoders
     vs_secrets: tuple[PsnrRange, ...]  # each decoder's, seen from the cameras of its secret
+
+
+@dataclass(frozen=True)
+class RenderFidelity:
+    """Renders of a model against those of the plain model that it should show, from test cameras."""
+
+    psnr: float  # dB, of the mean square error over all views; at most 120
+    nothing: float  # dB, what empty pictures would come to
 
 
 @dataclass(frozen=True)
@@ -123,6 +134,19 @@ def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
     if opened.frame is not None:
         return opened.frame
     return align([view.camera for view in secret.train], [view.camera for view in cover.train])
+
+
+@torch.no_grad()
+def render_fidelity(model: Gaussians, plain: Gaussians, scene: Scene) -> RenderFidelity:
+    """How near a model comes to the plain model of its scene, where no photo says anything about either."""
+    background = scene.background.to(model.device)
+    errors, empty = [], []
+    for view in subsample_views(scene.test, _FIDELITY_VIEWS):
+        expected = render(plain, view.camera, background).clamp(0, 1)
+        errors.append((render(model, view.camera, background).clamp(0, 1) - expected).square().mean())
+        empty.append((background - expected).square().mean())
+    psnr, nothing = (-10 * torch.stack(each).mean().clamp_min(1e-12).log10() for each in (errors, empty))
+    return RenderFidelity(round(float(psnr), 2), round(float(nothing), 2))
 
 
 def _range(values: Sequence[float]) -> PsnrRange:

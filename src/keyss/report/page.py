@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
+from functools import partial
 from importlib.resources import files
 from pathlib import Path, PurePath
 
@@ -18,8 +19,8 @@ from keyss.report import figures, numbers
 from keyss.report.untrusted import AuditPictures, check_bounds, clean, flat
 from keyss.report.verdicts import auc_text, detector_rocs, headline, verdicts
 from keyss.runs.audit_record import Audit, ImagesResult, read_audit
-
-REPORT = "report.html"
+from keyss.runs.files import REPORT
+from keyss.runs.folder import write_again
 
 _STYLES = ("page.css", "pictures.css", "print.css")
 _HOW = "`keyss audit RUN --key-file KEY` measures it"
@@ -27,20 +28,25 @@ _EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and audits after i
 
 
 def write_report(run_folder: Path | str) -> Path:
-    """Write RUN/report.html from RUN/audit, atomically, and return its path.
+    """Write RUN/private/report.html from RUN/private/audit, atomically, and return its path.
 
     One file that needs no network: pictures, figures, style and script are in it, and so it shows the secret.
     The same audit gives the same bytes. Raises InputError when there is no audit, or it is broken, too large
-    or names pictures outside RUN/audit; OutputError when the file cannot be written.
+    or names pictures outside its folder; OutputError when the file cannot be written.
     """
     run = Path(run_folder)
-    audit = read_audit(run)
+    data = report_bytes(read_audit(run), run)
+    write_again(run, "audit", REPORT, partial(write_bytes, data=data))
+    return run / REPORT
+
+
+def report_bytes(audit: Audit, folder: Path) -> bytes:
+    """The file's content; pictures are in `folder`, laid out as in a run's. Raises InputError."""
     try:
         check_bounds(audit)
     except RecursionError as error:
-        raise InputError(f"{run}: the audit's configuration is nested too deeply") from error
-    write_bytes(run / REPORT, page(audit, AuditPictures(run)).encode())
-    return run / REPORT
+        raise InputError(f"{folder}: the audit's configuration is nested too deeply") from error
+    return page(audit, AuditPictures(folder)).encode()
 
 
 def page(audit: Audit, pictures: AuditPictures) -> str:

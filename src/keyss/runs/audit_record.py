@@ -18,9 +18,10 @@ from keyss.measure.sealwatch_detectors import SealwatchRocs
 from keyss.measure.sinkhorn import Sinkhorn3D
 from keyss.measure.speed import SpeedResult
 from keyss.measure.two_sample import TwoSample
+from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
 
-AUDIT_FOLDER, AUDIT_FILE = "audit", "audit.json"  # the folder is in that of the run
+AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # the folder is in that of the run
 PICTURES = "pictures"  # folder in that of the audit
 
 
@@ -150,7 +151,7 @@ class Audit:
 
 
 def read_audit(run: Path) -> Audit:
-    """RUN/audit/audit.json. Raises InputError when it is missing, broken, too large or of another version."""
+    """A run's audit. Raises InputError when it is missing, broken, too large or of another version."""
     path = run / AUDIT_FOLDER / AUDIT_FILE
     if not path.exists():
         raise InputError(f"{path}: expected an audit, found nothing there; `keyss audit {run}` makes one")

@@ -9,11 +9,13 @@ from typing import Any
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.models import write_model
+from keyss.runs.folder import PRIVATE, PUBLISH
 from keyss.runs.records import record_bytes
 
-STEGO, SIDECAR, MODEL = "stego.ply", "decoder.sealed", "model.ply"
-CONFIG, METRICS = "config.json", "metrics.json"
-PRIVATE = "private"  # plain models of cover and secrets: for measuring, never to be published
+STEGO, SIDECAR = f"{PUBLISH}/stego.ply", f"{PUBLISH}/decoder.sealed"
+MODEL = "model.ply"  # of a plain fit
+CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
+CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 
 
 def plain_names(secrets: int) -> list[str]:
@@ -22,7 +24,7 @@ def plain_names(secrets: int) -> list[str]:
 
 
 def writers(contents: Mapping[str, Any]) -> dict[str, Callable[[Path], None]]:
-    """For `OutputFolder.fill`, of each file's content: a model, bytes as they are, or a record."""
+    """For `RunFolder.write`, of each file's content: a model, bytes as they are, or a record."""
     return {name: _writer(content) for name, content in contents.items()}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from keyss._version import __version__
 from keyss.fitting.image_metrics import ImageQuality
-from keyss.measure.hiding import HidingQuality
+from keyss.measure.hiding import HidingQuality, RenderFidelity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +24,7 @@ class HideMetrics(HidingQuality):
     seconds: float  # of hiding, without fitting plain models and measuring
     width: int  # pixels of the cover's photos
     seed: int
+    against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, as they open from the written files
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of the method's own
 
 

@@ -98,7 +98,7 @@ def read_sidecar(path: Path) -> bytes:
 
 def sidecar_beside(stego: Path) -> Path | None:
     """The sidecar beside a model's file, if there is one."""
-    path = stego.with_name(SIDECAR)
+    path = stego.with_name(Path(SIDECAR).name)
     return path if path.exists() else None
 
 

@@ -1,0 +1,335 @@
+"""The folder of a run: what it holds, who is at work in it, and what of it this program may remove.
+
+`publish/` holds what may be given away and nothing else; `private/` (mode 0700) holds what this program keeps
+to itself, in files of mode 0600: among them the manifest, which lists every file that was written here, and
+while something runs the lock, the checkpoints and the files that are not finished.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import msgspec
+
+from keyss._version import __version__
+from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.files.lock import held_by, lock
+from keyss.runs.records import read_record, write_record
+
+PUBLISH, PRIVATE = "publish", "private"
+MANIFEST = f"{PRIVATE}/manifest.json"
+_LOCK, _CHECKPOINTS, _STAGING = (f"{PRIVATE}/{name}" for name in ("lock", "checkpoint", "unfinished"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Running:
+    """Work that has begun and has not ended."""
+
+    stage: str
+    arguments: dict[str, Any]  # what must be the same for it to be continued
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What this program wrote into a folder."""
+
+    version: int = 1
+    keyss: str = __version__
+    running: Running | None = None
+    files: dict[str, tuple[str, ...]] = field(default_factory=dict)  # paths in the folder, by stage
+
+
+class RunFolder:
+    """A folder for the results of one stage: of hiding, or of an audit of what was hidden, for example.
+
+    `arguments`: JSON-able, what `resume` compares. `onto`: stages whose results are there already and stay;
+    those of all other stages are replaced, which takes `overwrite`. `writes`: names of files to come, as far
+    as they are known; one that is somebody else's is never replaced.
+
+    Nothing is created before `work`. Raises OutputError when the folder is not empty and neither `overwrite`
+    nor `resume` is given, when there is nothing to resume, and when another process is at work in it;
+    UsageError for both at once.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        stage: str,
+        arguments: Mapping[str, Any] | None = None,
+        *,
+        onto: Collection[str] = (),
+        writes: Collection[str] = (),
+        overwrite: bool = False,
+        resume: bool = False,
+    ) -> None:
+        self.path, self.stage, self.onto = Path(path), stage, frozenset(onto)
+        self.arguments: dict[str, Any] = msgspec.to_builtins(dict(arguments or {}))
+        if overwrite and resume:
+            raise UsageError("`overwrite=True` starts anew and `resume=True` continues: give one of them")
+        self._was_there = self.path.exists()
+        self._continues = False
+        if self.path.is_symlink() or self._was_there:
+            if not self.path.is_dir():
+                raise OutputError(f"{self.path} exists and is not a folder")
+            self._check(overwrite, resume)
+        for name in writes:
+            _refuse_foreign(self.path, name)
+
+    def _check(self, overwrite: bool, resume: bool) -> None:
+        """Raise OutputError where this stage must not begin."""
+        if (pid := held_by(self.path / _LOCK)) is not None:
+            raise OutputError(f"{self.path}: process {pid} is at work in this folder")
+        there = read_manifest(self.path)
+        in_use = set(there.files) - self.onto or (there == Manifest() and any(self.path.iterdir()))
+        if (running := there.running) is not None:
+            if resume:
+                self._check_same(running)
+                self._continues = True
+            elif not overwrite:
+                raise OutputError(
+                    f"{self.path} holds an interrupted run ({running.stage}): `resume=True` with the same "
+                    "arguments continues it, `overwrite=True` drops it"
+                )
+        elif in_use and resume:
+            finished = f"holds a finished run ({self.stage})" if self.stage in there.files else "is in use"
+            raise OutputError(f"{self.path} {finished}, and no interrupted one that could be resumed")
+        elif in_use and not overwrite:
+            raise OutputError(
+                f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
+            )
+
+    def _check_same(self, running: Running) -> None:
+        """Raise OutputError unless this is the run that was interrupted."""
+        if running.stage != self.stage:
+            raise OutputError(
+                f"{self.path} holds an interrupted run of another kind ({running.stage}, not {self.stage})"
+            )
+        old, new = running.arguments, self.arguments
+        differ = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
+        if differ:
+            changes = "; ".join(f"{name}: {_differences(old.get(name), new.get(name))}" for name in differ)
+            raise OutputError(
+                f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
+                "or start anew with `overwrite=True`"
+            )
+
+    @contextmanager
+    def work(self) -> Iterator[RunFolder]:
+        """Claims the folder while the block runs.
+
+        At its end the files that were written appear, all or none, those that they replace are removed, and
+        checkpoints too. When the block fails, checkpoints stay if there are any, to be resumed from; else the
+        folder is left as it was. Raises OutputError.
+        """
+        try:
+            with _typed(self.path):
+                (self.path / PRIVATE).mkdir(parents=True, exist_ok=True)
+                (self.path / PRIVATE).chmod(0o700)
+            with lock(self.path / _LOCK):
+                before = read_manifest(self.path)  # again: now nobody else changes it
+                if not self._continues:
+                    self._drop_unfinished()
+                shutil.rmtree(self.path / _STAGING, ignore_errors=True)
+                self._save(replace(before, running=Running(stage=self.stage, arguments=self.arguments)))
+                self._names: list[str] = []
+                try:
+                    yield self
+                    with _typed(self.path):
+                        self._finish()
+                except BaseException:
+                    self._give_up()
+                    raise
+        finally:
+            _remove_empty(self.path / PRIVATE)
+            if not self._was_there:
+                _remove_empty(self.path)
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder for checkpoints, created."""
+        folder = self.path / _CHECKPOINTS
+        with _typed(folder):
+            folder.mkdir(exist_ok=True, mode=0o700)
+        return folder
+
+    def write(self, writers: Mapping[str, Callable[[Path], None]]) -> Path:
+        """Call each writer with a path to write a file or a folder to; returns where they lie until the end.
+
+        Names are paths in the run's folder. Raises OutputError.
+        """
+        staging = self.path / _STAGING
+        with _typed(self.path):
+            for name, write in writers.items():
+                _refuse_foreign(self.path, name)
+                (staging / name).parent.mkdir(parents=True, exist_ok=True)
+                write(staging / name)
+                written = [staging / name]
+                if written[0].is_dir():
+                    written = sorted(path for path in written[0].rglob("*") if path.is_file())
+                self._names += [str(path.relative_to(staging)) for path in written]
+        return staging
+
+    def keep(self, stage: str, name: str, write: Callable[[Path], None]) -> None:
+        """Write a file of another stage; it stays whatever becomes of this one. Raises OutputError."""
+        with _typed(self.path):
+            _write_entered(self.path, stage, name, write)
+
+    def _finish(self) -> None:
+        there = read_manifest(self.path)
+        kept = {stage: names for stage, names in there.files.items() if stage in self.onto}
+        for stage, names in there.files.items():
+            if stage not in kept:
+                _remove(self.path, names)
+        # Listed before they appear: whatever happens in between, the manifest knows them.
+        there = replace(there, files=kept | {self.stage: tuple(self._names)})
+        self._save(there)
+        for name in self._names:
+            staged, target = self.path / _STAGING / name, self.path / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if name.startswith(f"{PUBLISH}/"):
+                staged.chmod(0o666 & ~_umask())
+            os.replace(staged, target)
+        self._save(replace(there, running=None))
+        self._drop_unfinished()
+
+    def _give_up(self) -> None:
+        """Leave what can be resumed, or the folder as it was."""
+        shutil.rmtree(self.path / _STAGING, ignore_errors=True)
+        there = read_manifest(self.path)
+        checkpoints = self.path / _CHECKPOINTS
+        if checkpoints.is_dir() and any(checkpoints.iterdir()):
+            return
+        self._drop_unfinished()
+        there = replace(there, running=None)
+        if there.files:
+            self._save(there)
+        else:
+            (self.path / MANIFEST).unlink(missing_ok=True)
+
+    def _drop_unfinished(self) -> None:
+        """Remove the traces of an earlier run. Raises OutputError for what was there before keyss."""
+        for name in (_CHECKPOINTS, _STAGING):
+            if (self.path / name).exists() and not (self.path / MANIFEST).exists():
+                raise OutputError(f"{self.path / name} is in the way, and keyss did not write it: move it")
+            shutil.rmtree(self.path / name, ignore_errors=True)
+
+    def _save(self, manifest: Manifest) -> None:
+        write_record(self.path / MANIFEST, manifest)
+
+
+def clear(folder: Path) -> None:
+    """Remove all that this program wrote into a folder, and the folder if nothing else is in it."""
+    if not (folder / PRIVATE).is_dir():
+        return
+    with _typed(folder):
+        with lock(folder / _LOCK):
+            _remove(folder, [name for names in read_manifest(folder).files.values() for name in names])
+            for name in (_CHECKPOINTS, _STAGING):
+                shutil.rmtree(folder / name, ignore_errors=True)
+            (folder / MANIFEST).unlink(missing_ok=True)
+        _remove_empty(folder / PRIVATE)
+        _remove_empty(folder)
+
+
+def write_again(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
+    """Write a file of a finished stage anew. Raises OutputError, also where a process is at work."""
+    with _typed(folder):
+        (folder / PRIVATE).mkdir(mode=0o700, exist_ok=True)
+        with lock(folder / _LOCK):
+            _write_entered(folder, stage, name, write)
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """What this program wrote into a folder; empty where there is no manifest.
+
+    Raises OutputError for a damaged one, and for one that names what is not in the folder.
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        return Manifest()
+    try:
+        manifest = read_record(path, Manifest)
+    except InputError as error:
+        raise OutputError(f"{error}; what keyss wrote in {folder} is not known any more") from error
+    for name in (name for names in manifest.files.values() for name in names):
+        parts = PurePosixPath(name).parts
+        if not parts or ".." in parts or parts[0] == "/" or "\0" in name or name == MANIFEST:
+            raise OutputError(f"{path}: {name!r} is not a file in this folder")
+    return manifest
+
+
+def _write_entered(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
+    _refuse_foreign(folder, name)
+    there = read_manifest(folder)
+    if not any(name in names for names in there.files.values()):
+        names = {**there.files, stage: (*there.files.get(stage, ()), name)}
+        write_record(folder / MANIFEST, replace(there, files=names))
+    (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
+    write(folder / name)
+
+
+def _refuse_foreign(folder: Path, name: str) -> None:
+    """Raise OutputError if what is in the way of a file is not this program's."""
+    target = folder / name
+    if any((folder / parent).is_symlink() for parent in PurePosixPath(name).parents if parent.name):
+        raise OutputError(
+            f"{target.parent} leads out of {folder}: remove this link, or choose another folder"
+        )
+    if not (target.is_symlink() or target.exists()):
+        return
+    if not any(name in names for names in read_manifest(folder).files.values()):
+        raise OutputError(
+            f"{target} is in the way, and keyss did not write it: move it, or choose another folder"
+        )
+
+
+def _remove(folder: Path, names: Collection[str]) -> None:
+    """Remove files, and folders below `folder` that are empty then; links to elsewhere are not followed."""
+    for name in names:
+        path = folder / name
+        parents = list(path.relative_to(folder).parents)[:-1]
+        if any((folder / parent).is_symlink() for parent in parents) or (
+            path.is_dir() and not path.is_symlink()
+        ):
+            continue
+        path.unlink(missing_ok=True)
+        for parent in parents:
+            _remove_empty(folder / parent)
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # not there, or something is in it
+        folder.rmdir()
+
+
+def _differences(old: Any, new: Any) -> str:
+    """What differs, down to the innermost fields."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
+        return ", ".join(f"{name} {_differences(old.get(name), new.get(name))}" for name in names)
+    return f"{_shown(old)} then, {_shown(new)} now"
+
+
+def _shown(value: Any) -> str:
+    return "none" if value is None else msgspec.json.encode(value).decode()
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
+
+
+@contextmanager
+def _typed(path: Path) -> Iterator[None]:
+    """The system's errors as OutputErrors."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot write to {error.filename or path}: {error.strerror or error}") from error

@@ -1,0 +1,55 @@
+"""Fixtures of the command line: runs of it, and a small world to run it in."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import SMALL, Said
+from files.scene_files import write_blender, write_nerfstudio
+from keyss.cli import main
+
+
+@pytest.fixture
+def keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
+    """Runs the command line in this process, without a key in the environment and without a terminal."""
+    monkeypatch.delenv("KEYSS_KEY", raising=False)
+    monkeypatch.delenv("KEYSS_DEBUG", raising=False)
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+
+    def run(*arguments: object) -> Said:
+        capsys.readouterr()
+        try:
+            status = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            status = int(end.code or 0)
+        return Said(status, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with scenes `a` and `b`, a key file, and `hidden`: b hidden in a; tests must not change it."""
+    folder = tmp_path_factory.mktemp("world")
+    write_blender(folder / "a", count=3, channels=3)
+    write_nerfstudio(folder / "b", count=4)
+    (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
+    (folder / "key.txt").chmod(0o600)
+    (folder / "wrong.txt").write_text("fedcba9876543210\n")
+    arguments = [
+        "--sidecar",
+        "--cover",
+        folder / "a",
+        "--secret",
+        folder / "b",
+        "--key-file",
+        folder / "key.txt",
+    ]
+    status = main(["hide", *map(str, arguments), "-o", str(folder / "hidden"), *SMALL])
+    assert status == 0
+    return folder

@@ -1,0 +1,56 @@
+"""What tests of the command line run and compare."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from keyss.cli import commands
+from keyss.fitting.image_metrics import ImageQuality
+from keyss.measure.hiding import BaselineQuality, RenderFidelity
+from keyss.runs.metrics import HideMetrics
+
+METRICS = HideMetrics(
+    method="learned",
+    cover=ImageQuality(30.0, 0.5),
+    secrets=(ImageQuality(20.0, 0.25),),
+    baseline=BaselineQuality(ImageQuality(30.5, 0.6), (None,)),
+    wrong_key=None,
+    chance_level=(9.0,),
+    gaussians=1234,
+    secret_gaussians=(567,),
+    iterations=10,
+    seconds=1.0,
+    width=100,
+    seed=0,
+    against_plain=(RenderFidelity(32.0, 8.0), RenderFidelity(31.0, 9.0)),
+    details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
+)
+SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
+COMMANDS = [command.__name__ for command in commands.ALL]
+PROGRAM = [sys.executable, "-c", "import sys; from keyss.cli import main; sys.exit(main())"]
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a run of the command line came to."""
+
+    status: int
+    out: str
+    err: str
+
+
+def listing(folder: Path) -> dict[str, int]:
+    """Every file and folder below, hidden ones too, with its time of change."""
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))}
+
+
+def assert_refused(said: Said, status: int, words: str) -> None:
+    """The exit status, and one or two lines that hold `words`."""
+    assert said.status == status, said.err
+    assert words in said.err
+    assert said.err.startswith("keyss: ")
+    assert 1 <= len(said.err.splitlines()) <= 2
+    assert "Traceback" not in said.err
+    assert said.out == ""

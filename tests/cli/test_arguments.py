@@ -1,0 +1,133 @@
+"""What of the command line reaches the functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cli.said import METRICS, Said, assert_refused
+from keyss import api as verbs
+from keyss.methods import registry
+from keyss.methods.learned.options import PRESETS as LEARNED_PRESETS
+from tiny_scenes import random_gaussians
+
+
+class TestArguments:
+    """What reaches the functions."""
+
+    @pytest.fixture
+    def hidden(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
+        calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
+
+        def hide(*args: Any, **kwargs: Any) -> verbs.HideResult:
+            calls.append((args, kwargs))
+            return verbs.HideResult(random_gaussians(1), None, METRICS)
+
+        monkeypatch.setattr(verbs, "hide", hide)
+        return calls
+
+    def test_secrets_and_keys_pair_up_in_order(
+        self, keyss: Callable[..., Said], hidden: list[Any], tmp_path: Path
+    ) -> None:
+        for name in "bc":
+            (tmp_path / f"{name}.txt").write_text(f"key of {name}")
+        said = keyss(
+            *("hide", "--cover", "A", "-o", "out", "--secret", "B", "--key-file", tmp_path / "b.txt"),
+            *(
+                "--secret",
+                "C",
+                "--key-file",
+                tmp_path / "c.txt",
+                "--secret-model",
+                "mb",
+                "--secret-model",
+                "mc",
+            ),
+        )
+        assert said.status == 0, said.err
+        (cover, secrets), _ = hidden[0]
+        assert cover == Path("A")
+        assert secrets == [
+            verbs.Secret(Path("B"), "key of b", Path("mb")),
+            verbs.Secret(Path("C"), "key of c", Path("mc")),
+        ]
+
+    def test_options_override_the_preset(
+        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("KEYSS_KEY", "k")
+        said = keyss(
+            *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
+            *("--max-gaussians", 80, "--seed", 9, "--mask", "xyz,sc", "--start", "points", "--width", 10),
+            *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
+        )
+        assert said.status == 0, said.err
+        _, options = hidden[0]
+        config = options.pop("method")
+        assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
+        assert config.mask == ("sc", "xyz")
+        assert config.start == "points"
+        assert config.decoder == "network"
+        assert (config.iterations, config.max_gaussians) == (7, 80)
+        assert config.fit.evaluate_every == LEARNED_PRESETS["quick"].fit.evaluate_every
+        assert options.pop("reporter") is not None
+        assert options == {
+            "width": 10,
+            "background": (1.0, 0.5, 0.0),
+            "cover_model": Path("m.ply"),
+            "device": "cpu",
+            "out": Path("out"),
+            "overwrite": False,
+            "resume": True,
+        }
+
+    def test_by_default_the_preset_stays_as_it_is(
+        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("KEYSS_KEY", "k")
+        assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
+        assert hidden[0][1]["method"] == LEARNED_PRESETS["best"]
+        assert keyss("hide", "--method", "carry", "--cover", "A", "--secret", "B", "-o", "out").status == 0
+        assert hidden[1][1]["method"] == registry.get("carry").presets["best"]
+
+    def test_options_of_a_method_reach_it(
+        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("KEYSS_KEY", "k")
+        scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
+        assert keyss(*scenes, "--sidecar", "--key-encoder", "clip", "--clip-model", "C").status == 0
+        learned = hidden[0][1]["method"]
+        assert (learned.sidecar, learned.key_encoder, learned.clip_model) == (True, "clip", "C")
+        assert keyss(*scenes, "--method", "carry", "--thin", "--dither", "--seed", 5).status == 0
+        carry = hidden[1][1]["method"]
+        assert (carry.prune_to_fit, carry.dither, carry.fit.seed) == (True, True, 5)
+
+    @pytest.mark.parametrize(
+        ("extra", "words"),
+        [
+            (("--iterations", 0), "iterations"),
+            (("--max-gaussians", -5), "max_gaussians"),
+            (("--seed", -1), "--seed"),
+            (("--seed", 10**30), "--seed"),
+            (("--mask", "op,colour"), "colour"),
+            (("--secret-model", "x", "--secret-model", "y"), "--secret-model"),
+            (("--secret", "C"), "KEYSS_KEY holds one key"),
+        ],
+    )
+    def test_what_makes_no_sense_is_refused(
+        self,
+        keyss: Callable[..., Said],
+        hidden: list[Any],
+        monkeypatch: pytest.MonkeyPatch,
+        extra: tuple[object, ...],
+        words: str,
+    ) -> None:
+        monkeypatch.setenv("KEYSS_KEY", "k")
+        assert_refused(keyss("hide", "--cover", "A", "--secret", "B", "-o", "out", *extra), 2, words)
+        assert hidden == []
+
+    def test_hide_needs_a_secret(self, keyss: Callable[..., Said], hidden: list[Any]) -> None:
+        assert keyss("hide", "--cover", "A", "-o", "out").status == 2

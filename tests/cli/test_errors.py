@@ -1,0 +1,233 @@
+"""What goes wrong is a line and an exit status, and leaves nothing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import SMALL, Said, assert_refused, listing
+from files.scene_files import photo, save, write_colmap
+
+
+def _scene_with(change: Callable[[Path], None]) -> Callable[[Path], list[object]]:
+    """`fit` on a COLMAP scene after `change`."""
+
+    def prepare(folder: Path) -> list[object]:
+        write_colmap(folder / "scene", count=4)
+        change(folder / "scene")
+        return ["fit", folder / "scene", "-o", folder / "out", *SMALL]
+
+    return prepare
+
+
+def _ply_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
+    """`reveal` on a stego file after `change` of its bytes."""
+
+    def prepare(folder: Path) -> list[object]:
+        stego = folder / "hidden" / "stego.ply"
+        stego.write_bytes(change(stego.read_bytes()))
+        return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
+
+    return prepare
+
+
+def _decoder_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
+    def prepare(folder: Path) -> list[object]:
+        decoder = folder / "hidden" / "decoder.sealed"
+        decoder.write_bytes(change(decoder.read_bytes()))
+        stego = folder / "hidden" / "stego.ply"
+        return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
+
+    return prepare
+
+
+def _keep(path: Path, size: int) -> None:
+    path.write_bytes(path.read_bytes()[:size])
+
+
+def _later_version(data: bytes) -> bytes:
+    return data[:8] + b"\x07" + data[9:]
+
+
+def _with_nan(data: bytes) -> bytes:
+    at = data.index(b"end_header\n") + len(b"end_header\n")
+    return data[:at] + b"\0\0\xc0\x7f" + data[at + 4 :]
+
+
+def _with_count(count: str) -> Callable[[bytes], bytes]:
+    return lambda data: data.replace(b"element vertex 100\n", f"element vertex {count}\n".encode())
+
+
+def _other_model(folder: Path) -> list[object]:
+    shutil.copy(folder / "hidden" / "private" / "secret-1.ply", folder / "hidden" / "stego.ply")
+    stego = folder / "hidden" / "stego.ply"
+    return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
+
+
+def _hide(folder: Path, **changes: object) -> list[object]:
+    options = {"--cover": folder / "a", "--secret": folder / "b", "--key-file": folder / "key.txt"}
+    options |= {"--out": folder / "out"} | {
+        f"--{name.replace('_', '-')}": value for name, value in changes.items()
+    }
+    return ["hide", "--sidecar", *(part for option in options.items() for part in option), *SMALL]
+
+
+def _empty_key(folder: Path) -> list[object]:
+    (folder / "empty.txt").write_text("\n")
+    return _hide(folder, key_file=folder / "empty.txt")
+
+
+def _without_clip(folder: Path) -> list[object]:
+    pytest.importorskip("transformers", reason="needs keyss[clip]")
+    return _hide(folder, key_encoder="clip", clip_model=folder / "a")
+
+
+ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
+    "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
+    "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden", "-o", f / "out"]),
+    "truncated points": (4, "points3D", _scene_with(lambda s: _keep(s / "sparse/0/points3D.bin", 40))),
+    "image missing": (4, "01.png", _scene_with(lambda s: (s / "images/01.png").unlink())),
+    "image of another size": (
+        4,
+        "01.png",
+        _scene_with(lambda s: save(s / "images/01.png", photo(1, size=(13, 9)))),
+    ),
+    "one image": (4, "2 posed images", lambda f: ["fit", write_colmap(f / "s", count=1), "-o", f / "out"]),
+    "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
+    "no secret": (4, "nowhere", lambda f: _hide(f, secret=f / "nowhere")),
+    "no cover model": (4, "nowhere.ply", lambda f: _hide(f, cover_model=f / "nowhere.ply")),
+    "output exists": (5, "--overwrite", lambda f: _hide(f, out=f / "hidden")),
+    "output is a file": (5, "not a folder", lambda f: ["fit", f / "a", "-o", f / "key.txt"]),
+    "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
+    "key file empty": (4, "keyss keygen", _empty_key),
+    "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
+    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / "hidden/stego.ply", "-o", f / "s.ply"]),
+    "header truncated": (4, "stego.ply", _ply_with(lambda data: data[:100])),
+    "data truncated": (4, "stego.ply", _ply_with(lambda data: data[:-1])),
+    "negative count": (4, "stego.ply", _ply_with(_with_count("-3"))),
+    "absurd count": (4, "stego.ply", _ply_with(_with_count("99999999999999"))),
+    "NaN": (4, "NaN", _ply_with(_with_nan)),
+    "another version": (4, "version", _decoder_with(_later_version)),
+    "decoder truncated": (4, "decoder.sealed", _decoder_with(lambda data: data[:-9])),
+    "decoder empty": (4, "decoder.sealed", _decoder_with(lambda data: b"")),
+    "another model": (4, "another model", _other_model),
+    "no sidecar and nothing in the model": (
+        3,
+        "opens nothing",
+        lambda f: ["reveal", f / "hidden/private/cover.ply", "--key-file", f / "key.txt", "-o", f / "s.ply"],
+    ),
+    "file exists": (
+        5,
+        "--overwrite",
+        lambda f: [
+            "reveal",
+            f / "hidden/stego.ply",
+            "--key-file",
+            f / "key.txt",
+            "-o",
+            f / "hidden/stego.ply",
+        ],
+    ),
+    "folder of the file missing": (
+        5,
+        "nowhere",
+        lambda f: ["reveal", f / "hidden/stego.ply", "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
+    ),
+    "evaluate without a run": (
+        4,
+        "config.json",
+        lambda f: ["evaluate", f / "a", "--key-file", f / "key.txt"],
+    ),
+    "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
+    "info of another file": (4, "key.txt", lambda f: ["info", f / "key.txt"]),
+    "clip without a model": (6, "--clip-model", _without_clip),
+    "clip model without clip": (2, "--key-encoder", lambda f: _hide(f, clip_model=f)),
+    "width of nothing": (2, "width", lambda f: ["fit", f / "a", "-o", f / "out", "--width", 0]),
+    "background out of range": (
+        2,
+        "background",
+        lambda f: ["fit", f / "a", "-o", f / "out", "--background", 0, 0, 9],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_errors_are_a_line_and_leave_nothing(
+    keyss: Callable[..., Said], world: Path, tmp_path: Path, name: str
+) -> None:
+    status, words, prepare = ERRORS[name]
+    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
+    arguments = prepare(tmp_path)
+    before = listing(tmp_path)
+    assert_refused(keyss(*arguments), status, words)
+    assert listing(tmp_path) == before
+
+
+def test_a_full_disk_is_a_line_and_leaves_nothing(
+    keyss: Callable[..., Said], world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("keyss.files.atomic.os.fsync", full)
+    arguments = [world / "hidden" / "stego.ply", "--key-file", world / "key.txt"]
+    assert_refused(keyss("reveal", *arguments, "-o", tmp_path / "secret.ply"), 5, "No space left")
+    arguments = [world / "hidden" / "stego.ply", "--cameras", world / "a"]
+    assert_refused(keyss("render", *arguments, "-o", tmp_path / "images"), 5, "No space left")
+    assert listing(tmp_path) == {}
+
+
+class TestUnexpectedErrors:
+    @pytest.fixture
+    def failing(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
+        def fail_with(error: BaseException) -> None:
+            def info(path: Path) -> None:
+                raise error
+
+            monkeypatch.setattr("keyss.runs.describe.info", info)
+
+        return fail_with
+
+    def test_ours_are_a_line_that_asks_for_a_report(
+        self, keyss: Callable[..., Said], failing: Callable[[BaseException], None]
+    ) -> None:
+        failing(ValueError("first\nsecond\x1b[31m"))
+        said = keyss("info", "x")
+        assert_refused(said, 70, "ValueError: first second [31m; please report")
+        assert "KEYSS_DEBUG=1" in said.err
+
+    def test_ours_come_through_for_whoever_debugs(
+        self,
+        keyss: Callable[..., Said],
+        failing: Callable[[BaseException], None],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        failing(ValueError("boom"))
+        monkeypatch.setenv("KEYSS_DEBUG", "1")
+        with pytest.raises(ValueError, match="boom"):
+            keyss("info", "x")
+
+    @pytest.mark.parametrize(
+        ("error", "status", "words"),
+        [
+            (MemoryError(), 5, "not enough memory"),
+            (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 5, "not enough memory"),
+            (OSError(errno.ENOSPC, "No space left on device", "/x/y"), 5, "/x/y: No space left"),
+            (KeyboardInterrupt(), 130, "interrupted"),
+        ],
+    )
+    def test_the_machines_are_explained(
+        self,
+        keyss: Callable[..., Said],
+        failing: Callable[[BaseException], None],
+        error: BaseException,
+        status: int,
+        words: str,
+    ) -> None:
+        failing(error)
+        assert_refused(keyss("info", "x"), status, words)

@@ -1,0 +1,78 @@
+"""What the help says, and how wrong usage ends."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import COMMANDS, Said
+from keyss.fitting.config import PRESETS as FIT_PRESETS
+from keyss.methods import registry
+
+
+class TestHelp:
+    def test_names_every_command(self, keyss: Callable[..., Said]) -> None:
+        said = keyss("--help")
+        assert said.status == 0
+        assert all(f"• {name}" in said.out for name in COMMANDS)
+        making = ["keygen", "fit", "hide", "reveal", "render"]
+        judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo"]
+        assert making + judging == COMMANDS
+
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_shows_an_example(self, keyss: Callable[..., Said], command: str) -> None:
+        said = keyss(command, "--help")
+        assert said.status == 0
+        assert f"example: keyss {command}" in said.out
+        assert "default: None" not in said.out
+
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
+        out = keyss(command, "--help").out
+        assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "demo"})
+        computing = {"fit", "hide", "reveal", "render", "evaluate", "audit", "demo"}
+        assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
+        assert "nothing here" not in out
+
+    @pytest.mark.parametrize("command", ["fit", "hide"])
+    def test_shows_the_options_of_training(self, keyss: Callable[..., Said], command: str) -> None:
+        out = keyss(command, "--help").out
+        for option in ("preset", "iterations", "max-gaussians", "width", "background", "resume", "overwrite"):
+            assert f"--{option}" in out
+
+    def test_offers_the_presets_there_are(self, keyss: Callable[..., Said]) -> None:
+        assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
+        for name, method in registry.METHODS.items():
+            said = keyss("hide", "--method", name, "--help").out
+            assert f"--preset {{{','.join(method.presets)}}}" in said
+            assert f"(default: {next(iter(method.presets))})" in said
+
+    @pytest.mark.parametrize("method", ["learned", "carry"])
+    def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:
+        """Names, defaults and sentences of all options; `hide_METHOD_help.txt` is what is meant."""
+        meant = Path(__file__).with_name(f"hide_{method}_help.txt").read_text(encoding="utf-8")
+        said = keyss("hide", "--method", method, "--help").out
+        assert [line.rstrip() for line in said.splitlines()] == meant.splitlines()
+
+    def test_needs_no_method_to_be_loaded(self) -> None:
+        """`keyss --help` answers at once: torch takes seconds."""
+        program = "import sys; from keyss.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+        program += "assert not {'torch', 'keyss.methods'} & set(sys.modules)"
+        subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+
+    def test_an_unknown_method_names_those_there_are(self, keyss: Callable[..., Said]) -> None:
+        said = keyss("hide", "--method", "none", "--cover", "A", "--secret", "B", "-o", "out")
+        assert said.status == 2
+        assert "learned" in said.err
+        assert "carry" in said.err
+
+    @pytest.mark.parametrize("arguments", [(), ("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
+    def test_wrong_usage_exits_with_2(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:
+        said = keyss(*arguments)
+        assert said.status == 2
+        assert said.out == ""
+        assert said.err

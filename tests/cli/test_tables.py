@@ -1,0 +1,61 @@
+"""What is printed when a command is done."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import replace
+
+from rich.console import Console
+
+from cli.said import METRICS
+from keyss.cli.tables import print_hiding
+from keyss.measure.hiding import BaselineQuality, PsnrRange, WrongKeys
+from keyss.runs.metrics import HideMetrics
+
+
+class TestNumbers:
+    """What is printed of a hiding, whatever its method."""
+
+    def table(self, metrics: HideMetrics) -> list[list[str]]:
+        console = Console(file=io.StringIO(), width=120)
+        print_hiding(metrics, console)
+        text: str = console.file.getvalue()  # type: ignore[attr-defined]
+        return [re.split("  +", line.strip()) for line in text.splitlines()]
+
+    def test_a_row_for_each_and_what_the_method_adds(self) -> None:
+        rows = self.table(METRICS)
+        assert rows[:4] == [
+            ["against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians"],
+            ["cover", "30.00", "0.500", "30.50", "0.50", "1,234"],
+            ["secret", "20.00", "0.250", "567"],
+            ["the stego cover, against the secret", "9.00"],
+        ]
+        assert rows[-2:] == [["carriers: 1,000"], ["bits per gaussian: 568, 600"]]
+
+    def test_columns_that_nothing_fills_are_left_out(self) -> None:
+        rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,)), details={}))
+        assert rows[0] == ["against the test photos", "PSNR", "SSIM", "Gaussians"]
+        assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
+
+    def test_wrong_keys_where_there_is_a_decoder(self) -> None:
+        two = replace(
+            METRICS,
+            secrets=METRICS.secrets * 2,
+            baseline=BaselineQuality(None, (None, None)),
+            secret_gaussians=(5, 6),
+            chance_level=(9.0, 8.0),
+            wrong_key=WrongKeys(
+                7, PsnrRange(28.0, 27.0, 29.0), (PsnrRange(8.0, 7.0, 9.5), PsnrRange(6.0, 5.0, 7.5))
+            ),
+        )
+        rows = [row[:2] for row in self.table(two)]
+        assert rows[3:10] == [
+            ["secret 2", "20.00"],
+            ["7 wrong keys, against the cover", "28.00"],
+            ["the worst of them", "27.00"],
+            ["the one nearest to the secret 1", "9.50"],
+            ["the one nearest to the secret 2", "7.50"],
+            ["the stego cover, against the secret 1", "9.00"],
+            ["the stego cover, against the secret 2", "8.00"],
+        ]

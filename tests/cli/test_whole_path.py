@@ -1,0 +1,79 @@
+"""Hiding, revealing, rendering, measuring and describing, one after the other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from cli.said import SMALL, Said, assert_refused, listing
+from keyss.files.ply import read_ply
+
+
+class TestTheWholePath:
+    def test_hide_left_its_results(self, world: Path) -> None:
+        names = {path.name for path in (world / "hidden").iterdir()}
+        assert names == {"stego.ply", "decoder.sealed", "metrics.json", "config.json", "private"}
+
+    def test_reveal_render_evaluate_info(
+        self, keyss: Callable[..., Said], world: Path, tmp_path: Path
+    ) -> None:
+        secret, images, key = tmp_path / "secret.ply", tmp_path / "images", world / "key.txt"
+        said = keyss("reveal", world / "hidden" / "stego.ply", "--key-file", key, "-o", secret)
+        left = len(read_ply(secret))  # without the cover's, which nothing draws
+        assert 0 < left < 100
+        assert said == Said(0, f"{secret}: {left} Gaussians\n", "")
+        said = keyss("render", secret, "--cameras", world / "b", "-o", images, "--split", "all")
+        assert said.status == 0
+        assert said.out == f"{images}: 4 images\n"
+        assert len(list(images.glob("*.png"))) == 4
+
+        run = tmp_path / "run"
+        shutil.copytree(world / "hidden", run)
+        said = keyss("evaluate", run, "--key-file", key, "--wrong-keys", 2)
+        assert said.status == 0
+        assert "2 wrong keys, against the cover" in said.out
+        metrics = json.loads((run / "metrics.json").read_text())
+        assert metrics["wrong_key"]["keys"] == 2
+        assert f"{metrics['secrets'][0]['psnr']:.2f}" in said.out
+
+        said = keyss("info", secret, "--json")
+        assert json.loads(said.out)["gaussians"] == left
+        said = keyss("info", run)
+        assert "metrics.secrets.1.psnr" in said.out
+        assert "{" not in said.out
+
+    def test_fit_prints_its_numbers_and_files(
+        self, keyss: Callable[..., Said], world: Path, tmp_path: Path
+    ) -> None:
+        out = tmp_path / "plain"
+        said = keyss("fit", world / "a", "-o", out, *SMALL, "--width", 8)
+        assert said.status == 0
+        assert "fit a: 20 steps" in said.err
+        assert str(out / "model.ply") in said.out
+        assert json.loads((out / "metrics.json").read_text())["width"] == 8
+
+    def test_wrong_key_exits_with_3_and_writes_nothing(
+        self, keyss: Callable[..., Said], world: Path, tmp_path: Path
+    ) -> None:
+        out = tmp_path / "secret.ply"
+        arguments = ["reveal", world / "hidden" / "stego.ply", "--key-file", world / "wrong.txt", "-o", out]
+        assert_refused(keyss(*arguments), 3, "opens nothing")
+        assert listing(tmp_path) == {}
+
+    def test_a_decoy_looks_like_a_success(
+        self, keyss: Callable[..., Said], world: Path, tmp_path: Path
+    ) -> None:
+        (tmp_path / "a.txt").write_text((world / "key.txt").read_text())
+        (tmp_path / "b.txt").write_text((world / "wrong.txt").read_text())
+        said = []
+        for name in "ab":
+            (tmp_path / f"{name}.txt").chmod(0o600)
+            key, out = tmp_path / f"{name}.txt", tmp_path / f"{name}.ply"
+            stego = world / "hidden" / "stego.ply"
+            said.append(keyss("reveal", stego, "--key-file", key, "--decoy", "-o", out))
+        right, wrong = said
+        assert right.status == 0
+        assert wrong == Said(0, right.out.replace("a.ply", "b.ply"), right.err)
+        assert len((tmp_path / "a.ply").read_bytes()) == len((tmp_path / "b.ply").read_bytes())
