@@ -25,8 +25,8 @@ from keyss.methods.carry.carrying import (
     record_requests,
     subsampled_counts,
 )
-from keyss.methods.dither import cost, dither
 from keyss.methods.carry.options import PRESETS, CarryOptions
+from keyss.methods.dither import cost, dither
 
 _PRUNE = "--prune-to-fit leaves out the least visible"
 _LEARNED = '`method="learned"` needs no low bits of the cover'
@@ -48,7 +48,9 @@ class CarryMethod:
         degree, *degrees = _degrees(inputs, options)
         check_degrees(LOW_BITS, degree, degrees)
         secrets = [model for model in others if model is not None]
-        requests = record_requests(secrets) if len(secrets) == len(others) and not options.prune_to_fit else []
+        requests = (
+            record_requests(secrets) if len(secrets) == len(others) and not options.prune_to_fit else []
+        )
         if cover is None:
             if requests:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something

@@ -39,8 +39,8 @@ from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, decoder_shape, sized, training_options
 from keyss.methods.learned.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
-from keyss.methods.learned.start import divided
 from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift, match_quaternion_lengths
+from keyss.methods.learned.start import divided
 from keyss.methods.learned.targets import PlacedScene
 
 NAME = "learned"
