@@ -73,6 +73,7 @@ def fit(
     config: FitConfig | None = None,
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -81,14 +82,19 @@ def fit(
 ) -> FitResult:
     """Train plain 3DGS on a scene.
 
-    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply` and
-    `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
+    `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
+    `resume` goes on.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or FitConfig()
     target = resolve_device(device)
     settings = FitRunConfig(
-        scene=path_of(scene), width=width, background=colour_of(background), config=config
+        scene=path_of(scene),
+        width=width,
+        background=colour_of(background),
+        skip_missing=skip_missing,
+        config=config,
     )
     folder = None
     if out is not None:
@@ -96,7 +102,7 @@ def fit(
         folder = RunFolder(
             out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
         )
-    loaded = as_scene(scene, width, background)
+    loaded = as_scene(scene, width, background, skip_missing=skip_missing)
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,
@@ -128,6 +134,7 @@ def hide(
     method: str | MethodOptions = "learned",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
     min_psnr: float = MIN_PSNR,
     device: Backend = "auto",
@@ -136,14 +143,15 @@ def hide(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> HideResult:
-    """Hide every secret in the cover, and measure the result on the test photos.
+    """Hide every secret in the cover, and measure the result on the test views.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
-    (`LearnedOptions`, `CarryOptions`). The secrets lie encrypted in the low bits of `stego.ply`; with
-    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these in
-    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
-    checkpoints from which `resume` goes on.
+    (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
+
+    The secrets lie encrypted in the low bits of `stego.ply`; with `LearnedOptions(sidecar=True)` they are in
+    a file `decoder.sealed`. `out` (a folder) gets these in `publish/`, and `private/` with the plain models,
+    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
 
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
@@ -164,6 +172,7 @@ def hide(
         ),
         width=width,
         background=colour_of(background),
+        skip_missing=skip_missing,
         payloads=(),
         options=options,
     )
@@ -178,7 +187,10 @@ def hide(
     if folder:
         check_disk(folder.path, chosen, options, inputs)
     trains = chosen.trains or any(each.model is None for each in inputs)
-    scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
+    scenes = [
+        as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
+        for source in sources
+    ]
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
@@ -196,7 +208,8 @@ def hide(
             for model, original, scene in zip(shown, plain, scenes, strict=True)
         )
         _check_quality(against_plain, min_psnr)
-        metrics = _measured(chosen, stego, scenes, plain, options, against_plain, target)
+        photos = tuple(each.photos for each in inputs)
+        metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
         if folder:
             payloads = tuple(each.fingerprint() for each in stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
@@ -212,6 +225,7 @@ def plan(
     method: str | MethodOptions = "learned",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
     device: Backend = "auto",
     out: PathLike | None = None,
@@ -230,7 +244,10 @@ def plan(
     options = chosen.prepare(inputs, options)
     if out is not None:
         check_disk(Path(out), chosen, options, inputs)
-    scenes = [as_scene(source, width, background, train_pictures=False) for source in sources]
+    scenes = [
+        as_scene(source, width, background, train_pictures=False, skip_missing=skip_missing)
+        for source in sources
+    ]
     return plan_hiding(chosen, options, inputs, scenes, target, None if out is None else Path(out))
 
 
@@ -277,18 +294,20 @@ def render(
     split: Split = "test",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> list[tuple[str, Tensor]]:
     """Pictures of a model from a scene's cameras: their names and uint8 images [H, W, 3].
 
-    `out` (a folder) gets a PNG per camera.
+    `width`, `background`, `skip_missing`: see `load_scene`; a photo that is left out has no camera. `out` (a
+    folder) gets a PNG per camera.
     """
     target = resolve_device(device)
     folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
-    scene = as_scene(cameras, width, background)
+    scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, views[split])
     if folder:
@@ -305,7 +324,7 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -332,7 +351,7 @@ def evaluate(
 
 
 def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
-    """A method and its options. Raises UsageError for numbers of secrets and for keys that it cannot have."""
+    """A method and its options. Raises UsageError for as many secrets, or for keys, as it cannot have."""
     if isinstance(chosen, MethodOptions):
         method, options = registry.of_options(chosen), chosen
     else:
@@ -384,6 +403,7 @@ def _measured(
     stego: Stego,
     scenes: Sequence[Scene],
     models: Sequence[Gaussians],  # plain ones of the scenes
+    photos: tuple[bool, ...],  # whether the scenes have some
     options: MethodOptions,
     against_plain: tuple[RenderFidelity, ...],
     device: torch.device,
@@ -401,6 +421,7 @@ def _measured(
         **vars(measured),
         method=method.name,
         gaussians=len(stego.gaussians),
+        photos=photos,
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         seconds=round(stego.seconds, 1),

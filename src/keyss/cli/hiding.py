@@ -24,8 +24,10 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
     optional,
+    preset_sizes,
     schedule,
 )
 
@@ -50,12 +52,13 @@ def hide(
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     cover_model: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
+        Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
     ] = None,
     secret_model: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
+        optional("FILE", "Plain model of a secret, once for each secret.", "they are fitted"),
     ] = (),
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
@@ -78,7 +81,7 @@ def hide(
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
     """
     from keyss import api
-    from keyss.cli.keys import keys, warn_of_weak_keys
+    from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
     from keyss.methods import registry
@@ -101,7 +104,7 @@ def hide(
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
-    warn_of_weak_keys(opening)
+    warn_of_doubtful_keys(opening)
     secrets = [
         api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)
     ]
@@ -112,6 +115,7 @@ def hide(
             method=options,
             width=width,
             background=background,
+            skip_missing=skip_missing,
             cover_model=cover_model,
             device=device,
             out=out,
@@ -124,6 +128,7 @@ def hide(
         method=options,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         cover_model=cover_model,
         min_psnr=min_psnr,
         device=device,
@@ -180,7 +185,7 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     # Types and defaults by name, for what `hide` leaves open.
     hints: dict[str, Any] = {
         "method": Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")],
-        "preset": Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")],
+        "preset": Annotated[Literal[tuple(method.presets)], arg(help=_preset_help(method))],
     }
     defaults: dict[str, Any] = {"method": method.name, "preset": next(iter(method.presets))}
     for name, (kind, option) in _own_options(method).items():
@@ -207,6 +212,12 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     return command
 
 
+def _preset_help(method: Method) -> str:
+    """What the presets of a method come to."""
+    sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
+    return f"Size and kind of a run on photos; .ply models bring their size along. {sizes}"
+
+
 def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
     """Of the fields of a method's options that the command line has, types and descriptions."""
     from keyss.methods.base import CommandLineOption
@@ -231,8 +242,9 @@ def reveal(
     stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply.")],
     *,
     key_file: Annotated[
-        Path | None, optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt")
-    ] = None,
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt"),
+    ] = (),
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
     decoder: Annotated[
         Path | None,
@@ -253,18 +265,19 @@ def reveal(
     example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
 
-    (key,) = keys((key_file,) if key_file else (), 1)
-    revealed = api.reveal(
-        stego,
-        key,
-        decoder=decoder,
-        frame=frame,
-        decoy=decoy,
-        force=force,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-    )
+    (key,) = keys(key_file, 1)
+    with hinting_at_white_space([key]):
+        revealed = api.reveal(
+            stego,
+            key,
+            decoder=decoder,
+            frame=frame,
+            decoy=decoy,
+            force=force,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
     print(f"{out}: {len(revealed):,} Gaussians")

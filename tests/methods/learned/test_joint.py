@@ -222,7 +222,7 @@ def test_combined_densification_scatters_and_unweights() -> None:
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(UsageError, match="--start points"):
+    with pytest.raises(UsageError, match='`start="points"`'):
         LearnedOptions(mask=("xyz",), decoder="network")
     assert LearnedOptions(mask=("xyz",), start="points", decoder="network").mask == ("xyz",)
     with pytest.raises(UsageError, match="network"):

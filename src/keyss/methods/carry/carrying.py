@@ -40,7 +40,9 @@ class CarriedSecret:
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The Gaussians that are left make up for those that were lost with their carriers."""
         if frame == "cover":
-            raise UsageError("a carried secret never lay in the cover's coordinates: leave out --frame cover")
+            raise UsageError(
+                'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
+            )
         return compensate_pruning(self.gaussians, self.count)
 
     def fingerprint(self) -> str:

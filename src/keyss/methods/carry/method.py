@@ -28,7 +28,7 @@ from keyss.methods.carry.carrying import (
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import cost, dither
 
-_PRUNE = "--prune-to-fit leaves out the least visible"
+_PRUNE = "`prune_to_fit=True` leaves out the least visible"
 _LEARNED = '`method="learned"` needs no low bits of the cover'
 
 

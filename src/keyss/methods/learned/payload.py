@@ -140,7 +140,7 @@ class HiddenSecret:
             raise InputError(
                 f"this decoder was made for another model: {found:.0%} of its anchors are in this PLY, "
                 f"at least {ANCHORS_NEEDED:.0%} expected "
-                "(quantising the positions does that too: --force tries all the same)"
+                "(quantising the positions does that too: `force=True` tries all the same)"
             )
 
 
