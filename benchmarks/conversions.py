@@ -32,13 +32,13 @@ def main() -> None:
     parser.add_argument("--key-file", type=Path, required=True)
     parser.add_argument("--sog-iterations", type=int, default=1)
     asked = parser.parse_args()
-    settings = json.loads((asked.run / "config.json").read_text())
+    settings = json.loads((asked.run / "private" / "config.json").read_text())
     cover, secret = (
         keyss.load_scene(path, width=settings["width"])
         for path in (settings["cover"], settings["secrets"][0])
     )
-    stego, source = read_model(asked.run / "stego.ply"), asked.run / "stego.ply"
-    sidecar = (asked.run / "decoder.sealed").read_bytes()
+    stego, source = read_model(asked.run / "publish" / "stego.ply"), asked.run / "publish" / "stego.ply"
+    sidecar = (asked.run / "publish" / "decoder.sealed").read_bytes()
     reopen = Reopener(key_of_file(asked.key_file), partial(open_model, sidecar=sidecar))
 
     def measured(model: Gaussians) -> tuple[float, float]:

@@ -142,8 +142,8 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
 
 def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed: int) -> dict[str, Any]:
     """What near and random keys show to somebody who holds the decoders, and how many the files refuse."""
-    stego = read_model(out / "stego.ply")
-    beside = out / "decoder.sealed"
+    stego = read_model(out / "publish" / "stego.ply")
+    beside = out / "publish" / "decoder.sealed"
     sidecar = beside.read_bytes() if beside.exists() else None
     opened = [registry.open_model(stego, key, sidecar=sidecar) for key in keys]
     derivation = KeyDerivation(salt=training_salt(scenes[0], seed))

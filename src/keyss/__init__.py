@@ -3,7 +3,7 @@
     from keyss import Secret, hide, reveal
 
     hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
-    reveal("runs/hidden/stego.ply", key, out="treasure.ply")
+    reveal("runs/hidden/publish/stego.ply", key, out="treasure.ply")
 
 The names below are loaded at first use (PEP 562), so that the command line answers at once.
 """

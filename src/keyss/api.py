@@ -409,8 +409,8 @@ def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
         if least > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
             raise QualityError(
                 f"{who} comes out at {each.psnr:.1f} dB against its plain model, and empty pictures "
-                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and with "
-                "`resume=True` nothing is trained again"
+                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and "
+                "with `resume=True` nothing is trained again"
             )
 
 

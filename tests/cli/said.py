@@ -8,7 +8,7 @@ from pathlib import Path
 
 from keyss.cli import commands
 from keyss.fitting.image_metrics import ImageQuality
-from keyss.measure.hiding import BaselineQuality
+from keyss.measure.hiding import BaselineQuality, RenderFidelity
 from keyss.runs.metrics import HideMetrics
 
 METRICS = HideMetrics(
@@ -24,6 +24,7 @@ METRICS = HideMetrics(
     seconds=1.0,
     width=100,
     seed=0,
+    against_plain=(RenderFidelity(32.0, 8.0), RenderFidelity(31.0, 9.0)),
     details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")

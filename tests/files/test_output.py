@@ -1,75 +1,123 @@
-"""Result folders: all files or none, and nothing lost of what was there."""
+"""Files appear whole or not at all, are their owner's only, and leave nothing beside them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from keyss.core import OutputError, UsageError
-from keyss.files.atomic import write_bytes
-from keyss.files.output import CHECKPOINTS, OutputFolder
+from keyss.core import OutputError
+from keyss.files.atomic import atomic_write, write_bytes
+from keyss.files.lock import held_by, lock
+from keyss.files.output import check_output_file
+
+WRITE_AND_WAIT = """
+import sys, time
+from keyss.files.atomic import atomic_write
+with atomic_write(sys.argv[1]) as file:
+    file.write(b"a part")
+    file.flush()
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+LOCK_AND_WAIT = """
+import sys, time
+from pathlib import Path
+from keyss.files.lock import lock
+with lock(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(60)
+"""
 
 
-def tree(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+@contextmanager
+def child(program: str, path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that has said its first word; it is killed at the end."""
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        yield process
+        process.kill()
 
 
-def failing(error: BaseException) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
-        path.write_bytes(b"a part")
-        raise error
-
-    return write
-
-
-def test_all_files_appear_and_checkpoints_go(tmp_path: Path) -> None:
-    folder = OutputFolder(tmp_path / "a" / "run")
-    assert list(tmp_path.iterdir()) == []
-    (folder.checkpoints() / "fit").touch()
-    folder.fill({"x": partial(write_bytes, data=b"1"), "below/y": partial(write_bytes, data=b"2")})
-    assert tree(tmp_path) == {"a/run/x": b"1", "a/run/below/y": b"2"}
-    assert {path.name for path in folder.path.iterdir()} == {"x", "below"}
+def test_only_the_owner_may_read_what_is_written(tmp_path: Path) -> None:
+    old = os.umask(0)
+    try:
+        write_bytes(tmp_path / "x", b"1")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "x").stat().st_mode & 0o777 == 0o600
 
 
-@pytest.mark.parametrize(
-    ("error", "raised"),
-    [(OSError(28, "No space left"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)],
-)
-@pytest.mark.parametrize("there", [True, False])
-def test_none_appears_when_one_fails(
-    tmp_path: Path, there: bool, error: BaseException, raised: type[BaseException]
-) -> None:
-    path = tmp_path / "run"
-    if there:
-        (path / CHECKPOINTS).mkdir(parents=True)
-        (path / CHECKPOINTS / "fit").write_bytes(b"state")
-        (path / "x").write_bytes(b"old")
-    before = tree(tmp_path)
-    with pytest.raises(raised):
-        OutputFolder(path, overwrite=True).fill({"x": partial(write_bytes, data=b"new"), "y": failing(error)})
-    assert tree(tmp_path) == before
-    assert path.exists() == there
+def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path) -> None:
+    with child(WRITE_AND_WAIT, tmp_path / "x"):
+        pass
+    assert len(list(tmp_path.iterdir())) == 1  # its temporary file
+    write_bytes(tmp_path / "x", b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
+    assert (tmp_path / "x").read_bytes() == b"whole"
 
 
-def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    with pytest.raises(OutputError, match="exists: choose another folder"):
-        OutputFolder(tmp_path)
-    with pytest.raises(OutputError, match="is not a folder"):
-        OutputFolder(tmp_path / "notes.txt")
-    with pytest.raises(UsageError, match="give one of them"):
-        OutputFolder(tmp_path, overwrite=True, resume=True)
-    OutputFolder(tmp_path, overwrite=True)
-    OutputFolder(tmp_path, resume=True)
+def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
+    with (
+        child(WRITE_AND_WAIT, tmp_path / "x"),
+        pytest.raises(OutputError, match="another process is writing it"),
+    ):
+        write_bytes(tmp_path / "x", b"1")
 
 
-def test_an_interrupted_run_is_continued_or_dropped(tmp_path: Path) -> None:
-    (tmp_path / CHECKPOINTS).mkdir()
-    (tmp_path / CHECKPOINTS / "fit").touch()
-    with pytest.raises(OutputError, match="interrupted run: --resume continues it"):
-        OutputFolder(tmp_path)
-    assert list(OutputFolder(tmp_path, resume=True).checkpoints().iterdir()) != []
-    assert list(OutputFolder(tmp_path, overwrite=True).checkpoints().iterdir()) == []
+def test_a_link_in_the_way_of_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"mine")
+    (tmp_path / ".x.unfinished").symlink_to(victim)
+    with pytest.raises(OutputError):
+        write_bytes(tmp_path / "x", b"1")
+    (tmp_path / ".x.unfinished").unlink()
+    os.link(victim, tmp_path / ".x.unfinished")
+    with pytest.raises(OutputError):
+        write_bytes(tmp_path / "x", b"1")
+    assert victim.read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left"), KeyboardInterrupt()])
+def test_an_error_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+    def fail() -> None:
+        with atomic_write(tmp_path / "x") as file:
+            file.write(b"a part")
+            raise error
+
+    write_bytes(tmp_path / "x", b"old")
+    with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
+        fail()
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+def test_a_lock_names_its_process_and_dies_with_it(tmp_path: Path) -> None:
+    path = tmp_path / "private" / "lock"
+    path.parent.mkdir()
+    with child(LOCK_AND_WAIT, path) as other:
+        assert held_by(path) == str(other.pid)
+        with pytest.raises(OutputError, match=f"process {other.pid} is at work"), lock(path):
+            pass
+    assert held_by(path) is None
+    with lock(path):
+        assert path.read_text() == str(os.getpid())
+    assert not path.exists()
+
+
+def test_a_folder_is_no_file_to_write(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="is a folder"):
+        check_output_file(tmp_path, True)
+    with pytest.raises(OutputError, match="there is no folder"):
+        check_output_file(tmp_path / "no" / "x", False)
+    write_bytes(tmp_path / "x", b"")
+    with pytest.raises(OutputError, match="exists"):
+        check_output_file(tmp_path / "x", False)
+    assert check_output_file(tmp_path / "x", True) == tmp_path / "x"

@@ -61,11 +61,11 @@ def demo(
         out,
         {
             "comparison.png": "all of it in one picture: look here first",
-            "stego.ply": "what would be published: opens in any 3DGS viewer",
+            "publish/stego.ply": "what would be published: opens in any 3DGS viewer",
             "secret.ply": "what the key brought back from it",
             "key.txt": "the key of this demo, known to everybody",
             "scenes": "the photos",
-            "metrics.json": "the numbers",
+            "private/metrics.json": "the numbers",
         },
     )
 

@@ -58,6 +58,9 @@ def hide(
         UseAppendAction[tuple[Path, ...]],
         optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
     ] = (),
+    min_psnr: Annotated[
+        float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
+    ] = 20.0,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -104,6 +107,7 @@ def hide(
         width=width,
         background=background,
         cover_model=cover_model,
+        min_psnr=min_psnr,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -114,12 +118,14 @@ def hide(
     print_files(
         out,
         {
-            "stego.ply": "the cover with the secret in it: this is what to publish",
-            "decoder.sealed": "the payloads, encrypted: needed for revealing",
-            "private": "plain models of all scenes: keep them to yourself",
-            "metrics.json": "the numbers",
-            "config.json": "what ran",
+            "publish/stego.ply": "publish this, byte for byte as it is: the cover, with the secret in it",
+            "publish/decoder.sealed": "the encrypted secret: publish it too, or send it to who is to open it",
+            "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
+    )
+    print(
+        "The key: send it over another channel than the file, and keep a copy: without it nothing is opened. "
+        "Whoever has file and key runs `keyss reveal`."
     )
 
 
@@ -230,7 +236,7 @@ def reveal(
 ) -> None:
     """Bring a secret back with its key.
 
-    example: keyss reveal runs/hidden/stego.ply --key-file key.txt -o secret.ply
+    example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
 
     example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
     """

@@ -41,7 +41,7 @@ def evaluate(
         device=device,
     )
     print_hiding(metrics)
-    print_files(run, {"metrics.json": "the numbers"})
+    print_files(run, {"private/metrics.json": "the numbers"})
 
 
 def steganalyze(
@@ -125,8 +125,8 @@ def audit(
     print_files(
         run,
         {
-            "report.html": "all of it, for people: look here first; it shows the secret",
-            "audit/audit.json": "all of it, for programs",
+            "private/report.html": "all of it, for people: look here first; it shows the secret",
+            "private/audit/audit.json": "all of it, for programs",
         },
     )
 

@@ -66,7 +66,7 @@ def fit(
         reporter=reporter(),
     )
     print_fit(read_record(out / METRICS, FitMetrics))
-    print_files(out, {"model.ply": "the model", "metrics.json": "its numbers", "config.json": "what ran"})
+    print_files(out, {"model.ply": "the model", "private": "its numbers, and what ran"})
 
 
 def render(
@@ -109,7 +109,7 @@ def info(
 ) -> None:
     """Tell what is in a model, a scene folder or a sidecar.
 
-    example: keyss info runs/hidden/stego.ply
+    example: keyss info runs/hidden/publish/stego.ply
     """
     from msgspec import to_builtins
 

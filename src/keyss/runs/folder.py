@@ -275,8 +275,12 @@ def _write_entered(folder: Path, stage: str, name: str, write: Callable[[Path], 
 
 
 def _refuse_foreign(folder: Path, name: str) -> None:
-    """Raise OutputError if a file that is in the way is not one of this program's."""
+    """Raise OutputError if what is in the way of a file is not this program's."""
     target = folder / name
+    if any((folder / parent).is_symlink() for parent in PurePosixPath(name).parents if parent.name):
+        raise OutputError(
+            f"{target.parent} leads out of {folder}: remove this link, or choose another folder"
+        )
     if not (target.is_symlink() or target.exists()):
         return
     if not any(name in names for names in read_manifest(folder).files.values()):

@@ -1,0 +1,244 @@
+"""Folders of runs: all files or none, nothing of somebody else touched, and nothing stale left."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from keyss.core import OutputError, UsageError
+from keyss.files.atomic import write_bytes
+from keyss.files.lock import lock
+from keyss.runs.folder import MANIFEST, Manifest, RunFolder, clear, read_manifest, write_again
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """What a person sees in it: all files but the manifest."""
+    files = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return {name: data for name, data in files.items() if not name.endswith(MANIFEST)}
+
+
+def content(data: bytes) -> Callable[[Path], None]:
+    return partial(write_bytes, data=data)
+
+
+def failing(error: BaseException) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        path.write_bytes(b"a part")
+        raise error
+
+    return write
+
+
+def make(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None, **how: object) -> None:
+    folder = RunFolder(path, stage, **how)  # type: ignore[arg-type]
+    with folder.work():
+        names = {"publish/stego.ply": b"1", "private/cover.ply": b"2"} if files is None else files
+        folder.write({name: content(data) for name, data in names.items()})
+
+
+def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **how: bool) -> None:
+    """Leaves a checkpoint."""
+    folder = RunFolder(path, stage, arguments, **how)
+    writers = {"publish/stego.ply": content(b"half"), "x": failing(KeyboardInterrupt())}
+    with pytest.raises(KeyboardInterrupt), folder.work():  # noqa: PT012
+        write_bytes(folder.checkpoints / "fit", b"state")
+        folder.write(writers)
+
+
+@contextmanager
+def umask(mask: int) -> Iterator[None]:
+    old = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(old)
+
+
+def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "a" / "run", "hide")
+    assert list(tmp_path.iterdir()) == []
+    with umask(0o022), folder.work():
+        (folder.checkpoints / "fit").touch()
+        folder.write({"publish/stego.ply": content(b"1"), "private/cover.ply": content(b"2")})
+        assert tree(tmp_path).keys().isdisjoint({"a/run/publish/stego.ply"})
+    assert tree(folder.path) == {"publish/stego.ply": b"1", "private/cover.ply": b"2"}
+    modes = {str(p.relative_to(folder.path)): p.stat().st_mode & 0o777 for p in folder.path.rglob("*")}
+    assert modes == {
+        "publish": 0o755,
+        "publish/stego.ply": 0o644,
+        "private": 0o700,
+        "private/cover.ply": 0o600,
+        MANIFEST: 0o600,
+    }
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(OSError(28, "No space left"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)],
+)
+@pytest.mark.parametrize("there", [True, False])
+def test_none_appears_when_one_fails(
+    tmp_path: Path, there: bool, error: BaseException, raised: type[BaseException]
+) -> None:
+    path = tmp_path / "run"
+    if there:
+        make(path)
+    before = tree(tmp_path), read_manifest(path)
+    folder = RunFolder(path, "hide", overwrite=there)
+    with pytest.raises(raised), folder.work():
+        folder.write({"publish/stego.ply": content(b"new"), "y": failing(error)})
+    assert (tree(tmp_path), read_manifest(path)) == before
+    assert path.exists() == there
+
+
+def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -> None:
+    make(tmp_path, files={"publish/stego.ply": b"1", "publish/decoder.sealed": b"2", "private/old/x": b"3"})
+    make(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
+    foreign = {
+        "notes.txt": b"mine",
+        "checkpoint/x": b"my own",
+        "private/old/mine": b"!",
+        "publish/readme": b"?",
+    }
+    for name, data in foreign.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    make(tmp_path, files={"publish/stego.ply": b"new"}, overwrite=True)
+    assert tree(tmp_path) == foreign | {"publish/stego.ply": b"new"}
+    assert read_manifest(tmp_path).files == {"hide": ("publish/stego.ply",)}
+
+
+def test_an_audit_leaves_what_was_hidden(tmp_path: Path) -> None:
+    make(tmp_path)
+    for data in (b"first", b"second"):
+        make(tmp_path, "audit", {"private/report.html": data}, onto=("hide",), overwrite=data == b"second")
+    assert tree(tmp_path)["private/report.html"] == b"second"
+    assert tree(tmp_path)["publish/stego.ply"] == b"1"
+    with pytest.raises(OutputError, match="exists"):
+        RunFolder(tmp_path, "audit", onto=("hide",))
+
+
+def test_somebody_elses_file_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "publish").mkdir()
+    (tmp_path / "publish" / "stego.ply").write_bytes(b"mine")
+    with pytest.raises(OutputError, match="in the way"):
+        RunFolder(tmp_path, "hide", writes=("publish/stego.ply",), overwrite=True)
+    with pytest.raises(OutputError, match="in the way"):
+        make(tmp_path, overwrite=True)
+    assert tree(tmp_path) == {"publish/stego.ply": b"mine"}
+
+
+def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(OutputError, match="exists: choose another folder"):
+        RunFolder(tmp_path, "hide")
+    with pytest.raises(OutputError, match="no interrupted one"):
+        RunFolder(tmp_path, "hide", resume=True)
+    with pytest.raises(OutputError, match="is not a folder"):
+        RunFolder(tmp_path / "notes.txt", "hide")
+    with pytest.raises(UsageError, match="give one of them"):
+        RunFolder(tmp_path, "hide", overwrite=True, resume=True)
+    make(tmp_path, overwrite=True)
+    with pytest.raises(OutputError, match=r"holds a finished run \(hide\)"):
+        RunFolder(tmp_path, "hide", resume=True)
+
+
+def test_an_interrupted_run_is_continued_with_the_same_arguments_only(tmp_path: Path) -> None:
+    arguments: dict[str, object] = {"width": 200, "options": {"seed": 0, "fit": {"iterations": 10}}}
+    interrupt(tmp_path, arguments)
+    assert tree(tmp_path) == {"private/checkpoint/fit": b"state"}
+    with pytest.raises(OutputError, match=r"interrupted run.*`resume=True`"):
+        RunFolder(tmp_path, "hide", arguments)
+    other = {"width": 160, "options": {"seed": 0, "fit": {"iterations": 20}}}
+    with pytest.raises(OutputError, match="iterations 10 then, 20 now; width: 200 then, 160 now"):
+        RunFolder(tmp_path, "hide", other, resume=True)
+    with pytest.raises(OutputError, match="of another kind"):
+        RunFolder(tmp_path, "fit", arguments, resume=True)
+    interrupt(tmp_path, arguments, resume=True)
+    folder = RunFolder(tmp_path, "hide", arguments, resume=True)
+    with folder.work():
+        assert (folder.checkpoints / "fit").read_bytes() == b"state"
+        folder.write({"publish/stego.ply": content(b"whole")})
+    assert tree(tmp_path) == {"publish/stego.ply": b"whole"}
+
+
+def test_starting_anew_drops_checkpoints_and_keeps_results_until_there_are_new_ones(tmp_path: Path) -> None:
+    make(tmp_path)
+    interrupt(tmp_path, {"width": 1}, overwrite=True)
+    assert tree(tmp_path)["publish/stego.ply"] == b"1"
+    folder = RunFolder(tmp_path, "hide", {"width": 2}, overwrite=True)
+    with folder.work():
+        assert not list(folder.checkpoints.iterdir())
+        folder.write({"publish/stego.ply": content(b"new")})
+    assert tree(tmp_path) == {"publish/stego.ply": b"new"}
+
+
+def test_resuming_what_never_began_begins(tmp_path: Path) -> None:
+    for path in (tmp_path / "new", tmp_path / "empty"):
+        path.name == "empty" and path.mkdir()
+        make(path, resume=True)
+
+
+def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
+    make(tmp_path)
+    with lock(tmp_path / "private" / "lock"):
+        with pytest.raises(OutputError, match=f"process {os.getpid()} is at work"):
+            RunFolder(tmp_path, "hide", overwrite=True)
+        with pytest.raises(OutputError, match="at work"):
+            write_again(tmp_path, "hide", "private/metrics.json", content(b"1"))
+    assert (tmp_path / MANIFEST).exists()
+
+
+def test_a_file_written_again_is_known(tmp_path: Path) -> None:
+    make(tmp_path)
+    write_again(tmp_path, "audit", "private/report.html", content(b"1"))
+    write_again(tmp_path, "audit", "private/report.html", content(b"2"))
+    assert tree(tmp_path)["private/report.html"] == b"2"
+    (tmp_path / "private" / "mine").write_bytes(b"mine")
+    with pytest.raises(OutputError, match="in the way"):
+        write_again(tmp_path, "audit", "private/mine", content(b"3"))
+    make(tmp_path, files={"publish/stego.ply": b"new"}, overwrite=True)
+    assert tree(tmp_path) == {"publish/stego.ply": b"new", "private/mine": b"mine"}
+
+
+@pytest.mark.parametrize("name", ["../victim", "/etc/passwd", "a/../../victim", "", MANIFEST])
+def test_a_forged_manifest_reaches_nothing_outside(tmp_path: Path, name: str) -> None:
+    (tmp_path / "victim").write_bytes(b"mine")
+    run = tmp_path / "run"
+    make(run)
+    (run / MANIFEST).write_bytes(msgspec.json.encode(Manifest(files={"hide": (name,)})))
+    with pytest.raises(OutputError, match="is not a file in this folder"):
+        RunFolder(run, "hide", overwrite=True)
+
+
+def test_links_in_a_run_folder_lead_nowhere(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "stego.ply").write_bytes(b"mine")
+    run = tmp_path / "run"
+    make(run)
+    (run / "publish" / "stego.ply").unlink()
+    (run / "publish").rmdir()
+    (run / "publish").symlink_to(elsewhere)
+    with pytest.raises(OutputError, match="leads out of"):
+        make(run, overwrite=True)
+    assert (elsewhere / "stego.ply").read_bytes() == b"mine"
+
+
+def test_clearing_leaves_what_is_not_ours(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    make(run)
+    (run / "notes.txt").write_bytes(b"mine")
+    clear(run)
+    assert tree(run) == {"notes.txt": b"mine"}
+    (run / "notes.txt").unlink()
+    make(run)
+    clear(run)
+    clear(run)
+    assert not run.exists()
