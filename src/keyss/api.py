@@ -75,6 +75,7 @@ def fit(
     config: FitConfig | None = None,
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -83,14 +84,19 @@ def fit(
 ) -> FitResult:
     """Train plain 3DGS on a scene.
 
-    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply` and
-    `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
+    `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
+    `resume` goes on.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or FitConfig()
     target = resolve_device(device)
     settings = FitRunConfig(
-        scene=path_of(scene), width=width, background=colour_of(background), config=config
+        scene=path_of(scene),
+        width=width,
+        background=colour_of(background),
+        skip_missing=skip_missing,
+        config=config,
     )
     folder = None
     if out is not None:
@@ -98,7 +104,7 @@ def fit(
         folder = RunFolder(
             out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
         )
-    loaded = as_scene(scene, width, background)
+    loaded = as_scene(scene, width, background, skip_missing=skip_missing)
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,
@@ -130,6 +136,7 @@ def hide(
     method: str | MethodOptions = "learned",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
     min_psnr: float = MIN_PSNR,
     device: Backend = "auto",
@@ -138,14 +145,15 @@ def hide(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> HideResult:
-    """Hide every secret in the cover, and measure the result on the test photos.
+    """Hide every secret in the cover, and measure the result on the test views.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
-    (`LearnedOptions`, `CarryOptions`). The secrets lie encrypted in the low bits of `stego.ply`; with
-    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these in
-    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
-    checkpoints from which `resume` goes on.
+    (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
+
+    The secrets lie encrypted in the low bits of `stego.ply`; with `LearnedOptions(sidecar=True)` they are in
+    a file `decoder.sealed`. `out` (a folder) gets these in `publish/`, and `private/` with the plain models,
+    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
 
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
@@ -171,6 +179,7 @@ def hide(
         ),
         width=width,
         background=colour_of(background),
+        skip_missing=skip_missing,
         payloads=(),
         options=options,
     )
@@ -183,7 +192,10 @@ def hide(
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
     trains = chosen.trains or any(each.model is None for each in inputs)
-    scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
+    scenes = [
+        as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
+        for source in sources
+    ]
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
@@ -201,7 +213,8 @@ def hide(
             for model, original, scene in zip(shown, plain, scenes, strict=True)
         )
         _check_quality(against_plain, min_psnr)
-        metrics = _measured(chosen, stego, scenes, plain, options, against_plain, target)
+        photos = tuple(each.photos for each in inputs)
+        metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
         if folder:
             payloads = tuple(each.fingerprint() for each in stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
@@ -319,18 +332,20 @@ def render(
     split: Split = "test",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> list[tuple[str, Tensor]]:
     """Pictures of a model from a scene's cameras: their names and uint8 images [H, W, 3].
 
-    `out` (a folder) gets a PNG per camera.
+    `width`, `background`, `skip_missing`: see `load_scene`; a photo that is left out has no camera. `out` (a
+    folder) gets a PNG per camera.
     """
     target = resolve_device(device)
     folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
-    scene = as_scene(cameras, width, background)
+    scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, views[split])
     if folder:
@@ -347,7 +362,8 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its
+    `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -409,8 +425,8 @@ def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
         if least > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
             raise QualityError(
                 f"{who} comes out at {each.psnr:.1f} dB against its plain model, and empty pictures "
-                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and "
-                "with `resume=True` nothing is trained again"
+                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, "
+                "and with `resume=True` nothing is trained again"
             )
 
 
@@ -419,6 +435,7 @@ def _measured(
     stego: Stego,
     scenes: Sequence[Scene],
     models: Sequence[Gaussians],  # plain ones of the scenes
+    photos: tuple[bool, ...],  # whether the scenes have some
     options: MethodOptions,
     against_plain: tuple[RenderFidelity, ...],
     device: torch.device,
@@ -436,6 +453,7 @@ def _measured(
         **vars(measured),
         method=method.name,
         gaussians=len(stego.gaussians),
+        photos=photos,
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         seconds=round(stego.seconds, 1),

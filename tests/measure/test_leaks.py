@@ -162,6 +162,33 @@ def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_phot
         assert torch.equal(picture, same[name])
 
 
+def test_the_picture_shows_the_variant_that_is_judged() -> None:
+    """One variant is a flat haze as bright as the photo, which PSNR likes; the other has the secret's
+    shapes."""
+    shown = {"shapes": HIDDEN, "haze": random_gaussians(1500, seed=7)}
+    attack = Attack(
+        "planted",
+        "",
+        {},
+        lambda model: iter(
+            shown.items() if model is not PLAINS[0] else [(name, PLAINS[0]) for name in shown]
+        ),
+    )
+    for order in (list(shown), list(shown)[::-1]):
+        shown = {name: shown[name] for name in order}
+        (row,), pictures = look_for_secret(_plain(5), PLAINS[:1], SECRET, FRAME, [attack])
+        assert row.best == "shapes"
+        expected = scores(
+            HIDDEN, [View(FRAME.apply_camera(SECRET.test[0].camera), SECRET.test[0].image)], SECRET.background
+        )
+        assert len(SECRET.test) > 1 or row.best_leak == expected - row.control
+        picture = pictures["planted"][:, :40].float() / 255
+        image = render(HIDDEN, FRAME.apply_camera(SECRET.test[0].camera), SECRET.background).clamp(0, 1)
+        assert (picture - image).abs().max() < 0.01
+        assert row.best_leak.evidence() > 1
+        assert row.leak.evidence() >= row.best_leak.evidence()
+
+
 def _decoder(conditioning: str) -> HiddenSecret:
     torch.manual_seed(0)
     kind = "curve" if conditioning == "gate" else "network"

@@ -25,8 +25,10 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
     optional,
+    preset_sizes,
     schedule,
 )
 
@@ -51,12 +53,13 @@ def hide(
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     cover_model: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover.", "one is fitted")
+        Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
     ] = None,
     secret_model: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Plain 3DGS model of a secret, once for each secret.", "they are fitted"),
+        optional("FILE", "Plain model of a secret, once for each secret.", "they are fitted"),
     ] = (),
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
@@ -76,7 +79,7 @@ def hide(
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
     """
     from keyss import api
-    from keyss.cli.keys import keys, warn_of_weak_keys
+    from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding
     from keyss.core.errors import UsageError
     from keyss.methods import registry
@@ -99,13 +102,14 @@ def hide(
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
-    warn_of_weak_keys(opening)
+    warn_of_doubtful_keys(opening)
     result = api.hide(
         cover,
         [api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)],
         method=options,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         cover_model=cover_model,
         min_psnr=min_psnr,
         device=device,
@@ -162,7 +166,7 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     # Types and defaults by name, for what `hide` leaves open.
     hints: dict[str, Any] = {
         "method": Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")],
-        "preset": Annotated[Literal[tuple(method.presets)], arg(help="Size and kind of the run.")],
+        "preset": Annotated[Literal[tuple(method.presets)], arg(help=_preset_help(method))],
     }
     defaults: dict[str, Any] = {"method": method.name, "preset": next(iter(method.presets))}
     for name, (kind, option) in _own_options(method).items():
@@ -189,6 +193,12 @@ def _with_options_of(method: Method) -> Callable[..., None]:
     return command
 
 
+def _preset_help(method: Method) -> str:
+    """What the presets of a method come to."""
+    sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
+    return f"Size and kind of a run on photos; .ply models bring their size along. {sizes}"
+
+
 def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
     """Of the fields of a method's options that the command line has, types and descriptions."""
     from keyss.methods.base import CommandLineOption
@@ -213,8 +223,9 @@ def reveal(
     stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply, or - for stdin.")],
     *,
     key_file: Annotated[
-        Path | None, optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt")
-    ] = None,
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt"),
+    ] = (),
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write, or - for stdout.")],
     decoder: Annotated[
         Path | None,
@@ -241,21 +252,22 @@ def reveal(
     example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
     from keyss.files.streams import is_standard
 
-    (key,) = keys((key_file,) if key_file else (), 1)
-    revealed = api.reveal_counted(
-        stego,
-        key,
-        decoder=decoder,
-        frame=frame,
-        decoy=decoy,
-        force=force,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-    )
+    (key,) = keys(key_file, 1)
+    with hinting_at_white_space([key]):
+        revealed = api.reveal_counted(
+            stego,
+            key,
+            decoder=decoder,
+            frame=frame,
+            decoy=decoy,
+            force=force,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
     for sentence in revealed.warnings:
         print(f"keyss: warning: {sentence}", file=sys.stderr)
     remains = revealed.remains

@@ -25,21 +25,27 @@ def evaluate(
     device: Device = "auto",
     seed: Annotated[int | None, optional("N", "Seed of the wrong keys.", "0")] = None,
 ) -> None:
-    """Measure a hiding run against the test photos, with the keys and with wrong ones.
+    """Measure a hiding run on test views, with the keys and with wrong ones.
+
+    Test views are photos that were not trained on or, of a .ply model, renders of it. Beside each number
+    stand the baseline, which is that of the scene's plain model (3DGS with nothing hidden), and the chance
+    level, which is the stego model itself held against the secret: what a wrong key should not get above.
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
     from keyss.cli.tables import print_files, print_hiding
 
-    metrics = api.evaluate(
-        run,
-        keys(key_file, len(key_file) or 1),
-        wrong_keys=wrong_keys,
-        seed=None if seed is None else checked_seed(seed),
-        device=device,
-    )
+    chosen = keys(key_file, len(key_file) or 1)
+    with hinting_at_white_space(chosen):
+        metrics = api.evaluate(
+            run,
+            chosen,
+            wrong_keys=wrong_keys,
+            seed=None if seed is None else checked_seed(seed),
+            device=device,
+        )
     print_hiding(metrics)
     print_files(run, {"private/metrics.json": "the numbers"})
 
@@ -81,7 +87,7 @@ def audit(
     *,
     key_file: KeyFiles = (),
     original: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover to compare with.", "the run's own")
+        Path | None, optional("FILE", "Plain model of the cover to compare with.", "the run's own")
     ] = None,
     controls: Annotated[
         int, arg(metavar="N", help="Plain models of the cover from other seeds, to compare with; 2 or more.")
@@ -104,23 +110,24 @@ def audit(
     example: keyss audit runs/hidden --key-file key.txt
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
     from keyss.cli.tables import print_files, print_verdicts
     from keyss.progress import reporter
 
     chosen = keys(key_file, len(key_file) or 1)
-    api.audit(
-        run,
-        chosen,
-        original=original,
-        controls=controls,
-        only=only,
-        seed=checked_seed(seed),
-        device=device,
-        overwrite=overwrite,
-        resume=resume,
-        reporter=reporter(),
-    )
+    with hinting_at_white_space(chosen):
+        api.audit(
+            run,
+            chosen,
+            original=original,
+            controls=controls,
+            only=only,
+            seed=checked_seed(seed),
+            device=device,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=reporter(),
+        )
     print_verdicts(run)
     print_files(
         run,

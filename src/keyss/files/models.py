@@ -11,6 +11,7 @@ from pathlib import Path
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
+from keyss.files.foreign import what_it_is
 from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.ply import read_ply, write_ply
 from keyss.files.streams import StandardInput, StandardOutput, is_standard
@@ -82,16 +83,18 @@ def _for_writing(path: Path | str) -> ModelFormat:
 
 
 def _by_content(path: Path | StandardInput) -> ModelFormat:
-    if not path.is_file():
-        raise InputError(f"{path}: expected a 3DGS model ({_known()}), but there is no such file")
     try:
+        if path.is_dir():
+            raise InputError(f"{path}: expected the file of a 3DGS model ({_known()}), found a folder")
+        if not path.is_file():
+            raise InputError(f"{path}: expected a 3DGS model ({_known()}), but there is no such file")
         with path.open("rb") as file:
             start = file.read(max(len(each.magic) for each in FORMATS))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     found = next((each for each in FORMATS if start.startswith(each.magic)), None)
     if found is None:
-        raise InputError(f"{path}: expected a 3DGS model ({_known()}), but it begins with {start!r}")
+        raise InputError(f"{path}: expected a 3DGS model ({_known()}), found {what_it_is(path)}")
     named = _by_suffix(str(path)) or found
     if named is not found:
         raise InputError(

@@ -42,8 +42,13 @@ class StandardInput:
     def __str__(self) -> str:
         return "standard input"
 
+    name = "-"
+
     def is_file(self) -> bool:
         return True
+
+    def is_dir(self) -> bool:
+        return False
 
     def open(self, mode: str) -> BinaryIO:
         """From the beginning; `mode` is "rb"."""

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from keyss.channels.sidecar import read_header
+from keyss.channels.sidecar import MAGIC, read_header
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene
+from keyss.files.foreign import what_it_is
 from keyss.files.models import is_model_path, read_model
 from keyss.files.scenes import load_scene
 from keyss.files.streams import is_standard
@@ -78,11 +79,18 @@ class SidecarInfo:
 
 
 def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    """What is in a PLY, "-" for standard input, a sidecar, a scene folder or a folder of results.
+    """What is in a PLY, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
+    InputError.
 
-    Raises InputError.
+    Photos that a scene names but that are not there are left out, with a KeyssWarning.
     """
-    path = Path(path)
+    try:
+        return _info(Path(path))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
     if is_standard(path):
         return _model_info(path)
     if path.is_dir():
@@ -90,11 +98,18 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
             return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
         if (path / MODEL).exists():
             return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
-        return _scene_info(load_scene(path))
+        return _scene_info(load_scene(path, skip_missing=True))
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if is_model_path(path):
         return _model_info(path)
+    with path.open("rb") as file:
+        start = file.read(len(MAGIC))
+    if start != MAGIC:
+        raise InputError(
+            f"{path}: expected a model (.ply), a sidecar, a scene folder or a result folder, "
+            f"found {what_it_is(path)}"
+        )
     try:
         costs, _, _ = read_header(read_sidecar(path))
     except InputError as error:

@@ -139,7 +139,7 @@ def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree:
     each = "" if secrets == 1 else f" for each of {secrets} secrets"
     return (
         f"a model of {gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low bits; "
-        f"{rounded:,} Gaussians (--max-gaussians) would do"
+        f"{rounded:,} Gaussians (`max_gaussians={rounded}`) would do"
     )
 
 

@@ -40,7 +40,9 @@ class CarriedSecret:
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The Gaussians that are left make up for those that were lost with their carriers."""
         if frame == "cover":
-            raise UsageError("a carried secret never lay in the cover's coordinates: leave out --frame cover")
+            raise UsageError(
+                'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
+            )
         return compensate_pruning(self.gaussians, self.count)
 
     def remains(self, revealed: Gaussians) -> Remains:
@@ -72,7 +74,7 @@ def check_degrees(channel: Channel, cover: Gaussians, secrets: Sequence[Gaussian
         raise UsageError(
             f"a cover of SH degree {cover.sh_degree} cannot carry a secret of SH degree {degree}: one of its "
             f"Gaussians has room for {most} bytes, and one of the secret's takes at least {least}; "
-            "--method learned can hide it"
+            '`method="learned"` can hide it'
         )
 
 

@@ -38,7 +38,7 @@ from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShi
 from keyss.methods.learned.targets import PlacedScene
 
 NAME = "learned"
-SIDECAR_ADVICE = "--sidecar writes a file beside it instead"
+SIDECAR_ADVICE = "`sidecar=True` writes a file beside it instead"
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
 
