@@ -185,7 +185,8 @@ def hide(
         folder = RunFolder(
             out, "hide", told, onto=("scenes",), writes=(STEGO, CONFIG), overwrite=overwrite, resume=resume
         )
-    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    arguments = ["cover_model", *["model"] * len(secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
     options = chosen.prepare(inputs, options)
     if folder:
         check_disk(folder.path, chosen, options, inputs)
@@ -435,10 +436,15 @@ def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Met
     return method, options
 
 
-def _input(source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None) -> SceneInput:
-    """A scene and the plain model that is given with it, or that it is."""
+def _input(
+    source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None, argument: str
+) -> SceneInput:
+    """A scene and the plain model that is given with it as `argument`, or that it is. Raises UsageError."""
     photos = isinstance(source, Scene) or not is_model(source)
-    if not photos and model is None:
+    if not photos:
+        if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
+            what = "a model in memory" if isinstance(source, Gaussians) else source
+            raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
         model = source  # type: ignore[assignment]
     return SceneInput(None if model is None else as_model(model), photos)
 

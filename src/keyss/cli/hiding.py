@@ -87,6 +87,7 @@ def hide(
     from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.progress import reporter
+    from keyss.rendering.orbit import is_model
 
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
@@ -103,6 +104,18 @@ def hide(
     }
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
+    given = [cover_model or cover, *(secret_model or secret)]
+    if not chosen.trains and all(map(is_model, given)):
+        training = {
+            "--preset": preset != next(iter(chosen.presets)),
+            "--iterations": iterations is not None,
+            "--max-gaussians": max_gaussians is not None,
+        }
+        if idle := [flag for flag, is_given in training.items() if is_given]:
+            raise UsageError(
+                f"{' and '.join(idle)}: nothing is trained when --method {method} gets models of all scenes; "
+                f"leave {'it' if len(idle) == 1 else 'them'} out"
+            )
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
     warn_of_doubtful_keys(opening)
