@@ -260,8 +260,6 @@ def reveal(
         out=out,
         overwrite=overwrite,
     )
-    for sentence in found.warnings:
-        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     return found.gaussians
 
 
@@ -277,7 +275,7 @@ def reveal_counted(
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> RevealResult:
-    """`reveal`, with the number of Gaussians that were hidden and its warnings in the result."""
+    """`reveal`, with the number of Gaussians that were hidden in the result."""
     target = resolve_device(device)
     beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
     inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
@@ -294,6 +292,8 @@ def reveal_counted(
     )
     if not force:
         found.check_usable()
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     if path is not None:
         write_model(path, found.gaussians)
     return found
