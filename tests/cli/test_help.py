@@ -56,9 +56,9 @@ class TestHelp:
         for name, method in registry.METHODS.items():
             presets["hide", "--method", name] = {each: own.fit for each, own in method.presets.items()}
         for command, fits in presets.items():
-            said = " ".join(keyss(*command, "--help").out.replace("│", " ").split())
+            said = "".join(keyss(*command, "--help").out.replace("│", " ").split())
             for name, fit in fits.items():
-                assert f"{name} {fit.iterations:,} and {fit.max_gaussians:,}" in said
+                assert f"{name}{fit.iterations:,}and{fit.max_gaussians:,}" in said
 
     @pytest.mark.parametrize("method", ["learned", "carry"])
     def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:
