@@ -183,7 +183,14 @@ def hide(
     if out is not None:
         told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
         folder = RunFolder(
-            out, "hide", told, onto=("scenes",), writes=(STEGO, CONFIG), overwrite=overwrite, resume=resume
+            out,
+            "hide",
+            told,
+            onto=("scenes",),
+            writes=(STEGO, CONFIG),
+            inputs=[Path(each) for each in (*sources, *models) if isinstance(each, str | Path)],
+            overwrite=overwrite,
+            resume=resume,
         )
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
@@ -374,7 +381,8 @@ def render(
     folder) gets a PNG per camera.
     """
     target = resolve_device(device)
-    folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
+    inputs = [Path(model)] if isinstance(model, str | Path) else []
+    folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
     scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}

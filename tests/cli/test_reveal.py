@@ -353,3 +353,15 @@ class TestVerify:
         said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
         assert_refused(said, 3, "opens nothing")
         assert_refused(keyss("verify", files / "plain.ply", "--decoder", files / "key"), 2, "key")
+
+
+def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:
+    hide = ("hide", "--method", "carry", "--width", 24, "--key-file", files / "key", "-o", tmp_path / "run")
+    small = tmp_path / "small.ply"
+    write_ply(small, trained_like(100, 3))
+    assert keyss(*hide, "--cover", files / "plain.ply", "--secret", small).status == 0
+    before, stego = listing(tmp_path), tmp_path / "run" / "publish" / "stego.ply"
+    assert_refused(keyss(*hide, "--overwrite", "--cover", stego, "--secret", small), 2, "is the input")
+    render = ("render", stego, "--cameras", files / "plain.ply", "-o", tmp_path / "run", "--overwrite")
+    assert_refused(keyss(*render), 2, "is the input")
+    assert listing(tmp_path) == before
