@@ -183,7 +183,14 @@ def hide(
     if out is not None:
         told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
         folder = RunFolder(
-            out, "hide", told, onto=("scenes",), writes=(STEGO, CONFIG), overwrite=overwrite, resume=resume
+            out,
+            "hide",
+            told,
+            onto=("scenes",),
+            writes=(STEGO, CONFIG),
+            inputs=[Path(each) for each in (*sources, *models) if isinstance(each, str | Path)],
+            overwrite=overwrite,
+            resume=resume,
         )
     arguments = ["cover_model", *["model"] * len(secrets)]
     inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
@@ -292,8 +299,6 @@ def reveal(
         out=out,
         overwrite=overwrite,
     )
-    for sentence in found.warnings:
-        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     return found.gaussians
 
 
@@ -309,7 +314,7 @@ def reveal_counted(
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> RevealResult:
-    """`reveal`, with the number of Gaussians that were hidden and its warnings in the result."""
+    """`reveal`, with the number of Gaussians that were hidden in the result."""
     target = resolve_device(device)
     beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
     inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
@@ -326,6 +331,8 @@ def reveal_counted(
     )
     if not force:
         found.check_usable()
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     if path is not None:
         write_model(path, found.gaussians)
     return found
@@ -375,7 +382,8 @@ def render(
     folder) gets a PNG per camera.
     """
     target = resolve_device(device)
-    folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
+    inputs = [Path(model)] if isinstance(model, str | Path) else []
+    folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
     scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
