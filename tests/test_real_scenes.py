@@ -88,6 +88,6 @@ def test_one_model_hides_in_another_without_photos(real_data: Path, tmp_path: Pa
     splats = real_data / "splats"
     arguments = ["hide", "--cover", splats / "guitar.ply", "--secret", splats / "playbot_lod4.ply"]
     assert main([*map(str, arguments), "--key-file", str(tmp_path / "key"), "-o", str(tmp_path / "out")]) == 0
-    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    metrics = json.loads((tmp_path / "out" / "private" / "metrics.json").read_text())
     assert metrics["cover"]["psnr"] > 50
     assert metrics["secrets"][0]["psnr"] > 50

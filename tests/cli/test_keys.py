@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from keyss.cli.keys import key_of_file, keys, warn_of_weak_keys
+from keyss.cli.keys import key_of_file, keys, warn_of_doubtful_keys
 from keyss.core import InputError, UsageError
 from keyss.keys import generate_key
 
@@ -138,9 +138,9 @@ def test_a_key_file_that_others_can_read_gets_a_warning_without_the_key(
 
 
 def test_weak_keys_get_a_warning_without_the_key(capsys: pytest.CaptureFixture[str]) -> None:
-    warn_of_weak_keys([generate_key(20)])
+    warn_of_doubtful_keys([generate_key(20)])
     assert capsys.readouterr().err == ""
-    warn_of_weak_keys([generate_key(20), "hunter2"])
+    warn_of_doubtful_keys([generate_key(20), "hunter2"])
     said = capsys.readouterr().err
     assert "key 2: " in said
     assert "bits" in said

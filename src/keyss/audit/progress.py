@@ -50,7 +50,7 @@ class FinishedParts:
         elif read_file(path, len(digest)) != digest:
             raise InputError(
                 f"{folder}: belongs to an audit with other settings or inputs; "
-                "give the same ones, or start anew with --overwrite"
+                "give the same ones, or start anew with `overwrite=True`"
             )
 
     def has(self, part: str) -> bool:

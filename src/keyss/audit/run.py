@@ -14,8 +14,8 @@ from keyss._version import __version__
 from keyss.audit.parts import PARTS
 from keyss.audit.progress import FinishedParts, PartProgress
 from keyss.audit.subject import AuditSubject, subject_of
-from keyss.core.errors import UsageError
-from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
+from keyss.core.errors import Interrupted, UsageError, signal_of
+from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.rendering import Backend, resolve_device
 from keyss.report.page import report_bytes
 from keyss.runs.audit_record import (
@@ -87,7 +87,7 @@ def audit(
                 try:
                     finished.keep(name, PARTS[name](subject, seed, progress))
                 except KeyboardInterrupt as error:
-                    raise Interrupted(finished.folder, index) from error
+                    raise Interrupted(finished.folder, index, signal_of(error)) from error
                 finally:
                     progress.finish(finished.has(name))
             sections[name], own = finished.take(name)

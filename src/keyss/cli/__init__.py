@@ -1,5 +1,10 @@
 """The command line: one subcommand per verb, a thin layer over the functions of the same names."""
 
-from keyss.cli.entry import main
+from collections.abc import Sequence
 
-__all__ = ["main"]
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """See `keyss.cli.entry.main`, which is loaded here: Ctrl-C must be provided for before that."""
+    from keyss.cli.entry import main
+
+    return main(arguments)

@@ -38,6 +38,7 @@ Background = Annotated[
         "white if there are any, else black",
     ),
 ]
+SkipMissing = Annotated[bool, arg(help="Leave out photos that a scene names but that are not there.")]
 Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
 MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]

@@ -10,8 +10,9 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
-from keyss.cli.hiding import hide, reveal
+from keyss.cli.hiding import hide, reveal, verify
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import fit, info, render
 
@@ -70,4 +71,12 @@ def demo(
     )
 
 
-ALL = (keygen, fit, hide, reveal, render, evaluate, audit, report, steganalyze, info, demo)
+def version() -> None:
+    """Print the version, as `keyss --version` does.
+
+    example: keyss version
+    """
+    print(__version__)
+
+
+ALL = (keygen, fit, hide, reveal, verify, render, evaluate, audit, report, steganalyze, info, demo, version)

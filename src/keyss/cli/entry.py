@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
-import tyro
+from keyss import __version__
+from keyss.cli.flags import as_flags
+from keyss.core.errors import Interrupted, KeyssError, KeyssWarning, OutputError, signal_of
 
-from keyss.cli import commands
-from keyss.cli.hiding import hide, hide_with_options
-from keyss.cli.models import fit, fit_with_presets
-
-INTERRUPTED = 130  # 128 + SIGINT, as a shell counts
-BROKEN_PIPE = 141  # 128 + SIGPIPE
+BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
 INTERNAL_ERROR = 70  # EX_SOFTWARE
-NO_ROOM = 5  # that of OutputError
+NO_ROOM = OutputError.exit_status
 
 _ABOUT = """Hide a 3D Gaussian Splatting scene inside another one and open it only with a key.
 
@@ -29,47 +31,70 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises SystemExit for --help and for arguments that cannot be parsed, as argument parsers do. With
     KEYSS_DEBUG=1 in the environment, errors that are not a person's come through as they are.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
-    app = tyro.extras.SubcommandApp()
+    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    options: set[str] = set()  # of the commands, as Python names them
     try:
-        for command in commands.ALL:
-            if command is hide and arguments[:1] == ["hide"]:
-                app.command(hide_with_options(arguments))
-            elif command is fit and arguments[:1] == ["fit"]:
-                app.command(fit_with_presets())
-            else:
-                app.command(command)
-        app.cli(prog="keyss", description=_ABOUT, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
-        sys.stdout.flush()
+        with _warnings_as_lines(options):
+            try:
+                _run(["version"] if arguments in (["--version"], ["-V"]) else arguments, options)
+            finally:
+                _flush()
         return 0
     except BrokenPipeError:
         # Whoever read our output has left; the interpreter must not try to flush what is still buffered.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
-        status, message = explain(error)
+        status, message = explain(_interrupt_behind(error) or error)
         if status == INTERNAL_ERROR and os.environ.get("KEYSS_DEBUG") == "1":
             raise
-        print(f"keyss: {_one_line(message)}", file=sys.stderr)
+        print(f"keyss: {_one_line(as_flags(message, options))}", file=sys.stderr)
         return status
+
+
+def _run(arguments: list[str], options: set[str]) -> None:
+    """The command that `arguments` ask for; its options are added to `options`."""
+    if arguments == ["version"]:  # without what parses arguments, which takes longer
+        print(__version__)
+        return
+
+    import tyro
+
+    from keyss.cli import commands
+    from keyss.cli.hiding import hide, hide_with_options
+    from keyss.cli.models import fit, fit_with_presets
+
+    app = tyro.extras.SubcommandApp()
+    for command in commands.ALL:
+        asked: Any = command
+        if command is hide and arguments[0] == "hide":
+            asked = hide_with_options(arguments)
+        elif command is fit and arguments[0] == "fit":
+            asked = fit_with_presets()
+        app.command(asked)
+        if command.__name__ == arguments[0]:
+            options |= {
+                name
+                for name, parameter in inspect.signature(asked).parameters.items()
+                if parameter.kind is parameter.KEYWORD_ONLY
+            }
+    app.cli(prog="keyss", description=_ABOUT, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def explain(error: BaseException) -> tuple[int, str]:
     """(exit status, what to tell a person) of an error."""
-    from keyss.core.errors import KeyssError
-    from keyss.fitting.loop import Interrupted
-
     match error:
         case KeyssError():
             return error.exit_status, f"error: {error}"
-        case Interrupted(checkpoint=None):
-            return INTERRUPTED, f"interrupted at iteration {error.iteration}; nothing was saved"
-        case Interrupted():
-            return INTERRUPTED, (
-                f"interrupted at iteration {error.iteration}; continue with the same command and --resume"
-            )
         case KeyboardInterrupt():
-            return INTERRUPTED, "interrupted"
+            signum = signal_of(error)
+            word = "interrupted" if signum == signal.SIGINT else "terminated"
+            if isinstance(error, Interrupted):
+                saved = "nothing was saved"
+                if error.checkpoint is not None:
+                    saved = "continue with the same command and `resume=True`"
+                word += f" at iteration {error.iteration}; {saved}"
+            return 128 + signum, word
         case _ if _is_out_of_memory(error):
             return NO_ROOM, (
                 "error: not enough memory; a smaller --width or --max-gaussians takes less "
@@ -82,6 +107,40 @@ def explain(error: BaseException) -> tuple[int, str]:
         f"internal error: {type(error).__name__}: {error}; please report it; "
         "run with KEYSS_DEBUG=1 for the traceback"
     )
+
+
+@contextmanager
+def _warnings_as_lines(options: Collection[str]) -> Iterator[None]:
+    """Prints what keyss warns of as one line on the standard error stream, each once."""
+    said: set[str] = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", KeyssWarning)
+        otherwise = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if not issubclass(category, KeyssWarning):
+                otherwise(message, category, *where, **more)
+            elif (line := _one_line(as_flags(str(message), options))) not in said:
+                said.add(line)
+                print(f"keyss: warning: {line}", file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
+
+
+def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
+    """What came up while an interrupt was handled, or was made of one, is no error of its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _flush() -> None:
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        error.filename = "the standard output"
+        raise
 
 
 def _is_out_of_memory(error: BaseException) -> bool:

@@ -6,6 +6,7 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 import inspect
+import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -24,6 +25,7 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
     optional,
     preset_sizes,
@@ -51,6 +53,7 @@ def hide(
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     cover_model: Annotated[
         Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
     ] = None,
@@ -76,7 +79,7 @@ def hide(
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
     """
     from keyss import api
-    from keyss.cli.keys import keys, warn_of_weak_keys
+    from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding
     from keyss.core.errors import UsageError
     from keyss.methods import registry
@@ -99,13 +102,14 @@ def hide(
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
-    warn_of_weak_keys(opening)
+    warn_of_doubtful_keys(opening)
     result = api.hide(
         cover,
         [api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)],
         method=options,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         cover_model=cover_model,
         min_psnr=min_psnr,
         device=device,
@@ -216,12 +220,13 @@ def _flags(method: Method) -> set[str]:
 
 
 def reveal(
-    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply.")],
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply, or - for stdin.")],
     *,
     key_file: Annotated[
-        Path | None, optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt")
-    ] = None,
-    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt"),
+    ] = (),
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write, or - for stdout.")],
     decoder: Annotated[
         Path | None,
         optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
@@ -231,7 +236,11 @@ def reveal(
     ] = "secret",
     decoy: Annotated[bool, arg(help="With a wrong key, write the cover instead of failing.")] = False,
     force: Annotated[
-        bool, arg(help="For a .ply that was quantised: skip the check that the decoder belongs to it.")
+        bool,
+        arg(
+            help="For a .ply that was quantised or pruned: skip the check that the decoder belongs to it, "
+            "and write what there is."
+        ),
     ] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -239,20 +248,65 @@ def reveal(
     """Bring a secret back with its key.
 
     example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
+
+    example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.files.streams import is_standard
 
-    (key,) = keys((key_file,) if key_file else (), 1)
-    revealed = api.reveal(
-        stego,
-        key,
-        decoder=decoder,
-        frame=frame,
-        decoy=decoy,
-        force=force,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-    )
-    print(f"{out}: {len(revealed):,} Gaussians")
+    (key,) = keys(key_file, 1)
+    with hinting_at_white_space([key]):
+        revealed = api.reveal_counted(
+            stego,
+            key,
+            decoder=decoder,
+            frame=frame,
+            decoy=decoy,
+            force=force,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
+    for sentence in revealed.warnings:
+        print(f"keyss: warning: {sentence}", file=sys.stderr)
+    remains = revealed.remains
+    of = f" of {remains.hidden:,}" if remains.hidden else ""
+    print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
+
+
+def verify(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
+    *,
+    key_file: Annotated[
+        Path | None, optional("FILE", "File with a key: check what it opens.", "the model alone is checked")
+    ] = None,
+    decoder: Annotated[
+        Path | None,
+        optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
+    ] = None,
+    json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
+    device: Device = "auto",
+) -> None:
+    """Check that a model is sound and, with a key, that all of its secret is there.
+
+    Exit status 0 says so, 3 that the key opens nothing, 4 that something is wrong.
+
+    example: keyss verify stego.ply --key-file key.txt
+    """
+    from msgspec import to_builtins
+
+    from keyss import api
+    from keyss.cli.keys import key_of_file
+    from keyss.cli.tables import print_facts
+    from keyss.core.errors import InputError
+    from keyss.runs.records import record_bytes
+
+    key = key_of_file(key_file) if key_file else None
+    found = api.verify(model, key, decoder=decoder, device=device)
+    if json_:
+        print(record_bytes(found).decode(), end="")
+    else:
+        print_facts(to_builtins(found))
+    if found.problems:
+        raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -6,10 +6,11 @@ import getpass
 import os
 import stat
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 
 VARIABLE = "KEYSS_KEY"
 MAX_FILE_BYTES = 4096
@@ -23,7 +24,8 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     """
     if files:
         if len(files) != count:
-            raise UsageError(f"expected one --key-file for each of {count} secret(s), got {len(files)}")
+            expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
+            raise UsageError(f"expected {expected}, got {len(files)}")
         return [key_of_file(path) for path in files]
     if VARIABLE in os.environ:
         if count != 1:
@@ -36,15 +38,37 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 
 
-def warn_of_weak_keys(chosen: Sequence[str]) -> None:
-    """Say on the standard error stream which of the keys can be guessed, without saying what they are."""
+def warn_of_doubtful_keys(chosen: Sequence[str]) -> None:
+    """Say on the standard error stream which of the keys can be guessed or were hardly meant like that.
+
+    What they are is not said.
+    """
     from keyss.keys import weakness
 
     for number, key in enumerate(chosen, start=1):
-        problem = weakness(key)
-        if problem:
+        for problem in filter(None, (weakness(key), _white_space(key))):
             which = f"key {number}: " if len(chosen) > 1 else ""
             print(f"keyss: warning: {which}{problem}", file=sys.stderr)
+
+
+@contextmanager
+def hinting_at_white_space(chosen: Sequence[str]) -> Iterator[None]:
+    """Adds to the error of keys that open nothing what may be wrong with them."""
+    try:
+        yield
+    except WrongKeyError as error:
+        hints = {hint for key in chosen if (hint := _white_space(key))}
+        raise WrongKeyError("; ".join((str(error), *sorted(hints)))) from error
+
+
+def _white_space(key: str) -> str | None:
+    """What to say of a key with white space at an end, which nobody sees."""
+    if key == key.strip():
+        return None
+    end = "begins" if key != key.lstrip() else "ends"
+    which = key[0] if end == "begins" else key[-1]
+    kind = "a space" if which == " " else "a line break" if which in "\r\n" else "white space"
+    return f"the key {end} with {kind}, which is a part of it"
 
 
 def key_of_file(path: Path) -> str:
@@ -71,7 +95,7 @@ def key_of_file(path: Path) -> str:
         raise InputError(f"{path}: expected a key in UTF-8, found other bytes") from error
     key = text.removesuffix("\n").removesuffix("\r")
     if not key:
-        raise InputError(f"{path}: the key file is empty; `keyss keygen > FILE` writes a key")
+        raise InputError(f"{path}: the key file is empty; `keyss keygen -o FILE` writes a key")
     return key
 
 

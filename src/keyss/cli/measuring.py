@@ -34,16 +34,18 @@ def evaluate(
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
     from keyss.cli.tables import print_files, print_hiding
 
-    metrics = api.evaluate(
-        run,
-        keys(key_file, len(key_file) or 1),
-        wrong_keys=wrong_keys,
-        seed=None if seed is None else checked_seed(seed),
-        device=device,
-    )
+    chosen = keys(key_file, len(key_file) or 1)
+    with hinting_at_white_space(chosen):
+        metrics = api.evaluate(
+            run,
+            chosen,
+            wrong_keys=wrong_keys,
+            seed=None if seed is None else checked_seed(seed),
+            device=device,
+        )
     print_hiding(metrics)
     print_files(run, {"private/metrics.json": "the numbers"})
 
@@ -108,23 +110,24 @@ def audit(
     example: keyss audit runs/hidden --key-file key.txt
     """
     from keyss import api
-    from keyss.cli.keys import keys
+    from keyss.cli.keys import hinting_at_white_space, keys
     from keyss.cli.tables import print_files, print_verdicts
     from keyss.progress import reporter
 
     chosen = keys(key_file, len(key_file) or 1)
-    api.audit(
-        run,
-        chosen,
-        original=original,
-        controls=controls,
-        only=only,
-        seed=checked_seed(seed),
-        device=device,
-        overwrite=overwrite,
-        resume=resume,
-        reporter=reporter(),
-    )
+    with hinting_at_white_space(chosen):
+        api.audit(
+            run,
+            chosen,
+            original=original,
+            controls=controls,
+            only=only,
+            seed=checked_seed(seed),
+            device=device,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=reporter(),
+        )
     print_verdicts(run)
     print_files(
         run,

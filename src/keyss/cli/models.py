@@ -21,6 +21,7 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
     preset_sizes,
     schedule,
@@ -36,6 +37,7 @@ def fit(
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -60,6 +62,7 @@ def fit(
         config=replace(PRESETS[preset], **schedule(iterations, max_gaussians, seed)),
         width=width,
         background=background,
+        skip_missing=skip_missing,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -88,13 +91,14 @@ def fit_with_presets() -> Callable[..., None]:
 
 
 def render(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply.")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
     *,
     cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
     out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
     split: Annotated[Literal["test", "train", "all"], arg(help="Which of its cameras.")] = "test",
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
@@ -110,6 +114,7 @@ def render(
         split=split,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -119,7 +124,8 @@ def render(
 
 def info(
     path: Annotated[
-        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a sidecar or a result folder.")
+        Positional[Path],
+        arg(metavar="FILE", help="A .ply (- for stdin), a scene folder, a sidecar or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,

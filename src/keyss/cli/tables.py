@@ -6,13 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console as RichConsole
 from rich.table import Table
 
 if TYPE_CHECKING:
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
+
+
+class Console(RichConsole):
+    """Leaves it to the entry point what to do when whoever reads has left."""
+
+    def on_broken_pipe(self) -> None:
+        raise  # what is being handled
 
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
@@ -24,8 +31,8 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
     differ = any(other not in (own, None) for own, other in sizes)
     rows = [
-        _scene_row(name, own, other, size, others if differ else None)
-        for name, own, other, (size, others) in zip(names, found, plain, sizes, strict=True)
+        _scene_row(name, quality, baseline, own, other if differ else None)
+        for name, quality, baseline, (own, other) in zip(names, found, plain, sizes, strict=True)
     ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
@@ -165,5 +172,5 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case list() | tuple():
-            return ", ".join(_text(item) for item in value)
+            return ", ".join(_text(item) for item in value) or "none"
     return str(value)

@@ -1,8 +1,14 @@
 """Errors that a person can cause. Each carries an exit status of its own for the command line.
 
-A message says what was expected, what came, and what to do. The command line prints it in one or
-two lines and never shows a traceback for these.
+A message says what was expected, what came, and what to do. It names arguments as Python does, between
+backticks: `overwrite=True`, `method="learned"`, `sh_degree`. The command line prints it in one line, with its
+own flags instead, and never shows a traceback for these.
 """
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
 
 
 class KeyssError(Exception):
@@ -45,3 +51,27 @@ class BackendError(KeyssError):
     """A backend or an optional dependency that is not there."""
 
     exit_status = 6
+
+
+class KeyssWarning(UserWarning):
+    """A result came out, but there is something to know about it; worded as messages of errors are."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C or another signal during long work, after saving to `checkpoint` (None: there was none to
+    write).
+
+    `iteration`: how many steps are done.
+    """
+
+    def __init__(
+        self, checkpoint: Path | None, iteration: int, signum: signal.Signals = signal.SIGINT
+    ) -> None:
+        super().__init__(signum)
+        self.checkpoint = checkpoint
+        self.iteration = iteration
+
+
+def signal_of(interrupt: KeyboardInterrupt) -> signal.Signals:
+    """Which signal an interrupt came from: Ctrl-C unless it says otherwise."""
+    return signal.Signals(interrupt.args[0]) if interrupt.args else signal.SIGINT

@@ -93,7 +93,7 @@ def run_demo(
     except BaseException as error:
         clear(out)
         if isinstance(error, Interrupted):  # there is nothing left to continue from
-            raise KeyboardInterrupt from error
+            raise KeyboardInterrupt(*error.args) from error
         raise
 
 

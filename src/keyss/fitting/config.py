@@ -46,7 +46,7 @@ class FitConfig:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise UsageError(f"{name}: expected {low} to {high}, got {value}")
+                raise UsageError(f"`{name}`: expected {low} to {high}, got {value}")
 
     def sh_degree_at(self, iteration: int) -> int:
         """SH degree in use: one more every 1,000 iterations or every sixth of a shorter run."""

@@ -1,11 +1,11 @@
-"""The loop around every training run: progress, checkpoints, Ctrl-C, resume."""
+"""The loop around every training run: progress, checkpoints, Ctrl-C and other signals, resume."""
 
 from __future__ import annotations
 
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,16 +13,12 @@ from typing import Any, Protocol
 import torch
 
 from keyss.core.errors import InputError
+from keyss.core.errors import Interrupted as Interrupted
 from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
 
-
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during training, after saving to `checkpoint` (None: there was none to write)."""
-
-    def __init__(self, checkpoint: Path | None, iteration: int) -> None:
-        super().__init__()
-        self.checkpoint = checkpoint
-        self.iteration = iteration
+_ENDING = tuple(
+    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
+)
 
 
 class TrainingRun(Protocol):
@@ -82,21 +78,23 @@ def train(
 ) -> float:
     """Take `run` to its last iteration; returns the seconds spent, those before a resume included.
 
-    With `checkpoint`, the state is saved there every `checkpoint_seconds` and on Ctrl-C (raises
-    Interrupted) and at the end; with `resume`, it continues from there if the file exists. `fingerprint`
-    (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of another one
-    raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global random
-    state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given back
-    to the caller.
+    With `checkpoint`, the state is saved there every `checkpoint_seconds`, on Ctrl-C, SIGTERM and SIGHUP
+    (raises Interrupted) and at the end; with `resume`, it continues from there if the file exists.
+    `fingerprint` (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of
+    another one raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global
+    random state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given
+    back to the caller.
     """
     reporter = reporter or SilentReporter()
     spent = 0.0
-    with torch.random.fork_rng(), _deferred_interrupt() as interrupted:
+    # Those that end a process are left to do so where there is nothing to save.
+    signals = (signal.SIGINT,) if checkpoint is None else _ENDING
+    with _deferred(signals) as interrupted, torch.random.fork_rng():
         torch.manual_seed(seed)
         if checkpoint is not None and resume and checkpoint.exists():
             tensors, meta = load_checkpoint(checkpoint)
             if meta.get("fingerprint") != fingerprint:
-                remedy = "give the same ones, or start anew with --overwrite"
+                remedy = "give the same ones, or start anew with `overwrite=True`"
                 raise InputError(f"{checkpoint}: belongs to a run with other settings or inputs; {remedy}")
             try:
                 torch.set_rng_state(tensors.pop("rng"))
@@ -122,9 +120,9 @@ def train(
                 if evaluate_every and run.iteration % evaluate_every == 0:
                     numbers = run.evaluate()
                 reporter.update(run.iteration, len(run), numbers)
-                if interrupted():
+                if (signum := interrupted()) is not None:
                     save()
-                    raise Interrupted(checkpoint, run.iteration)
+                    raise Interrupted(checkpoint, run.iteration, signum)
                 if time.monotonic() - saved > checkpoint_seconds:
                     save()
                     saved = time.monotonic()
@@ -135,21 +133,36 @@ def train(
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C into a flag that is looked at between steps; a second Ctrl-C interrupts at once."""
+def _deferred(signals: Sequence[signal.Signals]) -> Iterator[Callable[[], signal.Signals | None]]:
+    """Turn signals into a flag that is looked at between steps; a second one acts at once.
+
+    Signals that the process ignores stay ignored, as those of a program that `nohup` started.
+    """
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
+        yield lambda: None
         return
-    seen = False
+    seen: signal.Signals | None = None
 
     def note(signum: int, frame: Any) -> None:
         nonlocal seen
-        if seen:
-            raise KeyboardInterrupt
-        seen = True
+        if seen is None:
+            seen = signal.Signals(signum)
+            return
+        restore()
+        signal.raise_signal(signum)
 
-    previous = signal.signal(signal.SIGINT, note)
+    def restore() -> None:
+        for signum, handler in previous.items():
+            signal.signal(signum, handler)
+
+    handlers = {signum: signal.getsignal(signum) for signum in signals}
+    # None: a handler that is not Python's, which could not be put back.
+    previous = {signum: old for signum, old in handlers.items() if old not in (signal.SIG_IGN, None)}
     try:
+        for signum in previous:
+            signal.signal(signum, note)
         yield lambda: seen
     finally:
-        signal.signal(signal.SIGINT, previous)
+        restore()
+    if seen is not None:  # nobody looked any more
+        signal.raise_signal(seen)

@@ -18,6 +18,7 @@ from keyss.measure.sealwatch_detectors import SealwatchRocs
 from keyss.measure.sinkhorn import Sinkhorn3D
 from keyss.measure.speed import SpeedResult
 from keyss.measure.two_sample import TwoSample
+from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
 
@@ -157,5 +158,6 @@ def read_audit(run: Path) -> Audit:
     """A run's audit. Raises InputError when it is missing, broken, too large or of another version."""
     path = run / AUDIT_FOLDER / AUDIT_FILE
     if not path.exists():
+        run_folder(run)
         raise InputError(f"{path}: expected an audit, found nothing there; `keyss audit {run}` makes one")
     return read_record(path, Audit)

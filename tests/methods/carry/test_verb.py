@@ -60,10 +60,11 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert "carriers: " in out
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
     assert names == {
-        *("stego.ply", "metrics.json", "config.json"),
+        "publish/stego.ply",
+        *("private/metrics.json", "private/config.json", "private/manifest.json"),
         *("private/cover.ply", "private/secret-1.ply"),
     }
-    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [900]
     assert metrics["details"]["bits_per_gaussian"] == [568]
     assert metrics["cover"]["psnr"] == pytest.approx(metrics["baseline"]["cover"]["psnr"], abs=0.1)
@@ -75,7 +76,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert len(read_ply(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
     assert run("evaluate", tmp_path / "out", "--key-file", "key")[0] == 0
-    assert json.loads((tmp_path / "out/metrics.json").read_text()) == metrics
+    assert json.loads((tmp_path / "out/private/metrics.json").read_text()) == metrics
     status, _, err = run("evaluate", tmp_path / "out", "--key-file", "key", "--wrong-keys", 3)
     assert (status, "no decoder" in err) == (2, True)
     assert run("reveal", stego, "--key-file", "key", "--frame", "cover", "-o", tmp_path / "n.ply")[0] == 2
@@ -93,7 +94,7 @@ def test_too_large_secrets_are_refused_or_pruned(
     assert "4,414 records would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
     assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
-    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [4414]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
 
@@ -193,7 +194,7 @@ def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -
     """A scene without a model would be fitted for minutes, though the cover has no room."""
     coarse = trained_like(1500).map(lambda v: (v * 64).round() / 64)
     secret = Secret(tiny_scene(1), KEY)
-    with pytest.raises(InputError, match="--dither"):
+    with pytest.raises(InputError, match="`dither=True`"):
         keyss.hide(coarse, [secret], method="carry", out=tmp_path / "run")
     flat = random_gaussians(1500, sh_degree=0)
     model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))

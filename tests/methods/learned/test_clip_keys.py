@@ -93,7 +93,7 @@ def test_keys_that_clip_would_cut_off_are_refused(encoder: ClipKeys) -> None:
 
 
 def test_a_folder_without_clip_is_refused(tmp_path: Path, encoder: ClipKeys) -> None:
-    with pytest.raises(BackendError, match="--clip-model"):
+    with pytest.raises(BackendError, match="`clip_model`"):
         ClipKeys(tmp_path)
     with pytest.raises(BackendError, match="nothing is downloaded"):
         ClipKeys("nobody/nothing")

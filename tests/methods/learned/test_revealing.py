@@ -54,7 +54,7 @@ def test_positions_that_were_rounded_need_force() -> None:
     stego = trained_like(200)
     secret = some_secret(stego)
     rounded = replace(stego, means=(stego.means * 500).round() / 500)
-    with pytest.raises(InputError, match="--force"):
+    with pytest.raises(InputError, match="`force=True`"):
         secret.reveal(rounded)
     assert len(secret.reveal(rounded, force=True)) == 200
 

@@ -62,8 +62,7 @@ class Spread:
     def decode(self, chunks: Bytes, size: int) -> bytes:
         """The first `size` bytes from numbered chunks in any order. Raises InputError if too few are left."""
         blocks: list[dict[int, Bytes]] = [{} for _ in range(self.blocks)]
-        numbers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
-        for number, chunk in zip(numbers.tolist(), chunks[:, NUMBER_BYTES:], strict=True):
+        for number, chunk in zip(_numbers(chunks).tolist(), chunks[:, NUMBER_BYTES:], strict=True):
             if number < self.blocks * self.n:
                 blocks[number // self.n][number % self.n] = chunk
         decoded = (reed_solomon.decode(rows, self.k, self.n) for rows in blocks)
@@ -74,6 +73,18 @@ class Spread:
                 "blocks are lost"
             )
         return np.concatenate(whole).tobytes()[:size]
+
+    def left(self, chunks: Bytes) -> tuple[int, int]:
+        """How many of the different chunks are among these, and how many there are."""
+        every = self.blocks * self.n
+        numbers = np.unique(_numbers(chunks))
+        return int((numbers < every).sum()), every
+
+
+def _numbers(chunks: Bytes) -> npt.NDArray[np.int64]:
+    """[C] the numbers of numbered chunks."""
+    numbers: npt.NDArray[np.int64] = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
+    return numbers
 
 
 def chunk_bytes(sh_degree: int) -> int:
@@ -128,7 +139,7 @@ def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree:
     each = "" if secrets == 1 else f" for each of {secrets} secrets"
     return (
         f"a model of {gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low bits; "
-        f"{rounded:,} Gaussians (--max-gaussians) would do"
+        f"{rounded:,} Gaussians (`max_gaussians={rounded}`) would do"
     )
 
 

@@ -19,7 +19,7 @@ from keyss.channels.base import Channel, PreparedCover, RecordPlan, RecordReques
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
-from keyss.methods.base import Frame
+from keyss.methods.base import Frame, Remains
 from keyss.methods.carry.quantise import Codec
 from keyss.methods.carry.table import Table
 
@@ -40,8 +40,16 @@ class CarriedSecret:
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The Gaussians that are left make up for those that were lost with their carriers."""
         if frame == "cover":
-            raise UsageError("a carried secret never lay in the cover's coordinates: leave out --frame cover")
+            raise UsageError(
+                'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
+            )
         return compensate_pruning(self.gaussians, self.count)
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), self.count)
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        """It does: every record is bound to the Gaussian that it came out of."""
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
@@ -66,7 +74,7 @@ def check_degrees(channel: Channel, cover: Gaussians, secrets: Sequence[Gaussian
         raise UsageError(
             f"a cover of SH degree {cover.sh_degree} cannot carry a secret of SH degree {degree}: one of its "
             f"Gaussians has room for {most} bytes, and one of the secret's takes at least {least}; "
-            "--method learned can hide it"
+            '`method="learned"` can hide it'
         )
 
 

@@ -25,8 +25,8 @@ from keyss.methods.carry.carrying import (
 from keyss.methods.carry.dither import cost, dither
 from keyss.methods.carry.options import PRESETS, CarryOptions
 
-_PRUNE = "--prune-to-fit leaves out the least visible"
-_DITHER = "--dither gives it new low bits, at a price, and --method learned --sidecar needs none"
+_PRUNE = "`prune_to_fit=True` leaves out the least visible"
+_DITHER = '`dither=True` gives it new low bits, at a price, and `method="learned", sidecar=True` needs none'
 
 
 class CarryMethod:

@@ -39,7 +39,7 @@ class ClipKeys:
             self._text = transformers.CLIPTextModel.from_pretrained(str(model), local_files_only=True).eval()
         except (OSError, ValueError, TypeError) as error:
             raise BackendError(
-                f"no CLIP text encoder in {model}: give --clip-model a folder with one, for nothing is "
+                f"no CLIP text encoder in {model}: give `clip_model` a folder with one, for nothing is "
                 "downloaded (pip install 'keyss[clip]' brings the code only)"
             ) from error
 

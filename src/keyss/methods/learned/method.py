@@ -38,7 +38,7 @@ from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShi
 from keyss.methods.learned.targets import PlacedScene
 
 NAME = "learned"
-SIDECAR_ADVICE = "--sidecar writes a file beside it instead"
+SIDECAR_ADVICE = "`sidecar=True` writes a file beside it instead"
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
 
@@ -140,7 +140,7 @@ class LearnedMethod:
         """A decoder, and where the secret lies. Raises InputError for damage."""
         if not isinstance(content, Payload):
             raise InputError("the hidden secret is damaged: expected one payload, got records")
-        return unpack_secret(content.data)
+        return replace(unpack_secret(content.data), chunks=content.chunks)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """The opacity remaps of a warm start are in the source; nothing else is known without a key."""

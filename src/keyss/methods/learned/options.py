@@ -79,7 +79,9 @@ class LearnedOptions(MethodOptions):
 
     def __post_init__(self) -> None:
         if self.clip_model is not None and self.key_encoder != "clip":
-            raise UsageError("a CLIP model is for the key encoder clip (--clip-model, --key-encoder clip)")
+            raise UsageError(
+                '`clip_model` is for the key encoder clip: leave it out or set `key_encoder="clip"`'
+            )
         if self.poses != "both" and self.common_poses < 1:
             raise UsageError(
                 "poses of some scenes only: needs common_poses = 1, for all scenes are drawn from them"
@@ -87,7 +89,7 @@ class LearnedOptions(MethodOptions):
         if self.start == "warm" and "op" not in self.mask:
             raise UsageError(
                 f"mask {','.join(self.mask)}: a warm start hides the secret's Gaussians by their opacity and "
-                "needs op in the mask; start from points instead (--start points)"
+                'needs op in the mask; start from points instead (`start="points"`)'
             )
         if self.start == "warm" and self.conditioning == "bias":
             raise UsageError(

@@ -47,7 +47,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gauss
     """The most contributing Gaussians of every plain model; those of the secrets transparent in the cover."""
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     # What is never drawn would lie among the hidden.
-    plains = [plain[plain.opacity_logits > DRAWN_LOGIT] for plain in plains]
+    plains = [plain[(plain.opacity_logits > DRAWN_LOGIT) & ~plain.overflow] for plain in plains]
     weights = [1.0] + [config.secret_share] * (len(scenes) - 1)
     shares = _shares([len(plain) for plain in plains], weights, config.fit.max_gaussians)
     chosen = [
