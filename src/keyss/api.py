@@ -461,8 +461,12 @@ def _check_keys(keys: Sequence[str]) -> None:
     """Raise UsageError for keys that cannot be, or are the same to key derivation, before any work."""
     cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
     derived = [DerivedKey(key, cheap) for key in keys]
-    if any(a.equals(b) for a, b in combinations(derived, 2)):
-        raise UsageError("two secrets have the same key: each needs its own")
+    for (i, a), (j, b) in combinations(enumerate(derived, 1), 2):
+        if a.equals(b):
+            raise UsageError(
+                f"secrets {i} and {j} have the same key, which can open one of them only: give each its own "
+                "(`keyss keygen` makes one)"
+            )
 
 
 def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
