@@ -69,7 +69,7 @@ def _rows(audits: list[Audit]) -> list[str]:
         "secret breaks down after the cover, or neither does": lambda a: _attacks(a, ("cover", "neither")),
         "both break down at the same strength": lambda a: _attacks(a, ("both",)),
         "secret breaks down before the cover": lambda a: _attacks(a, ("secret",)),
-        "rendering, over plain: published, revealed": _rendering,
+        "rendering, over plain: stego, revealed": _rendering,
         "reveal, s": lambda a: f"{max(a.speed.reveal_seconds):.1f}",
         "audit, min": lambda a: f"{a.seconds / 60:.1f}",
     }
@@ -107,7 +107,7 @@ def _classifier(audit: Any) -> str:
 def _auc(audit: Audit, detector: str) -> str:
     rocs = [each for program in ("StegExpose", "sealwatch") for each in detector_rocs(audit, program)]
     found = next((each for each in rocs if each.name == detector), None)
-    return f"{found.published.auc:.2f} ({found.control.auc:.2f})" if found and found.control else ""
+    return f"{found.stego.auc:.2f} ({found.control.auc:.2f})" if found and found.control else ""
 
 
 def _leak(audit: Any, score: str, digits: int) -> str:

@@ -22,6 +22,7 @@ from keyss import FitConfig, LearnedOptions, Secret
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
 from keyss.runs.config import read_config
+from keyss.runs.files import STEGO
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = LearnedOptions(
@@ -63,10 +64,11 @@ def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
 def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
-        "stego.ply",
-        "decoder.sealed",
-        "config.json",
-        "metrics.json",
+        "publish/stego.ply",
+        "publish/decoder.sealed",
+        "private/config.json",
+        "private/metrics.json",
+        "private/manifest.json",
         "private/cover.ply",
         "private/secret-1.ply",
     }
@@ -75,7 +77,7 @@ def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
 
 
 def test_metrics_have_their_shape(run: Path) -> None:
-    metrics = json.loads((run / "metrics.json").read_text())
+    metrics = json.loads((run / "private" / "metrics.json").read_text())
     assert set(metrics) == {
         *("method", "cover", "secrets", "baseline", "wrong_key", "chance_level", "gaussians"),
         *("secret_gaussians", "iterations", "seconds", "width", "seed", "details", "version", "keyss"),
@@ -93,16 +95,16 @@ def test_metrics_have_their_shape(run: Path) -> None:
 
 
 def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
-    before = json.loads((run / "metrics.json").read_text())
+    before = json.loads((run / "private" / "metrics.json").read_text())
     after = keyss.evaluate(run, ["the key"])
     assert json.loads(msgspec.json.encode(after)) == before
-    assert json.loads((run / "metrics.json").read_text()) == before
+    assert json.loads((run / "private" / "metrics.json").read_text()) == before
     with pytest.raises(WrongKeyError):
         keyss.evaluate(run, ["another"])
 
 
 def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    secret = keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "secret.ply")
+    secret = keyss.reveal(run / "publish" / "stego.ply", "the key", out=tmp_path / "secret.ply")
     again = keyss.read_model(tmp_path / "secret.ply")
     assert torch.equal(secret.means, again.means)
     assert torch.equal(secret.sh, again.sh)
@@ -113,13 +115,13 @@ def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path]
         for view in scene.test
     ]
     psnr = float(-10 * torch.log10(torch.stack(errors)).mean())
-    metrics = json.loads((run / "metrics.json").read_text())
+    metrics = json.loads((run / "private" / "metrics.json").read_text())
     assert psnr == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.1)
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     keyss.hide(folders[0], [Secret(folders[1], "the key")], method=SIDECAR, out=tmp_path / "again")
-    for name in ("stego.ply", "decoder.sealed", "private/secret-1.ply"):
+    for name in ("publish/stego.ply", "publish/decoder.sealed", "private/secret-1.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
 
 
@@ -129,12 +131,12 @@ def test_existing_models_are_bounds_and_are_not_fitted_again(
     given = run / "private" / "cover.ply"
     secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
     keyss.hide(folders[0], [secret], method=SIDECAR, cover_model=given, out=tmp_path / "again")
-    assert (tmp_path / "again" / "stego.ply").read_bytes() == (run / "stego.ply").read_bytes()
+    assert (tmp_path / "again" / STEGO).read_bytes() == (run / STEGO).read_bytes()
 
 
 def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
     with pytest.raises(WrongKeyError):
-        keyss.reveal(run / "stego.ply", "wrong", out=tmp_path / "x.ply")
+        keyss.reveal(run / "publish" / "stego.ply", "wrong", out=tmp_path / "x.ply")
     assert not list(tmp_path.iterdir())
 
 
@@ -144,13 +146,13 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     """It changes every value that a decoder changes, by little, in the same way for one key every time."""
     paths = [tmp_path / f"{name}.ply" for name in ("right", "wrong", "again", "other")]
     for path, key in zip(paths, ("the key", "wrong", "wrong", "other"), strict=True):
-        keyss.reveal(run / "stego.ply", key, decoy=True, out=path)
+        keyss.reveal(run / "publish" / "stego.ply", key, decoy=True, out=path)
     right, wrong, again, other = (path.read_bytes() for path in paths)
     assert wrong == again
-    assert wrong not in (other, right, (run / "stego.ply").read_bytes())
+    assert wrong not in (other, right, (run / "publish" / "stego.ply").read_bytes())
     heads = [data[: data.index(b"end_header")].splitlines() for data in (right, wrong)]
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
-    decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "stego.ply")
+    decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "stego.ply")
     stego = whole[whole.opacities >= 1 / 255]
     assert len(decoy) == len(stego) < len(whole)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
@@ -162,12 +164,12 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
 
 
 def test_a_sidecar_is_looked_for_beside_the_model(run: Path, tmp_path: Path) -> None:
-    (tmp_path / "stego.ply").write_bytes((run / "stego.ply").read_bytes())
+    (tmp_path / "stego.ply").write_bytes((run / "publish" / "stego.ply").read_bytes())
     with pytest.raises(WrongKeyError):
         keyss.reveal(tmp_path / "stego.ply", "the key")
-    sidecar = run / "decoder.sealed"
+    sidecar = run / "publish" / "decoder.sealed"
     whole = keyss.reveal(tmp_path / "stego.ply", "the key", decoder=sidecar)
-    stego = keyss.read_model(run / "stego.ply")
+    stego = keyss.read_model(run / "publish" / "stego.ply")
     assert torch.equal(keyss.reveal(stego, "the key", decoder=sidecar.read_bytes()).means, whole.means)
     with pytest.raises(InputError, match="another model"):
         keyss.reveal(run / "private" / "secret-1.ply", "the key", decoder=sidecar)
@@ -185,7 +187,7 @@ def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
     result = keyss.hide(folders[0], [secret], method=config, cover_model=models[0], out=out)
     assert result.sidecar is None
     assert not list(out.glob("decoder*"))
-    (tmp_path / "moved.ply").write_bytes((out / "stego.ply").read_bytes())
+    (tmp_path / "moved.ply").write_bytes((out / "publish" / "stego.ply").read_bytes())
     revealed = keyss.reveal(tmp_path / "moved.ply", "the key")
     assert torch.equal(revealed.means, keyss.reveal(result.stego, "the key").means)
     assert keyss.evaluate(out, ["the key"]) == result.metrics
@@ -202,13 +204,13 @@ def test_outputs_that_exist_are_refused_before_any_work(
 ) -> None:
     (tmp_path / "x.ply").write_text("mine")
     with pytest.raises(OutputError, match="exists"):
-        keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "x.ply")
+        keyss.reveal(run / "publish" / "stego.ply", "the key", out=tmp_path / "x.ply")
     with pytest.raises(OutputError, match="exists"):
         keyss.hide(folders[0], [Secret(folders[1], "k")], method=CONFIG, out=tmp_path)
     with pytest.raises(OutputError, match="exists"):
         keyss.fit(folders[0], out=tmp_path)
     assert (tmp_path / "x.ply").read_text() == "mine"
-    keyss.reveal(run / "stego.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
+    keyss.reveal(run / "publish" / "stego.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
     assert len(keyss.read_model(tmp_path / "x.ply"))
 
 
@@ -227,20 +229,20 @@ def test_a_full_disk_leaves_no_results_but_keeps_the_work(
     with pytest.raises(OutputError, match="No space left"):
         keyss.fit(folders[0], config=config, out=tmp_path / "run")
     left = {path.name for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    assert left == {"fit.safetensors"}
+    assert left == {"fit.safetensors", "manifest.json"}
     monkeypatch.undo()
     keyss.fit(folders[0], config=config, out=tmp_path / "run", resume=True)
     assert (tmp_path / "run" / "model.ply").exists()
-    assert not (tmp_path / "run" / "checkpoint").exists()
+    assert not (tmp_path / "run" / "private" / "checkpoint").exists()
 
 
 def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    pictures = keyss.render(run / "stego.ply", folders[0], out=tmp_path / "images")
+    pictures = keyss.render(run / "publish" / "stego.ply", folders[0], out=tmp_path / "images")
     assert sorted(p.name for p in (tmp_path / "images").iterdir()) == sorted(name for name, _ in pictures)
     name, image = pictures[0]
     read = cv2.imread(str(tmp_path / "images" / name))
     assert np.array_equal(read[:, :, ::-1], image.numpy())
-    assert len(keyss.render(run / "stego.ply", folders[0], split="all")) == 16
+    assert len(keyss.render(run / "publish" / "stego.ply", folders[0], split="all")) == 16
 
 
 def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tuple[Path, Path]) -> None:
@@ -248,12 +250,12 @@ def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tu
         facts: dict[str, Any] = msgspec.to_builtins(keyss.info(path))
         return facts
 
-    assert found(run / "stego.ply")["sh_degree"] == 3
-    sealed = found(run / "decoder.sealed")
+    assert found(run / "publish" / "stego.ply")["sh_degree"] == 3
+    sealed = found(run / "publish" / "decoder.sealed")
     assert sealed.keys() == {"kind", "path", "bytes", "key_derivation"}  # not how many secrets there are
-    assert found(run / "stego.ply").keys() == found(run / "private" / "cover.ply").keys()
+    assert found(run / "publish" / "stego.ply").keys() == found(run / "private" / "cover.ply").keys()
     assert found(folders[0])["test_views"] == 2
-    assert found(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "stego.ply"))
+    assert found(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "publish" / "stego.ply"))
     with pytest.raises(InputError, match="no such"):
         keyss.info(run / "nothing")
 
@@ -303,15 +305,15 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
     keyss.hide(cover, [Secret(secret, "the key")], method=python, width=24, out=tmp_path / "python")
     arguments = ["--cover", str(cover), "--secret", str(secret), "--width", "24", "--iterations", "2"]
     assert main(["hide", "--sidecar", *arguments, "-o", str(tmp_path / "line")]) == 0
-    for name in ("config.json", "stego.ply", "decoder.sealed"):
+    for name in ("private/config.json", "publish/stego.ply", "publish/decoder.sealed"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
-    config = json.loads((tmp_path / "line" / "config.json").read_text())["options"]
+    config = json.loads((tmp_path / "line" / "private" / "config.json").read_text())["options"]
     assert (config["fit"]["max_gaussians"], config["fit"]["iterations"]) == (2200, 2)
     assert config["warm_rate"] == 0.1
 
 
 def test_configurations_come_back_with_their_method_s_options(run: Path, tmp_path: Path) -> None:
-    config = read_config(run / "config.json")
+    config = read_config(run / "private" / "config.json")
     assert config.options == SIDECAR
     assert config.method == "learned"
     for old, new, words in (
@@ -320,7 +322,7 @@ def test_configurations_come_back_with_their_method_s_options(run: Path, tmp_pat
         ('"seed": 0', '"seed": "0"', "seed"),
         ('"version": 1', '"version": 99', "version 1, got 99"),
     ):
-        text = (run / "config.json").read_text()
+        text = (run / "private" / "config.json").read_text()
         assert old in text
         (tmp_path / "config.json").write_text(text.replace(old, new))
         if words is None:

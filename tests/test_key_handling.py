@@ -75,16 +75,16 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     with monkeypatch.context() as patch:
         patch.setattr("keyss.progress.reporter", _CtrlC)
         assert main(["hide", *scenes, *key, *size]) == 130
-    checkpoints = list(_files(run / "checkpoint"))
+    checkpoints = list(_files(run / "private" / "checkpoint"))
     assert len(checkpoints) >= 3
     assert not any(_spelt(path.read_bytes()) for path in checkpoints)
 
     assert main(["hide", *scenes, *key, *size, "--resume"]) == 0
-    stego = str(run / "stego.ply")
+    stego = str(run / "publish" / "stego.ply")
     assert main(["reveal", stego, *key, "-o", str(folder / "secret.ply")]) == 0
     assert main(["evaluate", str(run), *key, "--wrong-keys", "2"]) == 0
     assert main(["reveal", str(run / "private" / "cover.ply"), *key, "-o", str(folder / "no.ply")]) == 3
-    assert main(["info", str(run / "decoder.sealed")]) == 0
+    assert main(["info", str(run / "publish" / "decoder.sealed")]) == 0
     written = list(_files(folder))
     assert {"stego.ply", "decoder.sealed", "config.json", "metrics.json"} <= {path.name for path in written}
     assert [path for path in written if _spelt(path.read_bytes())] == []

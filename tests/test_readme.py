@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from files.scene_files import write_blender, write_nerfstudio
+from keyss.methods.learned.options import PRESETS as LEARNED_PRESETS
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
@@ -27,6 +28,16 @@ def test_the_python_example_runs(
     exec(compile(short, "README.md", "exec"), {})
     assert "100 Gaussians" in capsys.readouterr().out
     assert (tmp_path / "secret.ply").exists()
+
+
+def test_the_sizes_of_presets_are_those_there_are() -> None:
+    """Each stands there with its name, steps and Gaussians."""
+    text = " ".join(README.split())
+    for name in ("best", "quick", "paper"):
+        fit = LEARNED_PRESETS[name].fit
+        found = re.search(rf"`{name}`[^;]*? ([\d,]+)(?: steps)? and (?:at most )?([\d,]+)", text)
+        assert found is not None, name
+        assert found.groups() == (f"{fit.iterations:,}", f"{fit.max_gaussians:,}"), name
 
 
 def test_the_files_it_links_to_exist() -> None:

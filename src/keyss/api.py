@@ -5,6 +5,7 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from keyss.audit.run import audit as audit
-from keyss.core.errors import QualityError, UsageError
+from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import png_bytes
@@ -40,7 +41,10 @@ from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
+from keyss.runs.planning import Plan, check_disk, plan_hiding
 from keyss.runs.records import write_record
+from keyss.runs.revealing import RevealResult, reveal_model
+from keyss.runs.verifying import Verification, check_model, check_secret
 
 WRONG_KEYS = 32
 MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
@@ -72,6 +76,7 @@ def fit(
     config: FitConfig | None = None,
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -80,14 +85,19 @@ def fit(
 ) -> FitResult:
     """Train plain 3DGS on a scene.
 
-    `width`: photos are shrunk to it. `background`: see `load_scene`. `out` (a folder) gets `model.ply` and
-    `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
+    `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
+    `resume` goes on.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
     config = config or FitConfig()
     target = resolve_device(device)
     settings = FitRunConfig(
-        scene=path_of(scene), width=width, background=colour_of(background), config=config
+        scene=path_of(scene),
+        width=width,
+        background=colour_of(background),
+        skip_missing=skip_missing,
+        config=config,
     )
     folder = None
     if out is not None:
@@ -95,7 +105,7 @@ def fit(
         folder = RunFolder(
             out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
         )
-    loaded = as_scene(scene, width, background)
+    loaded = as_scene(scene, width, background, skip_missing=skip_missing)
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,
@@ -127,6 +137,7 @@ def hide(
     method: str | MethodOptions = "learned",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
     min_psnr: float = MIN_PSNR,
     device: Backend = "auto",
@@ -135,26 +146,22 @@ def hide(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> HideResult:
-    """Hide every secret in the cover, and measure the result on the test photos.
+    """Hide every secret in the cover, and measure the result on the test views.
 
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
-    (`LearnedOptions`, `CarryOptions`). The secrets lie encrypted in the low bits of `stego.ply`; with
-    `LearnedOptions(sidecar=True)` they are in a file `decoder.sealed`. `out` (a folder) gets these in
-    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
-    checkpoints from which `resume` goes on.
+    (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
+
+    The secrets lie encrypted in the low bits of `stego.ply`; with `LearnedOptions(sidecar=True)` they are in
+    a file `decoder.sealed`. `out` (a folder) gets these in `publish/`, and `private/` with the plain models,
+    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
 
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
     is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
-    chosen, options = _method(method)
-    if not 1 <= len(secrets) <= chosen.most_secrets:
-        raise UsageError(
-            f"expected 1 to {chosen.most_secrets} secrets for the method {chosen.name}, got {len(secrets)}"
-        )
+    chosen, options = _method(method, secrets)
     keys = [secret.key for secret in secrets]
-    _check_keys(keys)
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
     models = [cover_model, *(secret.model for secret in secrets)]
@@ -168,6 +175,7 @@ def hide(
         ),
         width=width,
         background=colour_of(background),
+        skip_missing=skip_missing,
         payloads=(),
         options=options,
     )
@@ -180,8 +188,13 @@ def hide(
     arguments = ["cover_model", *["model"] * len(secrets)]
     inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
     options = chosen.prepare(inputs, options)
+    if folder:
+        check_disk(folder.path, chosen, options, inputs)
     trains = chosen.trains or any(each.model is None for each in inputs)
-    scenes = [as_scene(source, width, background, train_pictures=trains) for source in sources]
+    scenes = [
+        as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
+        for source in sources
+    ]
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
@@ -199,13 +212,47 @@ def hide(
             for model, original, scene in zip(shown, plain, scenes, strict=True)
         )
         _check_quality(against_plain, min_psnr)
-        metrics = _measured(chosen, stego, scenes, plain, options, against_plain, target)
+        photos = tuple(each.photos for each in inputs)
+        metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
         if folder:
             payloads = tuple(each.fingerprint() for each in stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
     return HideResult(stego.gaussians, stego.sidecar, metrics)
+
+
+def plan(
+    cover: PathLike | Scene | Gaussians,
+    secrets: Sequence[Secret],
+    *,
+    method: str | MethodOptions = "learned",
+    width: int | None = None,
+    background: Background = None,
+    skip_missing: bool = False,
+    cover_model: PathLike | Gaussians | None = None,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+) -> Plan:
+    """What `hide` with these arguments will do, and what it will take: see `keyss.runs.planning`.
+
+    Refuses what `hide` would refuse before its first step, renders and trains for some seconds to time it,
+    and writes nothing. `out`: where the results would go; room for them is looked for. Raises
+    KeyssError and its children.
+    """
+    chosen, options = _method(method, secrets)
+    target = resolve_device(device)
+    sources = [cover, *(secret.scene for secret in secrets)]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    options = chosen.prepare(inputs, options)
+    if out is not None:
+        check_disk(Path(out), chosen, options, inputs)
+    scenes = [
+        as_scene(source, width, background, train_pictures=False, skip_missing=skip_missing)
+        for source in sources
+    ]
+    return plan_hiding(chosen, options, inputs, scenes, target, None if out is None else Path(out))
 
 
 def reveal(
@@ -225,23 +272,89 @@ def reveal(
     Which method hid it shows itself. `frame`: "secret" gives it in its own frame, so that its cameras fit it;
     "cover" leaves it where it was hidden, which a carried one never was. If Gaussians were lost, the others
     make up for them (`keyss.core.pruning_compensation`). `force` is for models that were quantised: it skips
-    the check that the secret belongs to this one.
+    the check that the secret belongs to this one, and takes as little of it as there is.
 
-    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
-    lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
-    opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for files that
-    are not what they should be or do not belong together.
+    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if it opens and belongs to
+    it, else what lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for
+    a key that opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for
+    files that are not what they should be or do not belong together, and where less than a tenth of the
+    secret is left. Warns (KeyssWarning) of more than a hundredth that is missing, and of a sidecar beside
+    the file that was passed over. `reveal_counted` and `verify` tell how much there is.
     """
+    found = reveal_counted(
+        stego,
+        key,
+        decoder=decoder,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
+    return found.gaussians
+
+
+def reveal_counted(
+    stego: PathLike | Gaussians,
+    key: str,
+    *,
+    decoder: PathLike | bytes | None = None,
+    frame: Frame = "secret",
+    decoy: bool = False,
+    force: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> RevealResult:
+    """`reveal`, with the number of Gaussians that were hidden and its warnings in the result."""
     target = resolve_device(device)
-    path = None if out is None else check_model_output(out, overwrite)
-    model = as_model(stego)
-    if decoder is None and not isinstance(stego, Gaussians):
-        decoder = sidecar_beside(Path(stego))
-    secret = open_file(model, key, decoder, decoy=decoy)
-    found = secret.reveal(model.to(target), frame=frame, force=force)
+    beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
+    inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
+    path = None if out is None else check_model_output(out, overwrite, inputs)
+    found = reveal_model(
+        as_model(stego),
+        key,
+        device=target,
+        decoder=decoder,
+        beside=beside,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+    )
+    if not force:
+        found.check_usable()
     if path is not None:
-        write_model(path, found)
+        write_model(path, found.gaussians)
     return found
+
+
+def verify(
+    model: PathLike | Gaussians,
+    key: str | None = None,
+    *,
+    decoder: PathLike | bytes | None = None,
+    device: Backend = "auto",
+) -> Verification:
+    """Whether a model is sound and, with a key, whether all is there that the key opens; nothing is written.
+
+    Without a key, nothing that comes back says whether something is hidden. `decoder`: see `reveal`. Raises
+    InputError for a file that is no whole and finite model or not the one the secret was hidden in,
+    WrongKeyError for a key that opens nothing, UsageError for a decoder without a key.
+    """
+    if key is None and decoder is not None:
+        raise UsageError("a sidecar is verified with its key: give `key`, or leave out `decoder`")
+    target = resolve_device(device)
+    name = "model" if isinstance(model, Gaussians) else str(model)
+    gaussians = as_model(model)
+    secret = None
+    if key is not None:
+        beside = None if isinstance(model, Gaussians) else sidecar_beside(Path(model))
+        found = reveal_model(gaussians, key, device=target, decoder=decoder, beside=beside)
+        secret = check_secret(found)
+    return Verification(name, check_model(gaussians), secret)
 
 
 def render(
@@ -251,18 +364,20 @@ def render(
     split: Split = "test",
     width: int | None = None,
     background: Background = None,
+    skip_missing: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> list[tuple[str, Tensor]]:
     """Pictures of a model from a scene's cameras: their names and uint8 images [H, W, 3].
 
-    `out` (a folder) gets a PNG per camera.
+    `width`, `background`, `skip_missing`: see `load_scene`; a photo that is left out has no camera. `out` (a
+    folder) gets a PNG per camera.
     """
     target = resolve_device(device)
     folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
-    scene = as_scene(cameras, width, background)
+    scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, views[split])
     if folder:
@@ -279,7 +394,8 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the photos; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its
+    `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -305,12 +421,19 @@ def evaluate(
     return metrics
 
 
-def _method(chosen: str | MethodOptions) -> tuple[Method, MethodOptions]:
-    """A method and its options."""
+def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
+    """A method and its options. Raises UsageError for as many secrets, or for keys, as it cannot have."""
     if isinstance(chosen, MethodOptions):
-        return registry.of_options(chosen), chosen
-    method = registry.get(chosen)
-    return method, next(iter(method.presets.values()))
+        method, options = registry.of_options(chosen), chosen
+    else:
+        method = registry.get(chosen)
+        options = next(iter(method.presets.values()))
+    if not 1 <= len(secrets) <= method.most_secrets:
+        raise UsageError(
+            f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
+        )
+    _check_keys([secret.key for secret in secrets])
+    return method, options
 
 
 def _input(
@@ -346,8 +469,8 @@ def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
         if least > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
             raise QualityError(
                 f"{who} comes out at {each.psnr:.1f} dB against its plain model, and empty pictures "
-                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and "
-                "with `resume=True` nothing is trained again"
+                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, "
+                "and with `resume=True` nothing is trained again"
             )
 
 
@@ -356,6 +479,7 @@ def _measured(
     stego: Stego,
     scenes: Sequence[Scene],
     models: Sequence[Gaussians],  # plain ones of the scenes
+    photos: tuple[bool, ...],  # whether the scenes have some
     options: MethodOptions,
     against_plain: tuple[RenderFidelity, ...],
     device: torch.device,
@@ -373,6 +497,7 @@ def _measured(
         **vars(measured),
         method=method.name,
         gaussians=len(stego.gaussians),
+        photos=photos,
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         seconds=round(stego.seconds, 1),

@@ -73,13 +73,13 @@ def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     found = audit(run, [KEY], controls=2)
     assert calls == ["speed", "leaks"]
     assert read_audit(run) == found
-    assert json.loads((run / "audit" / "audit.json").read_text())["version"] == 2
-    assert gaussians_of(found) == len(keyss.read_model(run / "stego.ply"))
+    assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 2
+    assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "stego.ply"))
     assert found.leaks == LeaksResult(((), ()))
     assert (found.controls.models, found.controls.seeds) == (2, (1, 2))
-    assert (run / "audit" / "pictures" / "a.png").exists()
-    assert not (run / "audit" / "checkpoint").exists()
-    assert KEY not in (run / "audit" / "audit.json").read_text()
+    assert (run / "private" / "audit" / "pictures" / "a.png").exists()
+    assert not (run / "private" / "checkpoint").exists()
+    assert KEY not in (run / "private" / "audit" / "audit.json").read_text()
 
 
 def test_plain_models_are_made_once_and_differ(run: Path, calls: list[str]) -> None:
@@ -96,20 +96,20 @@ def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[s
     calls.append("fail")
     with pytest.raises(Interrupted):
         audit(run, [KEY], controls=2)
-    assert not (run / "audit" / "audit.json").exists()
-    with pytest.raises(OutputError, match="--resume continues it"):
+    assert not (run / "private" / "audit" / "audit.json").exists()
+    with pytest.raises(OutputError, match="`resume=True` with the same arguments"):
         audit(run, [KEY], controls=2)
-    with pytest.raises(InputError, match="other settings"):
+    with pytest.raises(OutputError, match="controls: 2 then, 3 now"):
         audit(run, [KEY], controls=3, resume=True)
     found = audit(run, [KEY], controls=2, resume=True)
     assert calls == ["fail", "speed", "leaks", "leaks"]
     assert gaussians_of(found) > 0
-    assert (run / "audit" / "pictures" / "a.png").exists()
+    assert (run / "private" / "audit" / "pictures" / "a.png").exists()
 
 
 def test_results_are_not_replaced_by_accident(run: Path, calls: list[str]) -> None:
     audit(run, [KEY], controls=2, only=["leaks"])
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="`overwrite=True`"):
         audit(run, [KEY], controls=2)
     assert read_audit(run).speed is None
 
@@ -148,7 +148,7 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     assert found.parameters is not None
     assert set(found.parameters.distances) >= {"position", "scale", "rotation", "opacity", "joint"}
     assert all(each.original is not None for each in found.parameters.distances.values())
-    metrics, sinkhorn = json.loads((run / "metrics.json").read_text()), found.parameters.sinkhorn
+    metrics, sinkhorn = json.loads((run / "private" / "metrics.json").read_text()), found.parameters.sinkhorn
     psnrs = metrics["cover"]["psnr"] + metrics["secrets"][0]["psnr"]
     assert sinkhorn.score == pytest.approx(psnrs * (1 - sinkhorn.stego.sum))
     sizes = [len(each) for each in vars(found.parameters.two_sample).values()]
@@ -158,13 +158,13 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     assert found.images is not None
     pictures = {item.file for view in found.images.pictures for item in view.items}
     pictures |= {str(row.picture) for row in found.leaks.secrets[0]}
-    assert all((run / "audit" / name).is_file() for name in pictures)
-    page = (run / "report.html").read_text()
+    assert all((run / "private" / "audit" / name).is_file() for name in pictures)
+    page = (run / "private" / "report.html").read_text()
     assert "data:image/png" in page
     assert KEY not in page
-    (run / "report.html").unlink()
+    (run / "private" / "report.html").unlink()
     assert main(["report", str(run)]) == 0
-    assert (run / "report.html").read_text() == page
+    assert (run / "private" / "report.html").read_text() == page
 
 
 def test_the_command_names_its_parts_as_the_audit_does() -> None:

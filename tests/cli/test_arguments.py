@@ -77,6 +77,7 @@ class TestArguments:
         assert options == {
             "width": 10,
             "background": (1.0, 0.5, 0.0),
+            "skip_missing": False,
             "cover_model": Path("m.ply"),
             "device": "cpu",
             "out": Path("out"),

@@ -13,6 +13,8 @@ import pytest
 from cli.said import SMALL, Said, assert_refused, listing
 from files.scene_files import photo, save, write_colmap
 
+STEGO = "hidden/publish/stego.ply"
+
 
 def _scene_with(change: Callable[[Path], None]) -> Callable[[Path], list[object]]:
     """`fit` on a COLMAP scene after `change`."""
@@ -29,7 +31,7 @@ def _ply_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]
     """`reveal` on a stego file after `change` of its bytes."""
 
     def prepare(folder: Path) -> list[object]:
-        stego = folder / "hidden" / "stego.ply"
+        stego = folder / "hidden" / "publish" / "stego.ply"
         stego.write_bytes(change(stego.read_bytes()))
         return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
 
@@ -38,9 +40,9 @@ def _ply_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]
 
 def _decoder_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
     def prepare(folder: Path) -> list[object]:
-        decoder = folder / "hidden" / "decoder.sealed"
+        decoder = folder / "hidden" / "publish" / "decoder.sealed"
         decoder.write_bytes(change(decoder.read_bytes()))
-        stego = folder / "hidden" / "stego.ply"
+        stego = folder / "hidden" / "publish" / "stego.ply"
         return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
 
     return prepare
@@ -64,8 +66,8 @@ def _with_count(count: str) -> Callable[[bytes], bytes]:
 
 
 def _other_model(folder: Path) -> list[object]:
-    shutil.copy(folder / "hidden" / "private" / "secret-1.ply", folder / "hidden" / "stego.ply")
-    stego = folder / "hidden" / "stego.ply"
+    shutil.copy(folder / "hidden" / "private" / "secret-1.ply", folder / "hidden" / "publish" / "stego.ply")
+    stego = folder / "hidden" / "publish" / "stego.ply"
     return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
 
 
@@ -105,7 +107,7 @@ def _spaced_key(folder: Path) -> Path:
 
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
-    "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden", "-o", f / "out"]),
+    "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
     "truncated points": (4, "points3D", _scene_with(lambda s: _keep(s / "sparse/0/points3D.bin", 40))),
     "image missing": (4, "01.png", _scene_with(lambda s: (s / "images/01.png").unlink())),
     "image of another size": (
@@ -122,7 +124,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
     "key file empty": (4, "keyss keygen", _empty_key),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
-    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / "hidden/stego.ply", "-o", f / "s.ply"]),
+    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / STEGO, "-o", f / "s.ply"]),
     "header truncated": (4, "stego.ply", _ply_with(lambda data: data[:100])),
     "data truncated": (4, "stego.ply", _ply_with(lambda data: data[:-1])),
     "negative count": (4, "stego.ply", _ply_with(_with_count("-3"))),
@@ -142,17 +144,17 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         "--overwrite",
         lambda f: [
             "reveal",
-            f / "hidden/stego.ply",
+            f / STEGO,
             "--key-file",
             f / "key.txt",
             "-o",
-            f / "hidden/stego.ply",
+            f / STEGO,
         ],
     ),
     "folder of the file missing": (
         5,
         "nowhere",
-        lambda f: ["reveal", f / "hidden/stego.ply", "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
+        lambda f: ["reveal", f / STEGO, "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
     ),
     "evaluate without a run": (
         4,
@@ -208,9 +210,9 @@ def test_a_full_disk_is_a_line_and_leaves_nothing(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("keyss.files.atomic.os.fsync", full)
-    arguments = [world / "hidden" / "stego.ply", "--key-file", world / "key.txt"]
+    arguments = [world / "hidden" / "publish" / "stego.ply", "--key-file", world / "key.txt"]
     assert_refused(keyss("reveal", *arguments, "-o", tmp_path / "secret.ply"), 5, "No space left")
-    arguments = [world / "hidden" / "stego.ply", "--cameras", world / "a"]
+    arguments = [world / "hidden" / "publish" / "stego.ply", "--cameras", world / "a"]
     assert_refused(keyss("render", *arguments, "-o", tmp_path / "images"), 5, "No space left")
     assert listing(tmp_path) == {}
 

@@ -52,6 +52,15 @@ class TestHelp:
             assert f"--preset {{{','.join(method.presets)}}}" in said
             assert f"(default: {next(iter(method.presets))})" in said
 
+    def test_says_what_the_presets_come_to(self, keyss: Callable[..., Said]) -> None:
+        presets = {("fit",): FIT_PRESETS}
+        for name, method in registry.METHODS.items():
+            presets["hide", "--method", name] = {each: own.fit for each, own in method.presets.items()}
+        for command, fits in presets.items():
+            said = "".join(keyss(*command, "--help").out.replace("│", " ").split())
+            for name, fit in fits.items():
+                assert f"{name}{fit.iterations:,}and{fit.max_gaussians:,}" in said
+
     @pytest.mark.parametrize("method", ["learned", "carry"])
     def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:
         """Names, defaults and sentences of all options; `hide_METHOD_help.txt` is what is meant."""

@@ -26,23 +26,24 @@ class TestNumbers:
     def test_a_row_for_each_and_what_the_method_adds(self) -> None:
         rows = self.table(METRICS)
         assert rows[:4] == [
-            ["against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians"],
+            ["on test views", "PSNR", "SSIM", "baseline", "loss", "Gaussians"],
             ["cover", "30.00", "0.500", "30.50", "0.50", "1,234"],
             ["secret", "20.00", "0.250", "567"],
-            ["the stego cover, against the secret", "9.00"],
+            ["chance level of the secret", "9.00"],
         ]
         assert rows[-2:] == [["carriers: 1,000"], ["bits per gaussian: 568, 600"]]
 
     def test_columns_that_nothing_fills_are_left_out(self) -> None:
-        rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,)), details={}))
-        assert rows[0] == ["against the test photos", "PSNR", "SSIM", "Gaussians"]
+        rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)), details={}))
+        assert rows[0] == ["on test views", "PSNR", "SSIM", "Gaussians"]
         assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
 
     def test_wrong_keys_where_there_is_a_decoder(self) -> None:
         two = replace(
             METRICS,
             secrets=METRICS.secrets * 2,
-            baseline=BaselineQuality(None, (None, None)),
+            baseline=BaselineQuality(None, (None, None), (None, None, None)),
+            photos=(True, True, True),
             secret_gaussians=(5, 6),
             chance_level=(9.0, 8.0),
             wrong_key=WrongKeys(
@@ -56,6 +57,30 @@ class TestNumbers:
             ["the worst of them", "27.00"],
             ["the one nearest to the secret 1", "9.50"],
             ["the one nearest to the secret 2", "7.50"],
-            ["the stego cover, against the secret 1", "9.00"],
-            ["the stego cover, against the secret 2", "8.00"],
+            ["chance level of the secret 1", "9.00"],
+            ["chance level of the secret 2", "8.00"],
         ]
+
+    def test_what_the_numbers_are_compared_with_is_said(self) -> None:
+        rows = self.table(METRICS)
+        assert ["Test views: photos that were not trained on. PSNR, baseline and loss in dB."] in rows
+        assert any(
+            "plain model (3DGS with nothing hidden), which has as many Gaussians" in row[0] for row in rows
+        )
+        assert any(row[0].startswith("Chance level: the stego model itself") for row in rows)
+        alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
+        assert not any(row[0].startswith("Baseline:") for row in self.table(alone))
+
+    def test_renders_of_models_are_not_called_photos(self) -> None:
+        rows = self.table(replace(METRICS, photos=(False, False)))
+        assert not any("photo" in cell for row in rows for cell in row if "there are no photos" not in cell)
+        assert any("8-bit renders of the given models" in row[0] for row in rows)
+        (line,) = (row[0] for row in self.table(replace(METRICS, photos=(True, False))) if "Test" in row[0])
+        assert "photos that were not trained on; for secret 8-bit renders of the given model" in line
+
+    def test_a_baseline_of_another_size_has_its_number_of_gaussians_beside_it(self) -> None:
+        baseline = BaselineQuality(METRICS.baseline.cover, METRICS.baseline.secrets, (152_746, None))
+        rows = self.table(replace(METRICS, baseline=baseline))
+        assert rows[0][-2:] == ["Gaussians", "baseline's"]
+        assert rows[1][-2:] == ["1,234", "152,746"]
+        assert not any("as many" in cell for row in rows for cell in row)

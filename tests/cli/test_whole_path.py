@@ -14,13 +14,13 @@ from keyss.files.ply import read_ply
 class TestTheWholePath:
     def test_hide_left_its_results(self, world: Path) -> None:
         names = {path.name for path in (world / "hidden").iterdir()}
-        assert names == {"stego.ply", "decoder.sealed", "metrics.json", "config.json", "private"}
+        assert names == {"publish", "private"}
 
     def test_reveal_render_evaluate_info(
         self, keyss: Callable[..., Said], world: Path, tmp_path: Path
     ) -> None:
         secret, images, key = tmp_path / "secret.ply", tmp_path / "images", world / "key.txt"
-        said = keyss("reveal", world / "hidden" / "stego.ply", "--key-file", key, "-o", secret)
+        said = keyss("reveal", world / "hidden" / "publish" / "stego.ply", "--key-file", key, "-o", secret)
         left = len(read_ply(secret))  # without the cover's, which nothing draws
         assert 0 < left < 100
         assert said == Said(0, f"{secret}: {left} Gaussians\n", "")
@@ -34,7 +34,7 @@ class TestTheWholePath:
         said = keyss("evaluate", run, "--key-file", key, "--wrong-keys", 2)
         assert said.status == 0
         assert "2 wrong keys, against the cover" in said.out
-        metrics = json.loads((run / "metrics.json").read_text())
+        metrics = json.loads((run / "private" / "metrics.json").read_text())
         assert metrics["wrong_key"]["keys"] == 2
         assert f"{metrics['secrets'][0]['psnr']:.2f}" in said.out
 
@@ -52,13 +52,14 @@ class TestTheWholePath:
         assert said.status == 0
         assert "fit a: 20 steps" in said.err
         assert str(out / "model.ply") in said.out
-        assert json.loads((out / "metrics.json").read_text())["width"] == 8
+        assert json.loads((out / "private" / "metrics.json").read_text())["width"] == 8
 
     def test_wrong_key_exits_with_3_and_writes_nothing(
         self, keyss: Callable[..., Said], world: Path, tmp_path: Path
     ) -> None:
         out = tmp_path / "secret.ply"
-        arguments = ["reveal", world / "hidden" / "stego.ply", "--key-file", world / "wrong.txt", "-o", out]
+        stego = world / "hidden" / "publish" / "stego.ply"
+        arguments = ["reveal", stego, "--key-file", world / "wrong.txt", "-o", out]
         assert_refused(keyss(*arguments), 3, "opens nothing")
         assert listing(tmp_path) == {}
 
@@ -71,7 +72,7 @@ class TestTheWholePath:
         for name in "ab":
             (tmp_path / f"{name}.txt").chmod(0o600)
             key, out = tmp_path / f"{name}.txt", tmp_path / f"{name}.ply"
-            stego = world / "hidden" / "stego.ply"
+            stego = world / "hidden" / "publish" / "stego.ply"
             said.append(keyss("reveal", stego, "--key-file", key, "--decoy", "-o", out))
         right, wrong = said
         assert right.status == 0

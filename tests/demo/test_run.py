@@ -38,11 +38,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, demo.DemoResult
 def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResult]) -> None:
     out, result = run
     assert {path.name for path in out.iterdir()} == {
-        *("stego.ply", "secret.ply", "decoder.sealed", "metrics.json", "config.json", "private"),
-        *("comparison.png", "key.txt", "scenes"),
+        *("publish", "private", "scenes", "secret.ply", "comparison.png", "key.txt"),
     }
     assert result.refused == len(demo.WRONG_KEYS)
-    assert result.metrics == read_record(out / "metrics.json", HideMetrics)
+    assert result.metrics == read_record(out / "private" / "metrics.json", HideMetrics)
     assert (out / "key.txt").read_text() == "demo-key-3\n"
     with Image.open(out / "comparison.png") as picture:
         assert picture.size[0] > 5 * 240
@@ -50,7 +49,7 @@ def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResu
 
 def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
     out, _ = run
-    verbs.reveal(out / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
+    verbs.reveal(out / "publish" / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
     assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
 
 
@@ -58,7 +57,7 @@ def test_one_seed_gives_the_same_bytes_in_another_place(
     run: tuple[Path, demo.DemoResult], tmp_path: Path
 ) -> None:
     demo.run_demo(tmp_path, seed=3, **SMALL)
-    for name in ("stego.ply", "secret.ply", "decoder.sealed"):
+    for name in ("publish/stego.ply", "publish/decoder.sealed", "secret.ply"):
         assert (tmp_path / name).read_bytes() == (run[0] / name).read_bytes()
 
 
@@ -67,7 +66,7 @@ def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
 ) -> None:
     (tmp_path / "stego.ply").write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="`overwrite=True`"):
         demo.run_demo(tmp_path, **SMALL)
     assert (tmp_path / "stego.ply").read_text() == "old"
 
@@ -82,7 +81,7 @@ def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
     with pytest.raises(KeyboardInterrupt) as caught:
         demo.run_demo(tmp_path, overwrite=True, **SMALL)
     assert not isinstance(caught.value, Interrupted)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", "stego.ply"}
     with pytest.raises(KeyboardInterrupt):
         demo.run_demo(tmp_path / "new", **SMALL)
     assert not (tmp_path / "new").exists()

@@ -153,7 +153,7 @@ def test_missing_photos_and_wrong_sizes_are_named(tmp_path: Path) -> None:
     write_json(tmp_path / "transforms_train.json", meta | {"w": 24, "h": 16})
     assert load_scene(tmp_path).train[0].camera.K[0, 0] == pytest.approx(6 / math.tan(0.35))
     (tmp_path / "train" / "r_1.png").unlink()
-    with pytest.raises(InputError, match="r_1: expected an image"):
+    with pytest.raises(InputError, match="1 of 2 photos are missing: train/r_1;"):
         load_scene(tmp_path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 import time
 from pathlib import Path
@@ -21,8 +22,10 @@ from files.scene_files import (
     point_bytes,
     save,
     write_colmap,
+    write_nerfstudio,
 )
 from keyss.core import InputError
+from keyss.core.errors import KeyssWarning
 from keyss.files import load_scene
 from keyss.files.colmap import read_colmap
 
@@ -35,7 +38,7 @@ def as_text(binary: Path, text: Path) -> None:
     pycolmap.Reconstruction(binary).write_text(text)
 
 
-@pytest.mark.parametrize("model", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
 def test_the_model_is_found_in_each_of_its_places(tmp_path: Path, model: str) -> None:
     scene = load_scene(write_colmap(tmp_path / "kitchen", model=model))
     assert scene.name == "kitchen"
@@ -66,6 +69,7 @@ def test_agrees_with_pycolmap_on_a_real_scene(real_data: Path, tmp_path: Path) -
     np.testing.assert_array_equal(layout.points.rgb, [p.color for p in points])
 
     as_text(real_data / "fox" / "sparse" / "0", tmp_path / "fox" / "sparse" / "0")
+    (tmp_path / "fox" / "images").symlink_to(real_data / "fox" / "images")
     text = read_colmap(tmp_path / "fox")
     np.testing.assert_array_equal(text.points.xyz, layout.points.xyz)
     np.testing.assert_array_equal(text.points.rgb, layout.points.rgb)
@@ -118,8 +122,67 @@ def test_text_models_with_comments_empty_lines_and_spaces_in_names(tmp_path: Pat
 
 def test_no_points_and_no_observations(tmp_path: Path) -> None:
     images = counted(*(image_bytes(i, f"0{i}.png", observations=0) for i in range(2)))
-    scene = load_scene(write_colmap(tmp_path, images=images, points3D=counted()))
+    with pytest.warns(KeyssWarning, match=r"points3D\.bin: there are no points"):
+        scene = load_scene(write_colmap(tmp_path, images=images, points3D=counted()))
     assert scene.points.shape == scene.colors.shape == (0, 3)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
+    model = write_colmap(tmp_path / "scene") / "sparse" / "0"
+    if suffix == ".txt":
+        as_text(model, tmp_path / "text")
+        for name in BINARIES:
+            (model / name).unlink()
+        for path in (tmp_path / "text").iterdir():
+            path.rename(model / path.name)
+    (model / f"points3D{suffix}").unlink()
+    with pytest.warns(KeyssWarning, match=rf"points3D\{suffix}: there are no points; .* random ones"):
+        scene = load_scene(tmp_path / "scene")
+    assert scene.points.shape == scene.colors.shape == (0, 3)
+    assert len(scene.views) == 3
+
+
+def shrunk(folder: Path, factor: int) -> None:
+    """Photos as Mip-NeRF 360 has them: `images_2` beside `images`, rounded to whole pixels."""
+    for i in range(3):
+        width, height = round(48 / factor), round(32 / factor)
+        save(folder / f"images_{factor}" / f"{i:02}.png", photo(10 * factor + i, size=(width, height)))
+
+
+def test_shrunk_photos_stand_in_for_missing_ones_the_largest_first(tmp_path: Path) -> None:
+    cameras = counted(camera_bytes(width=48, height=32, params=(40, 44, 25, 15)))
+    folder = write_colmap(tmp_path, cameras=cameras)
+    shutil.rmtree(folder / "images")
+    for factor in (8, 4, 2):
+        shrunk(folder, factor)
+        view = load_scene(folder).train[0]
+        np.testing.assert_array_equal(view.image, photo(10 * factor + 1, size=(48 // factor, 32 // factor)))
+        np.testing.assert_allclose(
+            view.camera.K, np.array([[40, 0, 25], [0, 44, 15], [0, 0, factor]]) / factor, rtol=1e-6
+        )
+        assert view.camera.name == "01.png"
+    for i in range(3):
+        save(folder / "images" / f"{i:02}.png", photo(i, size=(48, 32)))
+    assert load_scene(folder).train[0].camera.width == 48
+
+
+def test_shrunk_photos_do_not_fill_gaps(tmp_path: Path) -> None:
+    folder = write_colmap(
+        tmp_path, cameras=counted(camera_bytes(width=48, height=32, params=(40, 44, 25, 15)))
+    )
+    shrunk(folder, 2)
+    (folder / "images" / "01.png").unlink()
+    with pytest.raises(InputError, match=r"/images: 1 of 3 photos are missing: 01\.png"):
+        load_scene(folder)
+
+
+def test_nerfstudios_json_goes_before_the_model_that_it_was_made_from(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path)
+    write_colmap(tmp_path, model="colmap/sparse/0")
+    assert load_scene(tmp_path).test[0].camera.name == "images/frame_00000.png"
+    (tmp_path / "transforms.json").unlink()
+    assert load_scene(tmp_path).test[0].camera.name == "00.png"
 
 
 @pytest.mark.parametrize("name", BINARIES)
@@ -206,7 +269,7 @@ def two_images(*last: bytes) -> bytes:
         ({"images": two_images(image_bytes(2, "x" * 5000))}, "image name of up to 4095 bytes"),
         (
             {"images": two_images(image_bytes(2, "missing.png"))},
-            r"missing\.png: expected an image, but there is no",
+            r"1 of 2 photos are missing: missing\.png;",
         ),
         ({"images": two_images(image_bytes(2, "../images/01.png"))}, "inside images/"),
         ({"images": two_images(image_bytes(2, "a\\..\\01.png"))}, "inside images/"),
@@ -266,8 +329,7 @@ def test_broken_text_names_the_line(tmp_path: Path, name: str, text: str, messag
         read_colmap(tmp_path / "scene")
 
 
-@pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
-def test_missing_model_files_are_named(tmp_path: Path, name: str) -> None:
-    (write_colmap(tmp_path) / "sparse" / "0" / name).unlink()
-    with pytest.raises(InputError, match=f"{name}: expected a file"):
+def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
+    (write_colmap(tmp_path) / "sparse" / "0" / "images.bin").unlink()
+    with pytest.raises(InputError, match=r"images\.bin: expected a file"):
         load_scene(tmp_path)

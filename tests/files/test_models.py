@@ -66,16 +66,26 @@ def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
         read_model(path)
 
 
-@pytest.mark.parametrize("data", [b"", b"pl", b"\x89PNG\r\n\x1a\n"])
-def test_unknown_content_is_told_what_is_supported(tmp_path: Path, data: bytes) -> None:
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (b"", "an empty file"),
+        (b"pl", "a file of no kind that keyss knows"),
+        (b"\x89PNG\r\n", "a picture; a scene is"),
+    ],
+)
+def test_unknown_content_is_told_what_is_supported(tmp_path: Path, data: bytes, found: str) -> None:
     (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(InputError, match=r"expected a 3DGS model \(\.ply\), but it begins with b"):
+    with pytest.raises(InputError, match=rf"expected a 3DGS model \(\.ply\), found {found}"):
         read_model(tmp_path / "a.ply")
 
 
 def test_what_is_no_file(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "missing.ply"):
-        with pytest.raises(InputError, match=r"expected a 3DGS model \(\.ply\), but there is no such file"):
+    with pytest.raises(InputError, match=r"expected a 3DGS model \(\.ply\), but there is no such file"):
+        read_model(tmp_path / "missing.ply")
+    (tmp_path / "folder.ply").mkdir()
+    for path in (tmp_path, tmp_path / "folder.ply"):
+        with pytest.raises(InputError, match=r"expected the file of a 3DGS model \(\.ply\), found a folder"):
             read_model(path)
 
 

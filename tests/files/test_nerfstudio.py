@@ -6,15 +6,19 @@ import copy
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from files.scene_files import frames, mutations, photo, save, write_json, write_nerfstudio
 from keyss.core import InputError
+from keyss.core.errors import KeyssWarning
 from keyss.files import load_scene
 from keyss.files.lens import undistortion
 from keyss.files.ply_table import read_point_cloud
@@ -94,6 +98,27 @@ def test_splits(tmp_path: Path) -> None:
     assert names(write_nerfstudio(tmp_path, 4, test_filenames=path[:3])) == (["3"], ["0", "1", "2"])
 
 
+@pytest.mark.parametrize("others", [{}, {"test_filenames": [], "val_filenames": []}])
+def test_every_eighth_photo_is_for_testing_where_all_are_for_training(
+    tmp_path: Path, others: dict[str, object]
+) -> None:
+    everything = [f"images/frame_{i:05}.png" for i in range(10)]
+    folder = write_nerfstudio(tmp_path, 10, train_filenames=everything, **others)
+    with pytest.warns(KeyssWarning, match="`train_filenames` has all photos; every 8th"):
+        assert names(folder) == ([*"1234567", "9"], ["0", "8"])
+
+
+def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
+    path = [f"images/frame_{i:05}.png" for i in range(6)]
+    folder = write_nerfstudio(tmp_path, 6, train_filenames=path[:4])
+    for gone in (path[0], path[4]):
+        (folder / gone).unlink()
+    with pytest.warns(KeyssWarning, match=r"2 of 6 .* images/frame_00000.png, images/frame_00004.png$"):
+        layout = read_nerfstudio(folder, skip_missing=True)
+    assert [p.name for p in layout.train] == path[1:4]
+    assert [p.name for p in layout.test] == path[5:]
+
+
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
@@ -102,7 +127,10 @@ def test_splits(tmp_path: Path) -> None:
             r"Expected `array.*`, got `str` - at `\$\.train_filenames`",
         ),
         ({"train_filenames": [3]}, r"Expected `str`, got `int` - at `\$\.train_filenames\[0\]`"),
-        ({"train_filenames": ["images/none.png"]}, "none.png: expected an image"),
+        (
+            {"train_filenames": ["images/none.png"]},
+            "expected lists of frames, found 'images/none.png', which",
+        ),
         (
             {"train_filenames": ["images/frame_00000.png"], "test_filenames": ["images/frame_00000.png"]},
             "found 'images/frame_00000.png' in both",
@@ -203,6 +231,40 @@ def test_junk_anywhere_gives_an_input_error_or_a_scene(tmp_path: Path) -> None:
         except InputError:
             outcomes.add("refused")
     assert outcomes == {"refused", "read"}
+
+
+NUMBERS = st.one_of(
+    st.sampled_from([0, -1, 1, 2**31, 10**400, 1e-320, 1e308, -1e308, 1e15, 1e16, 6.5, 1e-9]),
+    st.integers(),
+    st.floats(allow_nan=False, allow_infinity=False),
+)
+FIELDS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2"]
+
+
+@given(
+    fields=st.dictionaries(st.sampled_from(FIELDS), NUMBERS, min_size=1, max_size=3),
+    entries=st.dictionaries(st.tuples(st.integers(0, 3), st.integers(0, 3)), NUMBERS, max_size=2),
+    fisheye=st.booleans(),
+)
+@settings(max_examples=80, deadline=None, database=None)
+def test_any_numbers_give_an_input_error_or_a_sound_scene(
+    tmp_path_factory: pytest.TempPathFactory,
+    fields: dict[str, float],
+    entries: dict[tuple[int, int], float],
+    fisheye: bool,
+) -> None:
+    folder = write_nerfstudio(tmp_path_factory.mktemp("scene"), 2, is_fisheye=fisheye, **fields)
+    meta = json.loads((folder / "transforms.json").read_text())
+    for (row, column), value in entries.items():
+        meta["frames"][1]["transform_matrix"][row][column] = value
+    write_json(folder / "transforms.json", meta)
+    with suppress(InputError):
+        for view in load_scene(folder).views:
+            rotation = view.camera.viewmat[:3, :3]
+            np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+            assert view.camera.viewmat.isfinite().all()
+            assert view.camera.K.isfinite().all()
+            assert view.image.shape == (view.camera.height, view.camera.width, 3)
 
 
 XYZ = np.array([[0, 1, 2], [3, 4, 5.5], [-1, 0, 7]], np.float32)

@@ -6,6 +6,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,6 +25,7 @@ from files.scene_files import (
     write_nerfstudio,
 )
 from keyss.core import InputError, UsageError
+from keyss.core.errors import KeyssWarning
 from keyss.files import load_scene
 
 WRITERS = {"colmap": write_colmap, "blender": write_blender, "nerfstudio": write_nerfstudio}
@@ -71,7 +73,10 @@ def test_unknown_layouts_are_told_what_is_known(tmp_path: Path) -> None:
     (tmp_path / "video.mp4").touch()
     with pytest.raises(InputError, match=f"found video.mp4. {known}"):
         load_scene(tmp_path)
-    with pytest.raises(InputError, match=f"found a file. {known}"):
+    with pytest.raises(InputError, match=f"found an empty file. {known}"):
+        load_scene(tmp_path / "video.mp4")
+    (tmp_path / "video.mp4").write_bytes(b"\0\0\0\x20ftypisom")
+    with pytest.raises(InputError, match=f"found a video; a scene is a folder of photos .*. {known}"):
         load_scene(tmp_path / "video.mp4")
     with pytest.raises(InputError, match=f"found nothing there. {known}"):
         load_scene(tmp_path / "none")
@@ -146,6 +151,26 @@ def test_grey_palette_and_deep_photos_become_rgb(tmp_path: Path) -> None:
     assert np.array_equal(with_photo(tmp_path, one_bit), np.where(rgb > 99, 255, 0))
 
 
+def test_deep_colour_photos_lose_only_what_8_bits_cannot_hold(tmp_path: Path) -> None:
+    deep = np.random.default_rng(0).integers(0, 65536, (HEIGHT, WIDTH, 3)).astype(np.uint16)
+    write_colmap(tmp_path)
+    cv2.imwrite(str(tmp_path / "images" / "01.png"), deep[:, :, ::-1])
+    assert np.abs(load_scene(tmp_path).train[0].image.numpy() - deep / 257).max() < 1
+
+
+@pytest.mark.parametrize(
+    "pixels", [np.full((HEIGHT, WIDTH), 0.5, np.float32), np.full((HEIGHT, WIDTH), 70_000)]
+)
+def test_photos_of_unknown_range_are_refused(tmp_path: Path, pixels: np.ndarray) -> None:
+    images = counted(image_bytes(1, "00.png"), image_bytes(2, "b.tif"))
+    write_colmap(tmp_path, images=images)
+    Image.fromarray(pixels.astype(np.int32) if pixels.dtype == int else pixels).save(
+        tmp_path / "images" / "b.tif"
+    )
+    with pytest.raises(InputError, match=r"b\.tif: .* its pixels have 32 bits"):
+        load_scene(tmp_path)
+
+
 def test_cmyk_jpegs_are_read(tmp_path: Path) -> None:
     images = counted(image_bytes(1, "00.png"), image_bytes(2, "b.jpg"))
     write_colmap(tmp_path, images=images)
@@ -157,6 +182,58 @@ def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6  # turn by 90 degrees
     assert np.array_equal(with_photo(tmp_path, Image.fromarray(photo(1)), exif=exif), photo(1))
+
+
+def test_a_photo_that_only_its_exif_data_turn_is_explained(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    write_colmap(tmp_path, cameras=counted(camera_bytes(width=HEIGHT, height=WIDTH)))
+    for path in (tmp_path / "images").iterdir():
+        Image.fromarray(photo(1)).save(path, exif=exif)
+    with pytest.raises(InputError, match=r"camera, 8x12 .*found 12x8; its EXIF data say .* turn its pixels"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_missing_photos_are_refused_or_left_out(tmp_path: Path, layout: str) -> None:
+    WRITERS[layout](tmp_path, count=10)
+    train = load_scene(tmp_path).train
+    folder = tmp_path / "images" if layout == "colmap" else tmp_path
+    for view in (train[0], train[-1]):
+        (folder / view.camera.name).unlink()
+    gone = [
+        view.camera.name.removesuffix(".png" if layout == "blender" else "") for view in (train[0], train[-1])
+    ]
+    message = f"2 of 10 photos are missing: {gone[0]}, {gone[1]}; .*`skip_missing=True`"
+    with pytest.raises(InputError, match=message):
+        load_scene(tmp_path)
+    with pytest.warns(KeyssWarning, match=f"2 of 10 photos are missing and left out: {gone[0]}, {gone[1]}$"):
+        left = load_scene(tmp_path, skip_missing=True)
+    names = {view.camera.name for view in left.views}
+    assert not names & {train[0].camera.name, train[-1].camera.name}
+    assert len(left.train) + len(left.test) == (18 if layout == "blender" else 8)
+    poses = {view.camera.name: view for view in train}
+    for view in left.train:
+        if view.camera.name in poses:
+            assert torch.equal(view.camera.viewmat, poses[view.camera.name].camera.viewmat)
+            assert torch.equal(view.image, poses[view.camera.name].image)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_a_scene_without_any_photo_is_refused_in_any_case(tmp_path: Path, layout: str) -> None:
+    WRITERS[layout](tmp_path, count=7)
+    for path in tmp_path.rglob("*.png"):
+        path.unlink()
+    with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more; put"):
+        load_scene(tmp_path)
+    with pytest.raises(InputError, match="all of its 7 photos are missing"):
+        load_scene(tmp_path, skip_missing=True)
+
+
+def test_an_empty_photo_is_called_that(tmp_path: Path) -> None:
+    (write_colmap(tmp_path) / "images" / "01.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"01\.png: expected an image .*, found an empty file"):
+        load_scene(tmp_path, skip_missing=True)
 
 
 def test_broken_photos_are_named(tmp_path: Path) -> None:

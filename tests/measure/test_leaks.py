@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 
 import pytest
@@ -23,10 +23,12 @@ from keyss.measure.leaks.attacks import (
     with_the_key,
 )
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
+from keyss.measure.leaks.scores import scores
 from keyss.methods.learned.attacks import known_remaps as learned_attacks
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.opacity_band import OpacityBand, hidden_logits, opacity_remap
 from keyss.methods.learned.payload import HiddenSecret
+from keyss.rendering import render
 from tiny_scenes import random_gaussians, tiny_scene
 
 Rows = dict[str, AttackResult]
@@ -160,6 +162,26 @@ def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_phot
         assert picture.shape == (30, 3 * 40 + 2 * 4, 3)
         assert torch.equal(picture[:, -40:], SECRET.test[0].image)
         assert torch.equal(picture, same[name])
+
+
+def test_the_picture_shows_the_variant_that_is_judged() -> None:
+    """Of two, the one with the secret's shapes, and not the haze, whichever comes first."""
+    camera = FRAME.apply_camera(SECRET.test[0].camera)
+    image = render(HIDDEN, camera, SECRET.background).clamp(0, 1)
+    planted = {"shapes": HIDDEN, "haze": random_gaussians(1500, seed=7)}
+    for order in (["shapes", "haze"], ["haze", "shapes"]):
+
+        def show(model: Gaussians, order: list[str] = order) -> Iterator[tuple[str, Gaussians]]:
+            return ((name, model if model is PLAINS[0] else planted[name]) for name in order)
+
+        attack = Attack("planted", "", {}, show)
+        (row,), pictures = look_for_secret(_plain(5), PLAINS[:1], SECRET, FRAME, [attack])
+        assert row.best == "shapes"
+        picture = pictures["planted"][:, :40].float() / 255
+        assert float((picture - image).abs().max()) < 0.01
+        assert 1 < row.best_leak.evidence() <= row.leak.evidence()
+        views = [replace(view, camera=FRAME.apply_camera(view.camera)) for view in SECRET.test]
+        assert row.best_leak == scores(HIDDEN, views, SECRET.background) - row.control
 
 
 def _decoder(conditioning: str) -> HiddenSecret:

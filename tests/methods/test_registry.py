@@ -120,7 +120,7 @@ def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
     assert secret_quality.psnr == pytest.approx(plain.psnr, abs=1e-3)
     assert result.metrics.details == {"floats": 60 * 14}
     assert keyss.evaluate(tmp_path / "run", [KEY]) == result.metrics
-    revealed = keyss.reveal(tmp_path / "run" / "stego.ply", KEY)
+    revealed = keyss.reveal(tmp_path / "run" / "publish" / "stego.ply", KEY)
     assert torch.equal(revealed.means, random_gaussians(60, sh_degree=0).means)
     with pytest.raises(WrongKeyError):
         keyss.reveal(result.stego, "wrong")
@@ -152,7 +152,7 @@ def test_from_the_command_line(
     assert "expected at most 59" in capsys.readouterr().err
     assert main([*hide, "--width", "24", "--limit", "60", "-o", run]) == 0
     assert "floats: 840" in capsys.readouterr().out
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    config = json.loads((tmp_path / "run" / "private" / "config.json").read_text())
     assert (config["method"], config["options"]["most"]) == ("whole", 60)
     assert main(["evaluate", run]) == 0
     assert main(["reveal", f"{run}/stego.ply", "-o", str(tmp_path / "revealed.ply")]) == 0

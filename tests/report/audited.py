@@ -62,14 +62,14 @@ def _few_changes() -> list[Change]:
 
 def found_in(run: Path) -> dict[str, Any]:
     """The JSON of a run's audit, to be changed."""
-    data: dict[str, Any] = json.loads((run / "audit" / "audit.json").read_bytes())
+    data: dict[str, Any] = json.loads((run / "private" / "audit" / "audit.json").read_bytes())
     return data
 
 
 def run_with(run: Path, folder: Path, data: object) -> Path:
     """A copy of a run's audit in a new folder, with other JSON."""
-    shutil.copytree(run / "audit", folder / "audit", dirs_exist_ok=True)
-    (folder / "audit" / "audit.json").write_text(json.dumps(data))
+    shutil.copytree(run / "private" / "audit", folder / "private" / "audit", dirs_exist_ok=True)
+    (folder / "private" / "audit" / "audit.json").write_text(json.dumps(data))
     return folder
 
 

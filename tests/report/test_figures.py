@@ -70,7 +70,7 @@ def test_figures_are_part_of_the_page(draw: Callable[[], Markup]) -> None:
     assert "style" not in page.tags
     assert page.loads() == []
     (label,) = page.values("aria-label")
-    assert HOSTILE in label or "published 0.50" in label
+    assert HOSTILE in label or "stego model 0.50" in label
     ids = page.values("id")
     referred = re.findall(r"url\(#([^)]*)\)", figure) + [link[1:] for link in page.values("xlink:href")]
     assert set(referred) == set(ids)

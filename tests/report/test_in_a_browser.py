@@ -34,8 +34,8 @@ def report(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = found_in(run_folder)
     run = run_with(run_folder, tmp_path_factory.mktemp("coloured"), data)
     items = {item["label"]: item["file"] for item in data["images"]["pictures"][0]["items"]}
-    for label, colour in {"photo": RED, "published": BLUE, "plain 3DGS": GREEN}.items():
-        Image.new("RGB", (40, 30), colour).save(run / "audit" / items[label])
+    for label, colour in {"photo": RED, "stego model": BLUE, "plain model": GREEN}.items():
+        Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / items[label])
     return write_report(run)
 
 
@@ -112,18 +112,18 @@ def test_the_slider_moves_with_the_mouse(page: playwright.Page) -> None:
 
 
 def test_either_side_can_show_any_picture(page: playwright.Page) -> None:
-    choose(page, "left", "plain 3DGS")
+    choose(page, "left", "plain model")
     assert colours(page) == (GREEN, BLUE)
     choose(page, "right", "photo")
     assert colours(page) == (GREEN, RED)
-    choose(page, "right", "plain 3DGS")
+    choose(page, "right", "plain model")
     assert colours(page) == (GREEN, GREEN)
 
 
 def test_the_difference(page: playwright.Page) -> None:
     page.locator(".choices input").first.click()
     assert colours(page)[1] == tuple(min(255, 4 * abs(a - b)) for a, b in zip(RED, BLUE, strict=True))
-    choose(page, "left", "published")
+    choose(page, "left", "stego model")
     assert page.locator(".compare").first.locator(".shot.left.right").count() == 1
 
 

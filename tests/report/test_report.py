@@ -59,7 +59,7 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def without_sealwatch(data: dict[str, Any]) -> dict[str, Any]:
     """As where it is not installed."""
-    for pair in ("published", "control"):
+    for pair in ("stego", "control"):
         data["stegexpose"][pair]["sealwatch"] = None
     data["stegexpose"]["sealwatch_missing"] = "get it with `pip install sealwatch`"
     return data
@@ -91,7 +91,7 @@ def test_what_was_hidden_where(page: Parsed, data: dict[str, Any]) -> None:
     for fact in (
         f"{data['run']['gaussians']} ",
         "40 pixels wide",
-        "2 plain 3DGS models, seeds 1, 2",
+        "2 plain models of the cover, seeds 1, 2",
         f"keyss {data['keyss']}, took ",
         "measures are within their limits.",
         "fit.iterations 20",
@@ -107,7 +107,7 @@ def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> 
     shown += [f"{data['wrong_key']['shown']['vs_secrets'][1]['max']:.2f}"]
     shown += [f"{data['leaks']['secrets'][1][0]['scores']['gradient']:.3f}"]
     shown += [f"{parameters['sinkhorn']['stego']['sum']:.4f}", f"{parameters['sinkhorn']['score']:.2f}"]
-    shown += [f"{data['stegexpose']['published']['stegexpose']['plain'][3]['rs']:.4f}"]
+    shown += [f"{data['stegexpose']['stego']['stegexpose']['plain'][3]['rs']:.4f}"]
     shown += [f"{robustness['changes'][1]['secrets'][1]['psnr']:.2f}"]
     shown += [f"{data['speed']['render'][0]['ratio']:.2f}×", "does not open", "Mean of 3 draws."]
     assert [number for number in shown if number.replace("-", "−") not in page.text] == []
@@ -127,7 +127,7 @@ def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]
 
 def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> None:
     assert page.loads() == []
-    html = (run_folder / "report.html").read_text()
+    html = (run_folder / "private" / "report.html").read_text()
     assert "@import" not in html
     assert all(url.startswith("#") for url in re.findall(r"url\(([^)]*)\)", html))
     assert set(re.findall(r"https?://[^\"' <]*", html)) == {
@@ -171,17 +171,17 @@ def test_an_empty_audit_says_how_to_fill_it(run_folder: Path, data: dict[str, An
 
 def test_a_broken_audit_leaves_the_old_report(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     run = run_with(run_folder, tmp_path, data | {"images": "none"})
-    (run / "report.html").write_text("old")
+    (run / "private" / "report.html").write_text("old")
     with pytest.raises(InputError, match=r"audit\.json: .*`\$\.images`"):
         write_report(run)
-    assert (run / "report.html").read_text() == "old"
-    assert sorted(path.name for path in run.iterdir()) == ["audit", "report.html"]
+    assert (run / "private" / "report.html").read_text() == "old"
+    assert sorted(path.name for path in (run / "private").iterdir()) == ["audit", "report.html"]
 
 
 @pytest.mark.usefixtures("without_drawing")
 def test_a_report_that_cannot_be_written(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     run = run_with(run_folder, tmp_path, data)
-    (run / "report.html").mkdir()
+    (run / "private" / "report.html").mkdir()
     with pytest.raises(OutputError, match=r"report\.html"):
         write_report(run)
 
@@ -196,9 +196,9 @@ def test_a_configuration_may_be_nested_but_not_without_end(
     def nested(depth: int) -> str:
         return text.replace('"HERE"', '{"a": ' * depth + "1" + "}" * depth)
 
-    (run / "audit" / "audit.json").write_text(nested(300))
+    (run / "private" / "audit" / "audit.json").write_text(nested(300))
     assert "a.a.a.a.a.a.a.a.a.a.a …" in parsed(run).text
-    (run / "audit" / "audit.json").write_text(nested(50_000))
+    (run / "private" / "audit" / "audit.json").write_text(nested(50_000))
     with pytest.raises(InputError):
         write_report(run)
 

@@ -21,8 +21,8 @@ from report.pages import Parsed
 @pytest.fixture
 def run(run_folder: Path, tmp_path: Path) -> Path:
     """A copy of the audit that may be changed, with a picture whose name is known."""
-    shutil.copytree(run_folder / "audit", tmp_path / "run" / "audit")
-    pictures = tmp_path / "run" / "audit" / "pictures"
+    shutil.copytree(run_folder / "private" / "audit", tmp_path / "run" / "private" / "audit")
+    pictures = tmp_path / "run" / "private" / "audit" / "pictures"
     (pictures / "cover-1-photo.png").rename(pictures / "photo.png")
     return tmp_path / "run"
 
@@ -34,7 +34,7 @@ def test_no_audit_says_how_to_get_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "[]", '{"version": 1}', '{"version": 2}', '{"version": 2, "run": {}}'])
 def test_broken_audits_are_refused(run: Path, text: str) -> None:
-    (run / "audit" / "audit.json").write_text(text)
+    (run / "private" / "audit" / "audit.json").write_text(text)
     with pytest.raises(InputError, match=r"audit\.json: expected"):
         read_audit(run)
 
@@ -118,17 +118,17 @@ def test_a_picture_comes_with_its_size(run: Path) -> None:
 )
 def test_pictures_outside_the_audit_are_refused(run: Path, tmp_path: Path, name: str) -> None:
     outside = tmp_path / "outside.png"
-    shutil.copy(run / "audit" / "pictures" / "photo.png", outside)
+    shutil.copy(run / "private" / "audit" / "pictures" / "photo.png", outside)
     shutil.copy(outside, run / "outside.png")
-    (run / "audit" / "link.png").symlink_to(outside)
-    (run / "audit" / "linked").symlink_to(tmp_path)
-    (run / "audit" / "loop").symlink_to(run / "audit" / "loop")
+    (run / "private" / "audit" / "link.png").symlink_to(outside)
+    (run / "private" / "audit" / "linked").symlink_to(tmp_path)
+    (run / "private" / "audit" / "loop").symlink_to(run / "private" / "audit" / "loop")
     with pytest.raises(InputError):
         AuditPictures(run).read(name.format(outside=outside))
 
 
 def test_only_png_files_are_pictures(run: Path) -> None:
-    pictures = run / "audit" / "pictures"
+    pictures = run / "private" / "audit" / "pictures"
     (pictures / "drawing.png").write_text('<svg xmlns="http://www.w3.org/2000/svg"><script/></svg>')
     (pictures / "cut.png").write_bytes((pictures / "photo.png").read_bytes()[:20])
     for name in ("drawing.png", "cut.png", "missing.png", ""):
@@ -137,7 +137,7 @@ def test_only_png_files_are_pictures(run: Path) -> None:
 
 
 def test_pictures_have_a_limit_together(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    size = (run / "audit" / "pictures" / "photo.png").stat().st_size
+    size = (run / "private" / "audit" / "pictures" / "photo.png").stat().st_size
     monkeypatch.setattr(untrusted, "_MAX_PICTURES", 2 * size)
     pictures = AuditPictures(run)
     for _ in range(2):

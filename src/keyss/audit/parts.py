@@ -51,7 +51,7 @@ AuditPart = Callable[[AuditSubject, int, PartProgress], PartResult[Any]]
 
 
 def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ImagesResult]:
-    """Cover and secrets against the test photos, beside plain models, and some of the pictures."""
+    """Cover and secrets against the test views, beside plain models, and some of the pictures."""
     names = ["cover", *(f"secret-{index}" for index in range(1, len(subject.scenes)))]
     plains = [subject.original, *subject.baselines]
     compared, baselines, pictures, shown = [], [], {}, []
@@ -59,24 +59,34 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
         zip(names, subject.scenes, subject.models, plains, strict=True)
     ):
         progress(index, len(names))
+        role = "secret" if index and len(names) == 2 else name.replace("-", " ")
+        reference = "photo" if subject.run.metrics.photos[index] else "given model"
         photos = [(picture_name(view.camera), view.image) for view in scene.test]
-        renders = {"published" if index == 0 else "revealed": renders_of(model, scene, scene.test)}
+        renders = {"stego model" if index == 0 else "revealed": renders_of(model, scene, scene.test)}
         if plain is not None:
-            renders["plain 3DGS"] = renders_of(plain, scene, scene.test)
+            renders["plain model"] = renders_of(plain, scene, scene.test)
         if index:
             without = subject.frames[index - 1].inverse().apply_gaussians(subject.stego)
             renders["without the key"] = renders_of(without, scene, scene.test)
         compared.append(compare_images(photos, next(iter(renders.values()))))
-        baselines.append(compare_images(photos, renders["plain 3DGS"]) if plain is not None else None)
+        baselines.append(compare_images(photos, renders["plain model"]) if plain is not None else None)
         for view in range(len(photos))[:: -(-len(photos) // PICTURED_VIEWS)]:
             items = []
-            for label, pictured in {"photo": photos, **renders}.items():
+            for label, pictured in {reference: photos, **renders}.items():
                 file = f"{name}-{view + 1}-{label.replace(' ', '-')}.png"
                 pictures[file] = pictured[view][1]
                 items.append(LabelledPicture(label, f"{PICTURES}/{file}"))
-            title = f"{name.replace('-', ' ').capitalize()}, {photos[view][0]}"
+            title = f"{role.capitalize()}, {photos[view][0]}"
             shown.append(PicturedView(title, tuple(items)))
-    result = ImagesResult(compared[0], baselines[0], tuple(compared[1:]), tuple(baselines[1:]), tuple(shown))
+    result = ImagesResult(
+        cover=compared[0],
+        cover_baseline=baselines[0],
+        secrets=tuple(compared[1:]),
+        secret_baselines=tuple(baselines[1:]),
+        gaussians=tuple(len(model) for model in subject.models),
+        baseline_gaussians=tuple(None if plain is None else len(plain) for plain in plains),
+        pictures=tuple(shown),
+    )
     return PartResult(result, pictures)
 
 
@@ -99,7 +109,7 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
 
 
 def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RendersResult]:
-    """Whether detectors of hidden bits tell pictures of the published model from those of a plain one.
+    """Whether detectors of hidden bits tell pictures of the stego model from those of a plain one.
 
     Beside it, whether they tell those of two plain models apart: some learn any difference.
     """
@@ -149,7 +159,7 @@ def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
 
 
 def robustness(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RobustnessResult]:
-    """What changes of the published model cost the cover, and what they cost the secrets."""
+    """What changes of the stego model cost the cover, and what they cost the secrets."""
     rows = measure_robustness(
         subject.stego, subject.reopeners, subject.cover, subject.secrets, seed=seed, progress=progress
     )

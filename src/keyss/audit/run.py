@@ -129,6 +129,7 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         secrets=tuple(secrets),
         width=run.config.width,
         gaussians=len(run.stego),
+        photos=run.metrics.photos,
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as it will be read again
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

@@ -23,7 +23,7 @@ from keyss.measure.robustness.survival import Reopener
 from keyss.methods import registry
 from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
-from keyss.runs.opening import HidingRun
+from keyss.runs.opening import HidingRun, as_model
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def subject_of(
     scenes = run.scenes()
     plain, *baselines = run.plain_models()
     if original is not None:
-        plain = read_model(original)
+        plain = as_model(original)
     if plain is None:
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
     stego = run.stego.to(device)

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from keyss.fitting.config import FitConfig
 
 
 def optional(metavar: str, help: str, otherwise: str, aliases: list[str] | None = None) -> Any:
@@ -33,11 +38,18 @@ Background = Annotated[
         "white if there are any, else black",
     ),
 ]
+SkipMissing = Annotated[bool, arg(help="Leave out photos that a scene names but that are not there.")]
 Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
 MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
+
+
+def preset_sizes(presets: Mapping[str, FitConfig]) -> str:
+    """What each preset comes to, as a sentence."""
+    sizes = [f"{name} {fit.iterations:,} and {fit.max_gaussians:,}" for name, fit in presets.items()]
+    return f"Steps of each training, and Gaussians of each model at most: {'; '.join(sizes)}."
 
 
 def schedule(iterations: int | None, max_gaussians: int | None, seed: int | None) -> dict[str, int]:

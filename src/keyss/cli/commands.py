@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
-from keyss.cli.hiding import hide, reveal
+from keyss.cli.hiding import hide, reveal, verify
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import fit, info, render
 
@@ -91,4 +91,4 @@ def version() -> None:
     print(__version__)
 
 
-ALL = (keygen, fit, hide, reveal, render, evaluate, audit, report, steganalyze, info, demo, version)
+ALL = (keygen, fit, hide, reveal, verify, render, evaluate, audit, report, steganalyze, info, demo, version)

@@ -62,11 +62,15 @@ def _run(arguments: list[str], options: set[str]) -> None:
 
     from keyss.cli import commands
     from keyss.cli.hiding import hide, hide_with_options
+    from keyss.cli.models import fit, fit_with_presets
 
     app = tyro.extras.SubcommandApp()
     for command in commands.ALL:
-        hiding = command is hide and arguments[0] == "hide"
-        asked: Any = hide_with_options(arguments) if hiding else command
+        asked: Any = command
+        if command is hide and arguments[0] == "hide":
+            asked = hide_with_options(arguments)
+        elif command is fit and arguments[0] == "fit":
+            asked = fit_with_presets()
         app.command(asked)
         if command.__name__ == arguments[0]:
             options |= {

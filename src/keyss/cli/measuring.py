@@ -25,7 +25,11 @@ def evaluate(
     device: Device = "auto",
     seed: Annotated[int | None, optional("N", "Seed of the wrong keys.", "0")] = None,
 ) -> None:
-    """Measure a hiding run against the test photos, with the keys and with wrong ones.
+    """Measure a hiding run on test views, with the keys and with wrong ones.
+
+    Test views are photos that were not trained on or, of a .ply model, renders of it. Beside each number
+    stands the baseline, which is that of the scene's plain model (3DGS with nothing hidden). Chance level is
+    what the stego model itself reaches against the secret: a wrong key should not get above it.
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
@@ -83,7 +87,7 @@ def audit(
     *,
     key_file: KeyFiles = (),
     original: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of the cover to compare with.", "the run's own")
+        Path | None, optional("FILE", "Plain model of the cover to compare with.", "the run's own")
     ] = None,
     controls: Annotated[
         int, arg(metavar="N", help="Plain models of the cover from other seeds, to compare with; 2 or more.")

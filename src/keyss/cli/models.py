@@ -5,8 +5,10 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -19,7 +21,9 @@ from keyss.cli.arguments import (
     Overwrite,
     Resume,
     Seed,
+    SkipMissing,
     Width,
+    preset_sizes,
     schedule,
 )
 
@@ -28,19 +32,18 @@ def fit(
     scene: Annotated[Positional[Path], arg(metavar="SCENE", help="Folder of posed photos.")],
     *,
     out: OutFolder,
-    preset: Annotated[
-        Literal["quick", "default", "paper"], arg(help="Size and length of the run.")
-    ] = "default",
+    preset: str = "default",
     iterations: Iterations = None,
     max_gaussians: MaxGaussians = None,
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Seed = None,
 ) -> None:
-    """Fit a plain 3DGS model to the photos of a scene.
+    """Fit a plain model, ordinary 3DGS with nothing hidden, to the photos of a scene.
 
     example: keyss fit SCENE -o runs/cover
     """
@@ -59,6 +62,7 @@ def fit(
         config=replace(PRESETS[preset], **schedule(iterations, max_gaussians, seed)),
         width=width,
         background=background,
+        skip_missing=skip_missing,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -69,14 +73,32 @@ def fit(
     print_files(out, {"model.ply": "the model", "private": "its numbers, and what ran"})
 
 
+def fit_with_presets() -> Callable[..., None]:
+    """`fit` as it is to be parsed: with its presets, which take a second to load."""
+    from keyss.fitting.config import PRESETS
+
+    def command(*arguments: Any, **options: Any) -> None:
+        fit(*arguments, **options)
+
+    signature = inspect.signature(fit, eval_str=True)
+    described = arg(help=f"Size and length of the run. {preset_sizes(PRESETS)}")
+    preset: Any = Annotated[Literal[tuple(PRESETS)], described]
+    parameters = signature.parameters | {"preset": signature.parameters["preset"].replace(annotation=preset)}
+    command.__signature__ = signature.replace(parameters=list(parameters.values()))  # type: ignore[attr-defined]
+    command.__name__, command.__doc__ = "fit", fit.__doc__
+    command.__annotations__ = {name: each.annotation for name, each in parameters.items()}
+    return command
+
+
 def render(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply.")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
     *,
     cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
     out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
     split: Annotated[Literal["test", "train", "all"], arg(help="Which of its cameras.")] = "test",
     width: Width = None,
     background: Background = None,
+    skip_missing: SkipMissing = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
@@ -92,6 +114,7 @@ def render(
         split=split,
         width=width,
         background=background,
+        skip_missing=skip_missing,
         device=device,
         out=out,
         overwrite=overwrite,
@@ -101,7 +124,8 @@ def render(
 
 def info(
     path: Annotated[
-        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a sidecar or a result folder.")
+        Positional[Path],
+        arg(metavar="FILE", help="A .ply (- for stdin), a scene folder, a sidecar or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,

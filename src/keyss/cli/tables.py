@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
+    from keyss.runs.planning import Plan
 
 
 class Console(RichConsole):
@@ -25,9 +26,15 @@ class Console(RichConsole):
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     """The numbers of a hiding: a row for each scene beside its baseline, wrong keys, the method's own."""
     numbers = [f" {i}" for i in range(1, len(metrics.secrets) + 1)] if len(metrics.secrets) > 1 else [""]
-    rows = [_scene_row("cover", metrics.cover, metrics.baseline.cover, metrics.gaussians)]
-    secrets = zip(numbers, metrics.secrets, metrics.baseline.secrets, metrics.secret_gaussians, strict=True)
-    rows += [_scene_row(f"secret{number}", found, plain, size) for number, found, plain, size in secrets]
+    names = ["cover", *(f"secret{number}" for number in numbers)]
+    found = [metrics.cover, *metrics.secrets]
+    plain = [metrics.baseline.cover, *metrics.baseline.secrets]
+    sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
+    differ = any(other not in (own, None) for own, other in sizes)
+    rows = [
+        _scene_row(name, own, other, size, others if differ else None)
+        for name, own, other, (size, others) in zip(names, found, plain, sizes, strict=True)
+    ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
         psnrs += [(f"{wrong.keys} wrong keys, against the cover", wrong.vs_cover.mean)]
@@ -37,20 +44,67 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
             for number, found in zip(numbers, wrong.vs_secrets, strict=True)
         ]
     psnrs += [
-        (f"the stego cover, against the secret{number}", level)
+        (f"chance level of the secret{number}", level)
         for number, level in zip(numbers, metrics.chance_level, strict=True)
     ]
-    rows += [[name, f"{psnr:.2f}", "", "", "", ""] for name, psnr in psnrs]
-    names = ("against the test photos", "PSNR", "SSIM", "baseline", "loss", "Gaussians")
-    filled = [column for column in zip(names, *rows, strict=True) if any(column[1:])]
-    table = _table(*(name for name, *_ in filled), texts=1)
+    rows += [[name, f"{psnr:.2f}", "", "", "", "", ""] for name, psnr in psnrs]
+    heads = ("on test views", "PSNR", "SSIM", "baseline", "loss", "Gaussians", "baseline's")
+    filled = [column for column in zip(heads, *rows, strict=True) if any(column[1:])]
+    table = _table(*(head for head, *_ in filled), texts=1)
     for row in zip(*(cells for _, *cells in filled), strict=True):
         table.add_row(*row)
     console = console or Console()
     console.print(table)
-    console.print("Baseline: plain 3DGS of the same scene. PSNR, baseline and loss in dB.")
+    for line in _explanations(metrics, names, differ):
+        console.print(line, highlight=False, soft_wrap=True)
     for name, value in metrics.details.items():
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False)
+
+
+def print_plan(plan: Plan) -> None:
+    """Stages, room and estimates of a run that has not begun."""
+    table = _table("stage", "steps", "Gaussians", "time, about", texts=1)
+    for stage in plan.stages:
+        steps = f"{stage.steps:,}" if stage.steps else ""
+        table.add_row(stage.name, steps, f"{stage.gaussians:,}", _duration(stage.seconds))
+    table.add_row("all", "", "", _duration(plan.seconds))
+    Console().print(table)
+    outlook = plan.outlook
+    free = "" if plan.free_bytes is None else f", {plan.free_bytes / 1e6:,.0f} MB free"
+    _print_columns(
+        [
+            ("method", plan.method),
+            ("room", f"{outlook.capacity:,} of the secrets' {outlook.asked:,} Gaussians"),
+            (
+                "published",
+                f"up to {outlook.gaussians:,} Gaussians of SH degree {outlook.sh_degree}, "
+                f"{plan.file_bytes / 1e6:,.1f} MB",
+            ),
+            ("memory", f"about {plan.memory_bytes / 1e9:.1f} GB"),
+            ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included{free}"),
+            *(("note", note) for note in outlook.notes),
+        ]
+    )
+    print("Nothing was written. Times are extrapolated from a few steps, and rough.")
+
+
+def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool) -> list[str]:
+    """A line for each term of the table."""
+    rendered = [name for name, photos in zip(names, metrics.photos, strict=True) if not photos]
+    views = "photos that were not trained on"
+    if len(rendered) == len(names):
+        views = "8-bit renders of the given models, as there are no photos"
+    elif rendered:
+        views += f"; for {', '.join(rendered)} 8-bit renders of the given model, as there are none"
+    lines = [f"Test views: {views}. PSNR, baseline and loss in dB."]
+    if metrics.baseline.cover or any(metrics.baseline.secrets):
+        size = "its own number of Gaussians" if sizes_differ else "as many Gaussians"
+        lines.append(f"Baseline: the scene's plain model (3DGS with nothing hidden), which has {size}.")
+    if metrics.chance_level:
+        lines.append(
+            "Chance level: the stego model itself against the secret. No wrong key should get above."
+        )
+    return lines
 
 
 def print_fit(metrics: FitMetrics) -> None:
@@ -76,7 +130,7 @@ def print_verdicts(run: Path) -> None:
     from keyss.runs.audit_record import read_audit
 
     lines = verdicts(read_audit(run))
-    table = _table("", "value", "beside", "limit", "", texts=5)
+    table = _table("measure", "measured", "baseline or control", "limit", "verdict", texts=5)
     for line in lines:
         table.add_row(line.measure, line.value, line.beside, line.limit, line.word)
     Console().print(table)
@@ -93,6 +147,13 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
     _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
 
 
+def _duration(seconds: float) -> str:
+    """As precise as an estimate is."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
     """Two columns of plain text: paths must come out whole and as they are, however narrow the terminal."""
     width = max((len(name) for name, _ in rows), default=0)
@@ -100,10 +161,19 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {text}")
 
 
-def _scene_row(name: str, found: ImageQuality, plain: ImageQuality | None, gaussians: int) -> list[str]:
-    """Cells of one scene: PSNR, SSIM, those of its plain model, the loss, and the number of Gaussians."""
+def _scene_row(
+    name: str, found: ImageQuality, plain: ImageQuality | None, gaussians: int, baselines: int | None
+) -> list[str]:
+    """Cells of one scene: PSNR, SSIM, PSNR of its plain model, the loss, and the numbers of Gaussians."""
     beside = ["", ""] if plain is None else [f"{plain.psnr:.2f}", f"{plain.psnr - found.psnr:.2f}"]
-    return [name, f"{found.psnr:.2f}", f"{found.ssim:.3f}", *beside, f"{gaussians:,}"]
+    return [
+        name,
+        f"{found.psnr:.2f}",
+        f"{found.ssim:.3f}",
+        *beside,
+        f"{gaussians:,}",
+        f"{baselines:,}" if baselines else "",
+    ]
 
 
 def _table(*names: str, texts: int = 0) -> Table:
@@ -137,5 +207,5 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case list() | tuple():
-            return ", ".join(_text(item) for item in value)
+            return ", ".join(_text(item) for item in value) or "none"
     return str(value)

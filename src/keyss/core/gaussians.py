@@ -11,6 +11,8 @@ from torch import Tensor
 
 SH_C0 = 0.28209479177387814  # the constant SH basis function
 DRAWN_OPACITY = 1 / 255  # below it 3DGS rasterizers draw nothing
+# Beyond these numbers of single precision overflow while a Gaussian is projected, and nothing is drawn.
+MAX_COORDINATE, MAX_LOG_SCALE, MAX_LENGTH, MAX_COLOUR = 1e15, 40.0, 1.8e19, 1e12
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,16 @@ class Gaussians:
     def opacities(self) -> Tensor:
         """[N] opacities in (0, 1)."""
         return self.opacity_logits.sigmoid()
+
+    @property
+    def overflow(self) -> Tensor:
+        """[N] which Gaussians have numbers so large that rasterizers leave them out."""
+        far = ~(self.means.abs() <= MAX_COORDINATE).all(1)
+        large = ~(self.log_scales <= MAX_LOG_SCALE).all(1)
+        long = ~(self.quats.double().norm(dim=1) <= MAX_LENGTH)
+        coloured: Tensor = (self.sh.abs() < MAX_COLOUR).flatten(1).all(1)
+        outside: Tensor = far | large | long | ~coloured
+        return outside
 
     @property
     def sh_degree(self) -> int:

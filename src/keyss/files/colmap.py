@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
+import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
@@ -18,10 +20,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from keyss.core.errors import InputError
-from keyss.files.layout import MAX_COORDINATE, Photo, PointCloud, SceneLayout, hold_out, refuse_duplicates
+from keyss.core.errors import InputError, KeyssWarning
+from keyss.files.layout import (
+    MAX_COORDINATE,
+    NO_POINTS,
+    Photo,
+    PointCloud,
+    SceneLayout,
+    hold_out,
+    leave_out_missing,
+    refuse_duplicates,
+)
 from keyss.files.lens import Lens, make_lens
 from keyss.files.reading import read_file, read_text
+
+# Where the sparse model may lie, best first. The last is where Nerfstudio's scenes keep it.
+MODEL_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")
+_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 _T = TypeVar("_T")
 _Image = tuple[str, int, NDArray[np.float64]]  # name, id of its camera, [4, 4] world to camera
@@ -46,24 +61,28 @@ _MODEL_NAMES = (
 )
 
 
-def read_colmap(folder: Path) -> SceneLayout:
+def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
 
-    The points are in the order of their ids. Files are `.bin` where `cameras.bin` is there, else `.txt`.
-    Image names may hold subfolders but never leave `images/`. Raises InputError for names that are absolute
-    or contain `..`, and when a file is missing, truncated, longer than it says, or holds values that no
-    reconstruction has (NaN, zero quaternions, unknown cameras, absurd counts or sizes). Whether the photos
-    exist is checked when they are read.
+    Where `images/` has none of the photos, they are taken from the first of `images_2/`, `images_4/` and
+    `images_8/` that has some: the same ones, shrunk. The points are in the order of their ids; a scene may
+    lack them, with a KeyssWarning. Files are `.bin` where `cameras.bin` is there, else `.txt`. Image names
+    may hold subfolders but never leave `images/`. Photos that are not there are refused, or left out with
+    `skip_missing`, see `leave_out_missing`.
+
+    Raises InputError for names that are absolute or contain `..`, and when a file is missing, truncated,
+    longer than it says, or holds values that no reconstruction has (NaN, zero quaternions, unknown cameras,
+    absurd counts or sizes).
     """
     model = colmap_model_folder(folder)
     if model is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
     if (model / "cameras.bin").is_file():
         cameras, images = _cameras_bin(model / "cameras.bin"), _images_bin(model / "images.bin")
-        points = _points_bin(model / "points3D.bin")
+        points = _points(model / "points3D.bin", _points_bin)
     else:
         cameras, images = _cameras_txt(model / "cameras.txt"), _images_txt(model / "images.txt")
-        points = _points_txt(model / "points3D.txt")
+        points = _points(model / "points3D.txt", _points_txt)
     lenses: dict[int, Lens] = {}
     for camera_id, lens in cameras:
         if camera_id in lenses:
@@ -76,17 +95,29 @@ def read_colmap(folder: Path) -> SceneLayout:
             raise InputError(f"{model}: expected image names inside images/, found {name!r}")
         if camera_id not in lenses:
             raise InputError(f"{model}: image {name!r} refers to camera {camera_id}, which does not exist")
-        photos.append(Photo(folder / "images" / name, name, viewmat, lenses[camera_id]))
+        photos.append(Photo(folder / name, name, viewmat, lenses[camera_id]))
     refuse_duplicates(model, photos)
-    return SceneLayout(*hold_out(model, photos), points)
+    images_folder, there = _with_files(folder, photos)
+    missing = sorted({photo.name for photo in photos} - {photo.name for photo in there})
+    leave_out_missing(folder / images_folder, len(photos), missing, skip_missing)
+    return SceneLayout(*hold_out(model, there), points)
 
 
-def colmap_model_folder(folder: Path) -> Path | None:
-    """Where the sparse model of a scene lies: `sparse/0`, `sparse` or the folder itself; None if nowhere."""
-    for candidate in (folder / "sparse" / "0", folder / "sparse", folder):
+def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
+    """The first of `places` in a scene's folder that holds a sparse model; None if there is none."""
+    for candidate in (folder / place for place in places):
         if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return candidate
     return None
+
+
+def _with_files(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
+    """(the folder that is taken, those photos that are in it)."""
+    for images in _IMAGE_FOLDERS:
+        found = [replace(photo, path=folder / images / photo.name) for photo in photos]
+        if there := [photo for photo in found if photo.path.exists()]:
+            return images, there
+    return _IMAGE_FOLDERS[0], []
 
 
 def _lens(where: str, model: str, width: int, height: int, read: Callable[[int], Sequence[float]]) -> Lens:
@@ -203,10 +234,21 @@ def _points_bin(path: Path) -> PointCloud:
     fields = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
     raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
     points = raw.view(fields)[:, 0]
-    return _points(path, points["id"], points["xyz"], points["rgb"])
+    return _sorted_points(path, points["id"], points["xyz"], points["rgb"])
 
 
-def _points(path: Path, ids: NDArray[Any], xyz: NDArray[Any], rgb: NDArray[Any]) -> PointCloud:
+def _points(path: Path, read: Callable[[Path], PointCloud]) -> PointCloud:
+    points = read(path) if path.exists() else NO_POINTS
+    if not len(points.xyz):
+        warnings.warn(
+            f"{path}: there are no points; a fit starts from random ones around what the cameras look at",
+            KeyssWarning,
+            stacklevel=2,
+        )
+    return points
+
+
+def _sorted_points(path: Path, ids: NDArray[Any], xyz: NDArray[Any], rgb: NDArray[Any]) -> PointCloud:
     order = np.argsort(ids, kind="stable")
     return PointCloud.checked(path, xyz[order].astype(np.float64), rgb[order].astype(np.uint8))
 
@@ -230,7 +272,9 @@ def _points_txt(path: Path) -> PointCloud:
         rgb.append([_number(int, where, word) for word in words[4:7]])
         if not all(0 <= c <= 255 for c in rgb[-1]):
             raise InputError(f"{where}: expected colours of 0 to 255, found {rgb[-1]}")
-    return _points(path, np.array(ids, dtype=object), np.reshape(xyz, (-1, 3)), np.reshape(rgb, (-1, 3)))
+    return _sorted_points(
+        path, np.array(ids, dtype=object), np.reshape(xyz, (-1, 3)), np.reshape(rgb, (-1, 3))
+    )
 
 
 def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -31,7 +32,10 @@ def open_image(path: Path) -> Image.Image:
         raise InputError(f"{path}: expected an image of at most {_MAX_PIXELS:,} pixels: {error}") from error
     except Exception as error:  # Pillow's parsers raise nearly anything on broken headers
         kinds = ", ".join(_FORMATS)
-        raise InputError(f"{path}: expected an image ({kinds}), but it cannot be read: {error}") from error
+        if os.path.isfile(path) and os.path.getsize(path) == 0:
+            raise InputError(f"{path}: expected an image ({kinds}), found an empty file") from error
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: expected an image ({kinds}), but it cannot be read: {reason}") from error
     if image.width * image.height > _MAX_PIXELS:
         image.close()
         raise InputError(
@@ -49,14 +53,22 @@ def probe_image(path: Path) -> tuple[int, int, bool]:
         return image.width, image.height, image.has_transparency_data
 
 
+def is_turned(path: Path) -> bool:
+    """Whether EXIF data say that an image is to be shown turned by a quarter. Raises InputError."""
+    with open_image(path) as image:
+        return image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+
+
 def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
     """[H, W, 3] sRGB of an image file, laid over `background` ([3] in [0, 1]) where it is transparent.
 
-    16-bit grey is scaled to 8 bits; palettes, grey and CMYK are converted. Raises InputError as
-    `open_image` does, and when the pixels cannot be decoded.
+    16 bits are scaled to 8; palettes, grey and CMYK are converted. Raises InputError as `open_image` does,
+    for more than 16 bits, whose range cannot be known, and when the pixels cannot be decoded.
     """
     with open_image(path) as image:
         try:
+            if image.mode == "F" or (image.mode == "I" and np.max(image.getextrema()) > 65535):
+                raise ValueError("its pixels have 32 bits; convert it to 8 or 16")
             return _to_rgb(image, background)
         except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
             raise InputError(f"{path}: expected an image, but it cannot be decoded: {error}") from error

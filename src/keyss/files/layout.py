@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.lens import Lens
 
 MAX_COORDINATE = 1e15  # squares of coordinates up to this still fit in float32
@@ -65,6 +66,25 @@ def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], t
         )
     ordered = sorted(photos, key=lambda photo: photo.name)
     return tuple(p for i, p in enumerate(ordered) if i % 8), tuple(ordered[::8])
+
+
+def leave_out_missing(where: Path, total: int, missing: Sequence[str], skip_missing: bool) -> None:
+    """Settle that `missing` of the `total` photos which a scene names are not on disk.
+
+    Raises InputError, unless `skip_missing`: then a KeyssWarning says which ones are left out.
+    """
+    if not missing:
+        return
+    listed = ", ".join(missing[:5]) + (f" and {len(missing) - 5:,} more" if len(missing) > 5 else "")
+    count = f"{len(missing):,} of {total:,} photos"
+    if not skip_missing:
+        raise InputError(
+            f"{where}: {count} are missing: {listed}; put them there, or fit, hide and render without them "
+            "with `skip_missing=True`"
+        )
+    if len(missing) == total:
+        raise InputError(f"{where}: all of its {total:,} photos are missing: {listed}")
+    warnings.warn(f"{where}: {count} are missing and left out: {listed}", KeyssWarning, stacklevel=2)
 
 
 def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:

@@ -72,7 +72,9 @@ def make_lens(
     Raises InputError, which starts with `where`, when a value is out of any sensible range.
     """
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise InputError(f"{where}: expected an image size of 1 to {MAX_SIDE} pixels, found {width}x{height}")
+        raise InputError(
+            f"{where}: expected an image size of 1 to {MAX_SIDE} pixels, found {width:g}x{height:g}"
+        )
     values = dict(parameters)
     focal = values.pop("f", math.nan)
     fx, fy = values.pop("fx", focal), values.pop("fy", focal)

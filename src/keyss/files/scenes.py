@@ -16,8 +16,9 @@ from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.scene import Camera, Scene, View
-from keyss.files.colmap import colmap_model_folder, read_colmap
-from keyss.files.images import probe_image, read_image, shrink
+from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
+from keyss.files.foreign import what_it_is
+from keyss.files.images import is_turned, probe_image, read_image, shrink
 from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
 from keyss.files.transforms import read_blender, read_nerfstudio
@@ -33,6 +34,7 @@ def load_scene(
     *,
     width: int | None = None,
     background: Tensor | Sequence[float] | None = None,
+    skip_missing: bool = False,
 ) -> Scene:
     """Read a scene folder in COLMAP's, NeRF-synthetic's or Nerfstudio's layout, told apart by content.
 
@@ -40,10 +42,15 @@ def load_scene(
     proportion and K scaled per axis; photos are never enlarged. Distorted lenses are undistorted before.
     `background`: three numbers in [0, 1] that lie behind everything and under transparent pixels; by
     default white when any photo has an alpha channel, else black.
+    `skip_missing`: photos that the scene names but that are not on disk are left out, with a KeyssWarning,
+    before it is settled which photos are for testing.
 
     The test views are the layout's own where it has a split, else every 8th image by name. Camera names
     are image paths as the layout has them, relative to `images/` for COLMAP and to the scene's folder for
-    the others (`train/r_0.png`). Rotations are exactly orthonormal up to float32.
+    the others (`train/r_0.png`). COLMAP's `images/` may be missing where `images_2/`, `images_4/` or
+    `images_8/` has the same photos, shrunk; the largest are taken. A scene may lack points, with a
+    KeyssWarning where COLMAP ought to have made some; training starts from random ones then, see
+    `keyss.fitting.parameters.initial_points`. Rotations are exactly orthonormal up to float32.
 
     Raises InputError for anything that is not such a scene: an unknown layout, broken or truncated
     files, missing or undecodable images, images whose size contradicts their camera's (a size divided by
@@ -54,7 +61,7 @@ def load_scene(
         raise UsageError(f"expected a width of at least 1 pixel, got {width}")
     behind = None if background is None else _checked_background(background)
     folder = Path(path)
-    layout = _read_layout(folder)
+    layout = _read_layout(folder, skip_missing)
     for part, purpose in ((layout.train, "to train on"), (layout.test, "to test on")):
         if not part:
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
@@ -80,18 +87,21 @@ def load_scene(
     )
 
 
-def _read_layout(folder: Path) -> SceneLayout:
+def _read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
     try:
         if not folder.is_dir():
-            found = "a file" if folder.exists() else "nothing there"
+            found = what_it_is(folder) if folder.exists() else "nothing there"
             raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {_KNOWN}")
-        # In this order, since a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it.
-        if colmap_model_folder(folder) is not None:
-            return read_colmap(folder)
+        # In this order, since a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it, and
+        # Nerfstudio's scenes hold the COLMAP model that they were made from.
+        if colmap_model_folder(folder, MODEL_PLACES[:-1]) is not None:
+            return read_colmap(folder, skip_missing=skip_missing)
         if (folder / "transforms_train.json").is_file():
-            return read_blender(folder)
+            return read_blender(folder, skip_missing=skip_missing)
         if (folder / "transforms.json").is_file():
-            return read_nerfstudio(folder)
+            return read_nerfstudio(folder, skip_missing=skip_missing)
+        if colmap_model_folder(folder) is not None:
+            return read_colmap(folder, skip_missing=skip_missing)
         entries = sorted(entry.name for entry in folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
@@ -111,6 +121,11 @@ def _view(
         raise InputError(
             f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height} "
             f"(or that divided by a whole number), found {pixels.shape[1]}x{pixels.shape[0]}"
+            + (
+                "; its EXIF data say that it is to be turned: turn its pixels"
+                if is_turned(photo.path)
+                else ""
+            )
         )
     if not lens.is_pinhole:
         straighten = undistortions(lens, str(photo.path.parent))

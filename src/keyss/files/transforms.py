@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,9 +13,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.images import probe_image
-from keyss.files.layout import MAX_COORDINATE, Photo, SceneLayout, hold_out, refuse_duplicates
+from keyss.files.layout import (
+    MAX_COORDINATE,
+    Photo,
+    SceneLayout,
+    hold_out,
+    leave_out_missing,
+    refuse_duplicates,
+)
 from keyss.files.lens import Lens, make_lens
 from keyss.files.ply_table import read_point_cloud
 from keyss.files.reading import read_text
@@ -60,40 +69,51 @@ class _Transforms(_Intrinsics, kw_only=True):
     val_filenames: list[str] | None = None
 
 
-def read_blender(folder: Path) -> SceneLayout:
+@dataclass(frozen=True)
+class _Posed:
+    """What a JSON file says, and its frames in file order."""
+
+    meta: _Transforms
+    names: tuple[str, ...]  # of all frames
+    photos: tuple[Photo, ...]  # of those whose photos are there
+
+
+def read_blender(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     """The photos of `transforms_train.json` and `transforms_test.json`; there are no points.
 
     Without a test file the validation file takes its place, and without that every 8th training photo.
+    Photos that are not there are refused, or left out with `skip_missing`, see `leave_out_missing`.
     Raises InputError, also when one photo is in both files.
     """
-    _, train = _read(folder / "transforms_train.json")
+    train = _read(folder / "transforms_train.json", skip_missing).photos
     for split in ("test", "val"):
         path = folder / f"transforms_{split}.json"
         if path.is_file():
-            _, test = _read(path)
+            test = _read(path, skip_missing).photos
             refuse_duplicates(path, train + test)
             return SceneLayout(train, test)
     return SceneLayout(*hold_out(folder, train))
 
 
-def read_nerfstudio(folder: Path) -> SceneLayout:
+def read_nerfstudio(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     """The photos of a `transforms.json` (instant-ngp's too), and the points of its `ply_file_path` if any.
 
     `train_filenames` and `test_filenames` (or `val_filenames`) make the split; with only one of the two,
-    the other photos are the other half; with neither, every 8th photo is for testing. Poses and points
-    are both taken as stored: `applied_transform` says how they once were, and both have it. Raises
-    InputError.
+    the other photos are the other half; with neither, every 8th photo is for testing. So it is, with a
+    KeyssWarning, where `train_filenames` has all photos. Photos that are not there are refused, or left out
+    with `skip_missing`, see `leave_out_missing`. Poses and points are both taken as stored:
+    `applied_transform` says how they once were, and both have it. Raises InputError.
     """
     path = folder / "transforms.json"
-    meta, photos = _read(path)
-    train, test = _split(path, meta, photos)
-    if meta.ply_file_path is None:
+    posed = _read(path, skip_missing)
+    train, test = _split(path, posed)
+    if posed.meta.ply_file_path is None:
         return SceneLayout(train, test)
-    return SceneLayout(train, test, read_point_cloud(folder / _inside(path, meta.ply_file_path)))
+    return SceneLayout(train, test, read_point_cloud(folder / _inside(path, posed.meta.ply_file_path)))
 
 
-def _read(path: Path) -> tuple[_Transforms, tuple[Photo, ...]]:
-    """(what the file says, its frames as photos in file order).
+def _read(path: Path, skip_missing: bool) -> _Posed:
+    """The frames of a JSON file as photos.
 
     A frame's own intrinsics go before those of the file. `file_path` is relative to the file's folder,
     may lack its extension, and must stay inside that folder or its parent. Raises InputError.
@@ -102,26 +122,35 @@ def _read(path: Path) -> tuple[_Transforms, tuple[Photo, ...]]:
         meta = msgspec.json.decode(read_text(path, _MAX_JSON_BYTES), type=_Transforms)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
+    names = [_image_name(path, frame.file_path) for frame in meta.frames]
+    missing = {name for name in names if not (path.parent / name).exists()}
+    leave_out_missing(path, len(names), sorted(missing), skip_missing)
     photos = []
-    for i, frame in enumerate(meta.frames):
+    for i, (name, frame) in enumerate(zip(names, meta.frames, strict=True)):
+        if name in missing:
+            continue
         where = f"{path}: frame {i}"
-        name = _find_image(path, frame.file_path)
         viewmat = _viewmat(where, np.array(frame.transform_matrix))
         photos.append(Photo(path.parent / name, name, viewmat, _lens(where, meta, frame, path.parent / name)))
     refuse_duplicates(path, photos)
-    return meta, tuple(photos)
+    return _Posed(meta, tuple(names), tuple(photos))
 
 
-def _split(
-    path: Path, meta: _Transforms, photos: tuple[Photo, ...]
-) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    names = {photo.name for photo in photos}
+def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    meta, photos, names = posed.meta, posed.photos, set(posed.names)
     train, test = (
-        {_find_image(path, each) for each in listed or ()}
+        {_image_name(path, each) for each in listed or ()}
         for listed in (meta.train_filenames, meta.test_filenames or meta.val_filenames)
     )
     if unknown := (train | test) - names:
         raise InputError(f"{path}: expected lists of frames, found {min(unknown)!r}, which is none")
+    if train == names and not test:
+        warnings.warn(
+            f"{path}: `train_filenames` has all photos; every 8th of them is kept for testing",
+            KeyssWarning,
+            stacklevel=2,
+        )
+        train = set()
     if not train and not test:
         return hold_out(path, photos)
     train, test = train or names - test, test or names - train
@@ -142,15 +171,13 @@ def _inside(path: Path, file_path: str) -> str:
     return name
 
 
-def _find_image(path: Path, file_path: str) -> str:
-    """The name of an image beside a JSON file, with the extension that it may lack there."""
+def _image_name(path: Path, file_path: str) -> str:
+    """The name of an image beside a JSON file, with the extension that it may lack there; as it is there
+    if no such file exists.
+    """
     name = _inside(path, file_path)
-    for extension in ("", *_EXTENSIONS):
-        if os.path.isfile(path.parent / (name + extension)):
-            return name + extension
-    raise InputError(
-        f"{path.parent / name}: expected an image (the extension may be left out), but there is no such file"
-    )
+    extensions = (each for each in ("", *_EXTENSIONS) if os.path.isfile(path.parent / (name + each)))
+    return name + next(extensions, "")
 
 
 def _viewmat(where: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -188,7 +215,7 @@ def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Len
         width, height = int(meta["w"]), int(meta["h"])
         if (width, height) != (meta["w"], meta["h"]):
             raise InputError(
-                f"{where}: expected whole numbers as `w` and `h`, found {meta['w']}, {meta['h']}"
+                f"{where}: expected whole numbers as `w` and `h`, found {meta['w']:g}, {meta['h']:g}"
             )
     else:
         width, height, _ = probe_image(image)

@@ -89,8 +89,9 @@ def initial_gaussians(
 def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Points [P, 3] and colours [P, 3] uint8 to start from: the scene's own, or random ones.
 
-    A scene without points (NeRF-synthetic) gets uniform ones of grey in a cube around what the cameras
-    look at, with half the cameras' mean distance as half its edge.
+    A scene with fewer than 100 points (NeRF-synthetic has none) gets grey ones, drawn uniformly by
+    `generator` from a cube around what the cameras look at, with half the cameras' mean distance as half its
+    edge.
     """
     if len(scene.points) >= 100:
         return scene.points, scene.colors

@@ -1,4 +1,4 @@
-"""How well a hiding works, on the test photos of its scenes: the numbers of `metrics.json`."""
+"""How well a hiding works, on the test views of its scenes: the numbers of `metrics.json`."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ _FIDELITY_VIEWS = 8
 
 @dataclass(frozen=True)
 class BaselineQuality:
-    """Plain 3DGS of the same scenes; None where there is no plain model of one."""
+    """Plain models of the same scenes; None where there is none of one."""
 
     cover: ImageQuality | None
     secrets: tuple[ImageQuality | None, ...]
+    gaussians: tuple[int | None, ...]  # of the plain models of the cover and of the secrets
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class PsnrRange:
 
 @dataclass(frozen=True)
 class WrongKeys:
-    """What decoders make of wrong embeddings, against test photos."""
+    """What decoders make of wrong embeddings, against test views."""
 
     keys: int
     vs_cover: PsnrRange  # means over the decoders
@@ -58,13 +59,13 @@ class RenderFidelity:
 
 @dataclass(frozen=True)
 class HidingQuality:
-    """Cover and secrets on their test photos, and what they are to be compared with."""
+    """Cover and secrets on their test views, and what they are to be compared with."""
 
     cover: ImageQuality
     secrets: tuple[ImageQuality, ...]
     baseline: BaselineQuality
     wrong_key: WrongKeys | None  # None where keys condition no decoder
-    chance_level: tuple[float, ...]  # dB, the stego cover itself against each secret's photos
+    chance_level: tuple[float, ...]  # dB, the stego model itself against each secret's test views
 
 
 def measure_hiding(
@@ -94,7 +95,11 @@ def measure_hiding(
     return HidingQuality(
         cover=_quality(cover, stego),
         secrets=tuple(_quality(secret, model) for secret, model in zip(secrets, revealed, strict=True)),
-        baseline=BaselineQuality(plain_cover, tuple(plain_secrets)),
+        baseline=BaselineQuality(
+            plain_cover,
+            tuple(plain_secrets),
+            tuple(None if model is None else len(model) for model in baselines),
+        ),
         wrong_key=what_wrong_keys_show(stego, opened, scenes, wrong),
         chance_level=tuple(
             _psnr_in(secret, frame_of(each, secret, cover).inverse().apply_gaussians(stego))

@@ -20,6 +20,7 @@ HIGHEST = 60.0  # degrees of elevation, and of depression
 # Distances in turn, in units of that from which the whole model is seen: people look at all of it, then near.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY = 8
+_LARGE, _MOST = 0.95, 10.0  # a weight's quantile, and what the largest may be of it
 
 
 def is_model(source: str | Path | Gaussians) -> bool:
@@ -85,11 +86,13 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
 def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
     """[3] where what can be seen of a model lies, and how far it reaches (world units).
 
-    Gaussians count by opacity and size. The radius holds nine tenths of them, but is at most three times
-    that of the nearer half: around an object, that is all of it; in an unbounded scene, its middle.
+    Gaussians count by opacity and size, a huge one no more than ten typical large ones. The radius holds nine
+    tenths of them, but is at most three times that of the nearer half: around an object, that is all of it;
+    in an unbounded scene, its middle.
     """
     scales = model.scales.sort(dim=1).values
-    weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu()
+    weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu().nan_to_num(0.0)
+    weight = weight.clamp_max(_MOST * _quantile(weight, torch.ones(len(model)), _LARGE))
     means = model.means.cpu()
     middle = torch.stack([_quantile(means[:, axis], weight, 0.5) for axis in range(3)])
     distance = (means - middle).norm(dim=1)

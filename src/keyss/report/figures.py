@@ -72,19 +72,19 @@ def distances(attributes: Mapping[str, AttributeDistance]) -> Markup | None:
 
 
 def two_sample(found: TwoSample) -> Markup | None:
-    """AUCs of the published model against each control, and of controls against each other."""
-    published, controls = found.stego[:_MOST_DRAWN], found.control[:_MOST_DRAWN]
-    names = [numbered("published", index, len(found.stego)) for index in range(len(published))]
+    """AUCs of the stego model against each control, and of controls against each other."""
+    stego, controls = found.stego[:_MOST_DRAWN], found.control[:_MOST_DRAWN]
+    names = [numbered("stego model", index, len(found.stego)) for index in range(len(stego))]
     names += [numbered("controls", index, len(found.control)) for index in range(len(controls))]
     if not names:
         return None
     aucs, lows, highs = (
-        [_share(getattr(each, name)) for each in (*published, *controls)] for name in ("auc", "low", "high")
+        [_share(getattr(each, name)) for each in (*stego, *controls)] for name in ("auc", "low", "high")
     )
 
     def draw(axes: Axes) -> None:
         for row, (auc, low, high) in enumerate(zip(aucs, lows, highs, strict=True)):
-            color = _STEGO if row < len(published) else _MUTED
+            color = _STEGO if row < len(stego) else _MUTED
             axes.plot([low, high], [row, row], color=color, linewidth=1.5, solid_capstyle="butt")
             axes.plot([auc], [row], "o", color=color)
         _mark(axes, 0.5, "guessing", TWO_SAMPLE_AUC, names)
@@ -98,7 +98,7 @@ def two_sample(found: TwoSample) -> Markup | None:
 
 
 def histograms(quantities: Mapping[str, Histogram]) -> list[Markup]:
-    """Shares of the Gaussians in bins, by quantity: the published model filled, each control a line."""
+    """Shares of the Gaussians in bins, by quantity: the stego model filled, each control a line."""
     return [_histogram(name, each) for name, each in list(quantities.items())[:_MOST_DRAWN]]
 
 
@@ -114,19 +114,19 @@ def _histogram(name: str, shares: Histogram) -> Markup:
         axes.set_yticks([])
         axes.margins(x=0.01)
 
-    description = f"Histogram of {name}: the published model, and {len(shares.controls)} plain models."
+    description = f"Histogram of {name}: the stego model, and {len(shares.controls)} plain models."
     return _figure(f"histogram-{name}", 1.75, description, draw, width=3.2)
 
 
 def roc(detectors: Sequence[DetectorRocs]) -> Markup | None:
-    """The curves of detectors: the share of renders of the published model found, against false alarms.
+    """The curves of detectors: the share of renders of the stego model found, against false alarms.
 
     Raises InputError when fpr and tpr do not fit each other.
     """
     if not detectors:
         return None
     for each in detectors:
-        x, y = each.published.fpr, each.published.tpr
+        x, y = each.stego.fpr, each.stego.tpr
         if len(x) != len(y):
             raise InputError(f"{each.name}: expected as many fpr as tpr, found {len(x)} and {len(y)}")
 
@@ -134,16 +134,16 @@ def roc(detectors: Sequence[DetectorRocs]) -> Markup | None:
         axes.plot([0, 1], [0, 1], color=_INK, linewidth=1)
         axes.annotate("guessing", (0.62, 0.62), (5, -3), textcoords="offset points", va="top", fontsize=8.5)
         for each, color in zip(detectors, (_STEGO, *_LINES), strict=False):
-            x, y = ([*map(_share, shares)] for shares in (each.published.fpr, each.published.tpr))
-            axes.plot(x, y, color=color, label=_short(f"{each.name}, {number(each.published.auc, 2)}", 40))
+            x, y = ([*map(_share, shares)] for shares in (each.stego.fpr, each.stego.tpr))
+            axes.plot(x, y, color=color, label=_short(f"{each.name}, {number(each.stego.auc, 2)}", 40))
         axes.set_xlim(0, 1)
         axes.set_ylim(0, 1.01)
         axes.set_aspect("equal")
         axes.set_xlabel("renders of plain models called suspect")
-        axes.set_ylabel("renders of the published one called suspect", rotation_mode="anchor")
+        axes.set_ylabel("renders of the stego model called suspect", rotation_mode="anchor")
         axes.legend(loc="lower right")
 
-    listed = ", ".join(f"{each.name} AUC {auc_text(each.published)}" for each in detectors)
+    listed = ", ".join(f"{each.name} AUC {auc_text(each.stego)}" for each in detectors)
     return _figure("roc", 3.6, f"ROC curves: {listed}.", draw)
 
 

@@ -6,6 +6,7 @@ import hashlib
 from base64 import b64encode
 from functools import partial
 from importlib.resources import files
+from itertools import zip_longest
 from pathlib import Path, PurePath
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -17,7 +18,7 @@ from keyss.measure.images import ImageComparison
 from keyss.measure.robustness.survival import mean_over_draws
 from keyss.report import figures, numbers
 from keyss.report.untrusted import AuditPictures, check_bounds, clean, flat
-from keyss.report.verdicts import auc_text, detector_rocs, headline, verdicts
+from keyss.report.verdicts import auc_text, detector_rocs, headline, missing_readers, verdicts, worst_leak
 from keyss.runs.audit_record import Audit, ImagesResult, read_audit
 from keyss.runs.files import REPORT
 from keyss.runs.folder import write_again
@@ -56,7 +57,7 @@ def page(audit: Audit, pictures: AuditPictures) -> str:
     found = {  # section by section: its title, and whether there is anything in it
         "verdict": ("Verdict", lines),
         "pictures": ("Pictures", audit.images and audit.images.pictures),
-        "images": ("Against the test photos", audit.images),
+        "images": (f"Against the test {'photos' if all(audit.run.photos) else 'views'}", audit.images),
         "wrong-keys": ("Wrong keys", audit.wrong_key),
         "leaks": ("Leaks without the key", audit.leaks),
         "statistics": ("The model's statistics", audit.parameters),
@@ -78,6 +79,8 @@ def page(audit: Audit, pictures: AuditPictures) -> str:
             headline=headline(lines),
             notes=notes,
             comparisons=_comparisons(audit.images) if audit.images else [],
+            worst_leak=worst_leak,
+            all_photos=all(audit.run.photos),
             detectors=[*detector_rocs(audit, "StegExpose"), *detector_rocs(audit, "sealwatch")],
             changes=mean_over_draws(audit.robustness.changes) if audit.robustness else [],
             style=Markup("".join(map(_asset, _STYLES))),
@@ -123,15 +126,18 @@ def _title(audit: Audit) -> str:
     return f"{' and '.join(secrets) or 'A secret'}, hidden in {cover}"
 
 
-def _comparisons(images: ImagesResult) -> list[tuple[str, ImageComparison]]:
-    """The comparisons of an audit with their names, each followed by its baseline."""
-    found = [("cover, published", images.cover), ("cover, plain 3DGS (baseline)", images.cover_baseline)]
-    for index, secret in enumerate(images.secrets):
-        name = numbers.numbered("secret", index, len(images.secrets))
-        found.append((f"{name}, revealed", secret))
-        if index < len(images.secret_baselines):
-            found.append((f"{name}, plain 3DGS (baseline)", images.secret_baselines[index]))
-    return [(name, comparison) for name, comparison in found if comparison is not None]
+def _comparisons(images: ImagesResult) -> list[tuple[str, ImageComparison, int | None]]:
+    """The comparisons of an audit with names and numbers of Gaussians, each followed by its baseline."""
+    compared = [images.cover, *images.secrets]
+    baselines = [images.cover_baseline, *images.secret_baselines]
+    models = list(zip_longest(compared, images.gaussians, baselines, images.baseline_gaussians))
+    found = []
+    for index, (own, gaussians, baseline, others) in enumerate(models[: len(compared)]):
+        name = numbers.numbered("secret", index - 1, len(images.secrets)) if index else "cover"
+        found.append((f"{name}, {'revealed' if index else 'stego model'}", own, gaussians))
+        if baseline is not None:
+            found.append((f"{name}, plain model (baseline)", baseline, others))
+    return found
 
 
 def _not_measured(audit: Audit) -> list[str]:
@@ -152,6 +158,7 @@ def _not_measured(audit: Audit) -> list[str]:
     ]
     if audit.stegexpose and audit.stegexpose.sealwatch_missing:
         notes.append(f"sealwatch: {audit.stegexpose.sealwatch_missing}")
+    notes += [f"Reading by {reader}: {note}" for reader, note in missing_readers(audit).items()]
     return notes
 
 

@@ -1,36 +1,41 @@
-"""What the numbers of an audit come to: one line each, with a word. All thresholds are here.
+"""What the numbers of an audit come to: one line each, with a word.
 
 *fine*: within the limit. *visible*: somebody without the key may see that something is hidden, or see
-something of it. *missed*: nothing shows, but the hiding does not do as well as it should.
+something of it. *missed*: nothing shows, but the hiding does not do as well as it should. *not measured*:
+what it takes was not there. All limits are here, but for those of leaks: `keyss.measure.leaks.scores` has
+them, for by them it is chosen what is pictured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from keyss.measure.images import ImageComparison
-from keyss.measure.leaks.scores import LeakScores
+from keyss.measure.leaks.looking import AttackResult
+from keyss.measure.leaks.scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT
 from keyss.measure.robustness.survival import mean_over_draws
 from keyss.measure.roc import Roc
 from keyss.report.numbers import decibel, difference, number, numbered, times
 from keyss.runs.audit_record import Audit, RenderDetection
 
-QUALITY_LOSS = 1.0  # dB that cover or secret may be below plain 3DGS of the same photos
-INVISIBLE = 45.0  # dB from which on nobody sees a difference: models that are their own baseline have 120
+QUALITY_LOSS = 1.0  # dB that cover or secret may be below the plain model of the same scene
+INVISIBLE = 45.0  # dB from which on nobody sees a difference
+IDENTICAL = 119.9  # dB; 120, the most, is what a given model has against its own renders
 DISTANCE_RATIO = 1.5  # of a distance from a control, to the one between two controls
 TWO_SAMPLE_AUC = 0.6  # of a classifier that tells the Gaussians of two models apart
 AS_THE_PLAIN_MODEL = 0.01  # more than that of the cover's own plain model an AUC may be
 IMAGE_AUC = 0.1  # distance from 0.5 of a detector's AUC on renders
-LEAK_PSNR = 1.0  # dB nearer to the secret's photos than a control comes
-LEAK_SSIM = 0.05
-LEAK_GRADIENT = 0.1  # correlation of coarse gradients with the photos', above a control's
+WRONG_KEY = 1.0  # dB nearer to the secret than chance level
 PRUNING, PRUNED = "random pruning", 0.25  # the share of the Gaussians that is removed ...
 PRUNING_LOSS = 1.5  # ... and the dB that it may cost the secret more than the cover
 
 Program = Literal["StegExpose", "sealwatch"]
-Word = Literal["fine", "visible", "missed"]
+Word = Literal["fine", "visible", "missed", "not measured"]
+
+
+JUDGED: tuple[Word, ...] = ("fine", "visible", "missed")
 
 
 @dataclass(frozen=True)
@@ -47,18 +52,18 @@ class Verdict:
 
 @dataclass(frozen=True)
 class DetectorRocs:
-    """One detector on renders: of the published model, and of two controls."""
+    """One detector on renders: of the stego model, and of two controls."""
 
     name: str
-    published: Roc
+    stego: Roc
     control: Roc | None
 
     def excess(self) -> float:
         """How much further from guessing it is than between controls."""
-        return abs(self.published.auc - 0.5) - (abs(self.control.auc - 0.5) if self.control else 0.0)
+        return abs(self.stego.auc - 0.5) - (abs(self.control.auc - 0.5) if self.control else 0.0)
 
     def is_suspicious(self) -> bool:
-        undecided = self.published.low <= 0.5 <= self.published.high
+        undecided = self.stego.low <= 0.5 <= self.stego.high
         return self.excess() > IMAGE_AUC and not undecided
 
 
@@ -79,15 +84,16 @@ def verdicts(audit: Audit) -> list[Verdict]:
 
 def headline(lines: Sequence[Verdict]) -> str:
     """The summary in a sentence or two."""
-    if not lines:
+    if all(line.word not in JUDGED for line in lines):
         return "Nothing was measured that could be judged."
-    fine = sum(line.word == "fine" for line in lines)
-    if fine == len(lines) == 1:
-        return "The one measure is within its limit."
-    if fine == len(lines):
-        return f"All {fine} measures are within their limits."
-    parts = [f"{fine} of {len(lines)} measures are within their limits."]
-    for word in ("visible", "missed"):
+    fine, judged = (sum(line.word in words for line in lines) for words in (("fine",), JUDGED))
+    if fine == judged == 1:
+        parts = ["The one measure is within its limit."]
+    elif fine == judged:
+        parts = [f"All {fine} measures are within their limits."]
+    else:
+        parts = [f"{fine} of {judged} measures are within their limits."]
+    for word in ("visible", "missed", "not measured"):
         names = [line.measure for line in lines if line.word == word]
         if names:
             parts.append(f"{word.capitalize()}: {', '.join(names)}.")
@@ -106,8 +112,8 @@ def detector_rocs(audit: Audit, program: Program) -> list[DetectorRocs]:
     if audit.stegexpose is None:
         return []
     control = _rocs(audit.stegexpose.control, program)
-    published = _rocs(audit.stegexpose.published, program)
-    return [DetectorRocs(name, found, control.get(name)) for name, found in published.items()]
+    stego = _rocs(audit.stegexpose.stego, program)
+    return [DetectorRocs(name, found, control.get(name)) for name, found in stego.items()]
 
 
 def _rocs(found: RenderDetection, program: Program) -> dict[str, Roc]:
@@ -127,12 +133,15 @@ def _qualities(audit: Audit) -> Iterator[Verdict]:
     rows = [("cover", images.cover, images.cover_baseline, "visible")]
     for index, pair in enumerate(zip(images.secrets, images.secret_baselines, strict=False)):
         rows.append((numbered("secret", index, count), *pair, "missed"))
-    for name, found, baseline, otherwise in rows:
+    for (name, found, baseline, otherwise), photos in zip(rows, _photos(audit), strict=False):
         if baseline is not None:
             got, plain = found.mean.psnr, baseline.mean.psnr
-            word = _word(got >= min(plain - QUALITY_LOSS, INVISIBLE), otherwise)
-            beside, limit = f"{decibel(plain)}, plain 3DGS", f"at most {decibel(QUALITY_LOSS, 1)} less"
-            yield Verdict(f"{name} on test photos", decibel(got), beside, limit, word, "images")
+            limit = f"at most {decibel(QUALITY_LOSS, 1)} less"
+            if (least := plain - QUALITY_LOSS) > INVISIBLE:
+                least, limit = INVISIBLE, f"at least {decibel(INVISIBLE, 0)}"
+            word = _word(got >= least, otherwise)
+            beside = "the given model itself" if plain >= IDENTICAL else f"{decibel(plain)}, plain model"
+            yield Verdict(f"{name} on {_views(photos)}", decibel(got), beside, limit, word, "images")
 
 
 def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
@@ -141,29 +150,31 @@ def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
     wrong = audit.wrong_key
     pairs = zip(wrong.shown.vs_secrets, wrong.chance_level, strict=False)
     shown, chance = max(((each.max, chance) for each, chance in pairs), key=lambda pair: pair[0] - pair[1])
-    value, beside = f"{decibel(shown)}, best of {wrong.shown.keys:,}", f"{decibel(chance)}, published model"
-    limit = f"at most {decibel(LEAK_PSNR, 1)} more"
-    yield Verdict("wrong keys", value, beside, limit, _word(shown - chance <= LEAK_PSNR), "wrong-keys")
+    value, beside = f"{decibel(shown)}, best of {wrong.shown.keys:,}", f"{decibel(chance)}, chance level"
+    limit = f"at most {decibel(WRONG_KEY, 1)} more"
+    yield Verdict("wrong keys", value, beside, limit, _word(shown - chance <= WRONG_KEY), "wrong-keys")
+
+
+def worst_leak(attacks: Iterable[AttackResult]) -> AttackResult | None:
+    """The attack without the key that shows most of the secret's shapes."""
+    without_key = (attack for attack in attacks if not attack.with_key)
+    return max(without_key, key=lambda attack: attack.best_leak.evidence(), default=None)
 
 
 def _leaks(audit: Audit) -> Iterator[Verdict]:
     secrets = audit.leaks.secrets if audit.leaks else ()
-    leaks = [attack.leak for attacks in secrets for attack in attacks if not attack.with_key]
-    if not leaks:
+    worst = worst_leak(attack for attacks in secrets for attack in attacks)
+    if worst is None:
         return
-    worst = LeakScores.combined(max, leaks)
-    value = f"{difference(worst.psnr)} dB, {difference(worst.ssim, 3)} SSIM"
-    limit = f"at most {decibel(LEAK_PSNR, 1)} and {LEAK_SSIM} SSIM"
-    word = _word(worst.psnr <= LEAK_PSNR and worst.ssim <= LEAK_SSIM)
-    yield Verdict("leaks without the key", value, "0, plain model", limit, word, "leaks")
-    # Haze is nearer to most photos than darkness is. What is left when colours are fitted is the secret.
-    value = f"{difference(worst.psnr_fitted)} dB, {difference(worst.ssim_fitted, 3)} SSIM"
-    value += f", {difference(worst.gradient_coarse)} gradients"
-    limit = f"at most {decibel(LEAK_PSNR, 1)}, {LEAK_SSIM} and {LEAK_GRADIENT}"
-    nothing_fits = worst.psnr_fitted <= LEAK_PSNR and worst.ssim_fitted <= LEAK_SSIM
-    word = _word(nothing_fits and worst.gradient_coarse <= LEAK_GRADIENT)
-    beside = "0, plain model; colours fitted"
-    yield Verdict("the secret's shapes in them", value, beside, limit, word, "leaks")
+    index = next(index for index, attacks in enumerate(secrets) if worst in attacks)
+    of = f"{numbered('secret', index, len(secrets))}, " if len(secrets) > 1 else ""
+    # With colours fitted: haze is nearer to most photos than darkness is, and shows nothing of a secret.
+    leak = worst.best_leak
+    value = f"{difference(leak.psnr_fitted)} dB, {difference(leak.ssim_fitted, 3)} SSIM, "
+    value += f"{difference(leak.gradient_coarse)} gradients ({of}{worst.attack}: {worst.best})"
+    limit = f"at most {decibel(PSNR_LIMIT, 1)}, {SSIM_LIMIT} and {GRADIENT_LIMIT}"
+    beside = "0, plain models; colours fitted"
+    yield Verdict("leaks without the key", value, beside, limit, _word(leak.evidence() <= 1), "leaks")
 
 
 def _distances(audit: Audit) -> Iterator[Verdict]:
@@ -198,13 +209,15 @@ def _two_sample(audit: Audit) -> Iterator[Verdict]:
 def _detectors(audit: Audit, program: Program) -> Iterator[Verdict]:
     """One line for all detectors of a program: the one that finds most beyond what it does in controls."""
     found = detector_rocs(audit, program)
+    measure, limit = f"{program} on renders", f"at most {IMAGE_AUC} further from 0.5, or 0.5 in the interval"
     if not found:
+        if program == "sealwatch" and audit.stegexpose and audit.stegexpose.sealwatch_missing:
+            yield Verdict(measure, "not installed", "", limit, "not measured", "not-measured")
         return
     worst = max(found, key=lambda each: (each.is_suspicious(), each.excess()))
-    value = f"AUC {auc_text(worst.published)}" + (f", {worst.name}" if len(found) > 1 else "")
+    value = f"AUC {auc_text(worst.stego)}" + (f", {worst.name}" if len(found) > 1 else "")
     beside = f"{auc_text(worst.control)}, between plain models" if worst.control else "0.5, guessing"
-    limit = f"{IMAGE_AUC} further from 0.5, or within interval"
-    yield Verdict(f"{program} on renders", value, beside, limit, _word(not worst.is_suspicious()), "renders")
+    yield Verdict(measure, value, beside, limit, _word(not worst.is_suspicious()), "renders")
 
 
 def _word(within: bool, otherwise: Word = "visible") -> Word:
@@ -224,9 +237,31 @@ def _pruning(audit: Audit) -> Iterator[Verdict]:
     yield Verdict(measure, value, beside, limit, word, "robustness")
 
 
+def missing_readers(audit: Audit) -> dict[str, str]:
+    """Readers that were not there, and what to do about it."""
+    readers = audit.speed.readers if audit.speed else ()
+    return {each.reader: each.note or "not installed" for each in readers if each.loads is None}
+
+
 def _readers(audit: Audit) -> Iterator[Verdict]:
-    loads = [each.loads for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
-    if not loads:
-        return
-    word = _word(all(loads), "missed")
-    yield Verdict("other readers of the file", f"{sum(loads)} of {len(loads)}", "", "all", word, "speed")
+    there = [each for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
+    if there:
+        word = _word(all(each.loads for each in there), "missed")
+        failing = dict.fromkeys(each.reader for each in there if not each.loads)
+        reading = dict.fromkeys(each.reader for each in there if each.reader not in failing)
+        parts = [f"by {', '.join(reading)}"] if reading else []
+        parts += [f"not by {', '.join(failing)}"] if failing else []
+        yield Verdict("reading by other programs", "; ".join(parts), "", "by all", word, "speed")
+    if missing := missing_readers(audit):
+        name = f"reading by {', '.join(missing)}"
+        yield Verdict(name, "not installed", "", "by all", "not measured", "not-measured")
+
+
+def _photos(audit: Audit) -> list[bool]:
+    """Of the cover and of every secret of the images, whether there are photos."""
+    count = 1 + len(audit.images.secrets if audit.images else ())
+    return [*audit.run.photos[:count], *[True] * (count - len(audit.run.photos))]
+
+
+def _views(photos: bool) -> str:
+    return "test photos" if photos else "renders of its model"

@@ -18,6 +18,7 @@ from keyss.measure.sealwatch_detectors import SealwatchRocs
 from keyss.measure.sinkhorn import Sinkhorn3D
 from keyss.measure.speed import SpeedResult
 from keyss.measure.two_sample import TwoSample
+from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
 
@@ -34,7 +35,8 @@ class AuditedRun:
     cover: str  # a scene folder, or a model without photos; so are the secrets
     secrets: tuple[str, ...]
     width: int | None  # pixels to which photos were shrunk
-    gaussians: int
+    gaussians: int  # of the stego model
+    photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
 
@@ -52,7 +54,7 @@ class WrongKeyResult:
     """What wrong keys show, as the run's `metrics.json` has it."""
 
     shown: WrongKeys
-    chance_level: tuple[float, ...]  # dB, the stego cover itself against each secret's photos
+    chance_level: tuple[float, ...]  # dB, the stego model itself against each secret's test views
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,14 @@ class PicturedView:
 
 @dataclass(frozen=True)
 class ImagesResult:
-    """Cover and secrets against the test photos, beside plain models where there are some."""
+    """Cover and secrets against the test views, beside plain models where there are some."""
 
     cover: ImageComparison
     cover_baseline: ImageComparison | None
     secrets: tuple[ImageComparison, ...]
     secret_baselines: tuple[ImageComparison | None, ...]
+    gaussians: tuple[int, ...]  # of the stego model and of the revealed secrets
+    baseline_gaussians: tuple[int | None, ...]  # of the plain models
     pictures: tuple[PicturedView, ...]
 
 
@@ -91,7 +95,7 @@ class SinkhornResult:
 
 @dataclass(frozen=True)
 class ParametersResult:
-    """Distances of the published model's parameters from those of plain models."""
+    """Distances of the stego model's parameters from those of plain models."""
 
     sinkhorn: SinkhornResult
     distances: dict[str, AttributeDistance]
@@ -109,10 +113,10 @@ class RenderDetection:
 
 @dataclass(frozen=True)
 class RendersResult:
-    """Detectors on renders of the published model and of controls."""
+    """Detectors on renders of the stego model and of controls."""
 
     views: tuple[str, ...]
-    published: RenderDetection  # beside a control
+    stego: RenderDetection  # beside a control
     control: RenderDetection  # two controls: some detectors learn any difference
     sealwatch_missing: str | None = None  # how to get it
 
@@ -126,7 +130,7 @@ class LeaksResult:
 
 @dataclass(frozen=True)
 class RobustnessResult:
-    """What changes of the published model cost."""
+    """What changes of the stego model cost."""
 
     changes: tuple[ChangeResult, ...]
     breakdown_points: tuple[BreakdownPoint, ...]
@@ -154,5 +158,6 @@ def read_audit(run: Path) -> Audit:
     """A run's audit. Raises InputError when it is missing, broken, too large or of another version."""
     path = run / AUDIT_FOLDER / AUDIT_FILE
     if not path.exists():
+        run_folder(run)
         raise InputError(f"{path}: expected an audit, found nothing there; `keyss audit {run}` makes one")
     return read_record(path, Audit)

@@ -35,6 +35,7 @@ class RunConfig(Generic[OptionsT]):
     models_given: tuple[bool, ...]  # of the cover, then of the secrets: a plain model, and not fitted
     width: int | None  # to which photos were shrunk
     background: tuple[float, float, float] | None  # where it was chosen
+    skip_missing: bool = False  # whether photos that are not there were left out
     payloads: tuple[str, ...]  # `Opened.fingerprint` of each secret
     options: OptionsT  # of the method
 
@@ -48,6 +49,7 @@ class FitRunConfig:
     scene: str | None
     width: int | None
     background: tuple[float, float, float] | None
+    skip_missing: bool = False
     config: FitConfig
 
 

@@ -7,11 +7,13 @@ from pathlib import Path
 
 from torch import Tensor
 
-from keyss.channels.sidecar import read_header
+from keyss.channels.sidecar import MAGIC, read_header
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene
+from keyss.files.foreign import what_it_is
 from keyss.files.models import is_model_path, read_model
 from keyss.files.scenes import load_scene
+from keyss.files.streams import is_standard
 from keyss.runs.files import METRICS, MODEL, STEGO
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import read_sidecar
@@ -35,7 +37,7 @@ class ModelInfo:
 
     kind: str
     path: str
-    bytes: int
+    bytes: int | None  # None: of standard input
     gaussians: int
     sh_degree: int
     bounding_box: tuple[Corner, Corner]
@@ -77,18 +79,37 @@ class SidecarInfo:
 
 
 def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    """What is in a PLY, a sidecar, a scene folder or a folder of results. Raises InputError."""
-    path = Path(path)
+    """What is in a PLY, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
+    InputError.
+
+    Photos that a scene names but that are not there are left out, with a KeyssWarning.
+    """
+    try:
+        return _info(Path(path))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
+    if is_standard(path):
+        return _model_info(path)
     if path.is_dir():
         if (path / STEGO).exists():
             return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
         if (path / MODEL).exists():
             return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
-        return _scene_info(load_scene(path))
+        return _scene_info(load_scene(path, skip_missing=True))
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if is_model_path(path):
         return _model_info(path)
+    with path.open("rb") as file:
+        start = file.read(len(MAGIC))
+    if start != MAGIC:
+        raise InputError(
+            f"{path}: expected a model (.ply), a sidecar, a scene folder or a result folder, "
+            f"found {what_it_is(path)}"
+        )
     try:
         costs, _, _ = read_header(read_sidecar(path))
     except InputError as error:
@@ -102,7 +123,7 @@ def _model_info(path: Path) -> ModelInfo:
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
-        bytes=path.stat().st_size,
+        bytes=None if is_standard(path) else path.stat().st_size,
         gaussians=len(model),
         sh_degree=model.sh_degree,
         bounding_box=(_rounded(model.means.amin(0)), _rounded(model.means.amax(0))),

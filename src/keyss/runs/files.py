@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.models import write_model
@@ -16,6 +18,34 @@ STEGO, SIDECAR = f"{PUBLISH}/stego.ply", f"{PUBLISH}/decoder.sealed"
 MODEL = "model.ply"  # of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run; not, where that cannot be seen."""
+    return os.path.isfile(folder / CONFIG)
+
+
+def model_in(folder: Path) -> Path | None:
+    """The model that a run came to, where `folder` is that of a run or the part of it that is published."""
+    names = (STEGO, MODEL, Path(STEGO).name, Path(MODEL).name)
+    return next((folder / name for name in names if os.path.isfile(folder / name)), None)
+
+
+def run_folder(path: Path) -> Path:
+    """`path`, if it is the folder of a run.
+
+    Raises InputError, which names the run that `path` lies in, where there is one.
+    """
+    if is_run(path):
+        return path
+    expected = f"{path}: expected the folder of a run, as `keyss hide` writes it"
+    if not os.path.lexists(path):
+        raise InputError(f"{expected}; there is nothing of that name")
+    found = "a folder" if os.path.isdir(path) else "a file"
+    run = next((each for each in path.absolute().parents[:2] if is_run(each)), None)
+    if run is not None:
+        raise InputError(f"{expected}, found {found} in one; give {run}")
+    raise InputError(f"{expected}, found {found} that is none: {CONFIG} is missing there")
 
 
 def plain_names(secrets: int) -> list[str]:

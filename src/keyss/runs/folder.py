@@ -189,12 +189,17 @@ class RunFolder:
         # Listed before they appear: whatever happens in between, the manifest knows them.
         there = replace(there, files=kept | {self.stage: tuple(self._names)})
         self._save(there)
-        for name in self._names:
-            staged, target = self.path / _STAGING / name, self.path / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if name.startswith(f"{PUBLISH}/"):
-                staged.chmod(0o666 & ~_umask())
-            os.replace(staged, target)
+        try:
+            for name in self._names:
+                staged, target = self.path / _STAGING / name, self.path / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                if name.startswith(f"{PUBLISH}/"):
+                    staged.chmod(0o666 & ~_umask())
+                os.replace(staged, target)
+        except BaseException:
+            _remove(self.path, self._names)
+            self._save(replace(there, files=kept))
+            raise
         self._save(replace(there, running=None))
         self._drop_unfinished()
 

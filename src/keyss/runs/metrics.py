@@ -13,16 +13,17 @@ from keyss.measure.hiding import HidingQuality, RenderFidelity
 
 @dataclass(frozen=True, kw_only=True)
 class HideMetrics(HidingQuality):
-    """A hiding, whatever its method: PSNRs in dB and SSIMs on test photos, through the written files."""
+    """A hiding, whatever its method: PSNRs in dB and SSIMs on test views, through the written files."""
 
     version: int = 1
     keyss: str = __version__  # the program that wrote it
     method: str
-    gaussians: int  # of the published model
+    gaussians: int  # of the stego model
+    photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # of the revealed secrets
     iterations: int  # of the method's own training, 0 without one
     seconds: float  # of hiding, without fitting plain models and measuring
-    width: int  # pixels of the cover's photos
+    width: int  # pixels of the cover's test views
     seed: int
     against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, as they open from the written files
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of the method's own
@@ -30,7 +31,7 @@ class HideMetrics(HidingQuality):
 
 @dataclass(frozen=True, kw_only=True)
 class FitMetrics(ImageQuality):
-    """A plain model on the test photos."""
+    """A plain model on the test views."""
 
     version: int = 1
     keyss: str = __version__

@@ -8,21 +8,27 @@ from pathlib import Path
 
 import torch
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import read_model
 from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
+from keyss.files.streams import is_standard
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
 from keyss.runs.config import Background, PathLike, RunConfig, read_config
-from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, plain_names
+from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, is_run, model_in, plain_names, run_folder
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 
 MOST_SIDECAR_BYTES = 1 << 30
+OPENS_NOTHING = (
+    "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
+    "(converted or quantised, moved, scaled, edited or trained on); its sidecar "
+    f"({Path(SIDECAR).name}) may be missing or another one; or nothing is hidden here"
+)
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,13 @@ class HidingRun:
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
         """The cover and the secrets with their photos, or with pictures of the models that they are."""
         return [
-            as_scene(source, self.config.width, self.config.background, train_pictures=train_pictures)
+            as_scene(
+                source,
+                self.config.width,
+                self.config.background,
+                train_pictures=train_pictures,
+                skip_missing=self.config.skip_missing,
+            )
             for source in self.sources
         ]
 
@@ -61,7 +73,7 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key and for a run on
     scenes that were in memory only, InputError for a folder that is not one of `hide`.
     """
-    folder = Path(run)
+    folder = run_folder(Path(run))
     config, metrics = read_config(folder / CONFIG), read_record(folder / METRICS, HideMetrics)
     sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
     if len(sources) <= len(config.secrets):
@@ -81,14 +93,19 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
 
 
 def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
-    """The secret that the key opens; see `registry.open_model`. Errors name the sidecar's file."""
-    if sidecar is None or isinstance(sidecar, bytes):
-        return registry.open_model(stego, key, sidecar=sidecar, decoy=decoy)
-    data = read_sidecar(Path(sidecar))
+    """The secret that the key opens; see `registry.open_model`. Errors name the sidecar's file.
+
+    A key that opens nothing is told so in the same words whatever there is: they say nothing of the file.
+    """
+    data = read_sidecar(Path(sidecar)) if isinstance(sidecar, str | Path) else sidecar
     try:
         return registry.open_model(stego, key, sidecar=data, decoy=decoy)
+    except WrongKeyError as error:
+        raise WrongKeyError(OPENS_NOTHING) from error
     except InputError as error:
-        raise InputError(f"{sidecar}: {error}") from error
+        if isinstance(sidecar, str | Path):
+            raise InputError(f"{sidecar}: {error}") from error
+        raise
 
 
 def read_sidecar(path: Path) -> bytes:
@@ -98,6 +115,8 @@ def read_sidecar(path: Path) -> bytes:
 
 def sidecar_beside(stego: Path) -> Path | None:
     """The sidecar beside a model's file, if there is one."""
+    if is_standard(stego):
+        return None
     path = stego.with_name(Path(SIDECAR).name)
     return path if path.exists() else None
 
@@ -108,15 +127,21 @@ def as_scene(
     background: Background,
     *,
     train_pictures: bool = True,
+    skip_missing: bool = False,
 ) -> Scene:
     """A scene, the photos in a folder, or what a model or the one in a `.ply` shows from all around.
 
-    `train_pictures`: see `scene_of_model`.
+    `train_pictures`: see `scene_of_model`. `skip_missing`: see `load_scene`.
     """
     if isinstance(source, Scene):
         return source
     if not isinstance(source, Gaussians) and not is_model(source):
-        return load_scene(source, width=width, background=background)
+        try:
+            return load_scene(source, width=width, background=background, skip_missing=skip_missing)
+        except InputError as error:
+            if is_run(Path(source)) and (inside := model_in(Path(source))):
+                raise InputError(f"{source}: expected a scene, found a run; its model is {inside}") from error
+            raise
     name = "model" if isinstance(source, Gaussians) else Path(source).stem
     colour = None if background is None else torch.as_tensor(background, dtype=torch.float32)
     return scene_of_model(
@@ -125,5 +150,9 @@ def as_scene(
 
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
-    """A model, or the one in a `.ply`, on the CPU."""
-    return source.to("cpu") if isinstance(source, Gaussians) else read_model(source)
+    """A model, or the one in a `.ply`, on the CPU. Raises InputError, which knows folders of runs."""
+    if isinstance(source, Gaussians):
+        return source.to("cpu")
+    if inside := model_in(Path(source)):
+        raise InputError(f"{source}: expected the file of a 3DGS model, found a folder; give {inside}")
+    return read_model(source)

@@ -30,7 +30,11 @@ def read_record(path: Path, type: type[T], *, at_most: int = MOST_BYTES) -> T:
     Raises InputError that names the file and the place in it: for a file that is missing, too large or no
     JSON, for another version, and for values of other types than the class states.
     """
-    if not path.exists():
+    try:
+        there = path.exists()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if not there:
         raise InputError(f"{path}: missing; expected a file that keyss wrote")
     data = read_file(path, at_most)
     generic: Any = type

@@ -60,10 +60,11 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert "carriers: " in out
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
     assert names == {
-        *("stego.ply", "metrics.json", "config.json"),
+        "publish/stego.ply",
+        *("private/metrics.json", "private/config.json", "private/manifest.json"),
         *("private/cover.ply", "private/secret-1.ply"),
     }
-    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [900]
     assert metrics["details"]["bits_per_gaussian"] == [568]
     assert metrics["cover"]["psnr"] == pytest.approx(metrics["baseline"]["cover"]["psnr"], abs=0.1)
@@ -75,7 +76,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert len(read_ply(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
     assert run("evaluate", tmp_path / "out", "--key-file", "key")[0] == 0
-    assert json.loads((tmp_path / "out/metrics.json").read_text()) == metrics
+    assert json.loads((tmp_path / "out/private/metrics.json").read_text()) == metrics
     status, _, err = run("evaluate", tmp_path / "out", "--key-file", "key", "--wrong-keys", 3)
     assert (status, "no decoder" in err) == (2, True)
     assert run("reveal", stego, "--key-file", "key", "--frame", "cover", "-o", tmp_path / "n.ply")[0] == 2
@@ -93,7 +94,7 @@ def test_too_large_secrets_are_refused_or_pruned(
     assert "4,414 records would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
     assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
-    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [4414]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
 
@@ -136,7 +137,7 @@ def test_dithering_says_what_it_costs(
     )
     status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out")
     assert status == 4
-    assert "--dither gives it new low bits" in err
+    assert "gives it new low bits" in err
     status, out, _ = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", "--dither")
     assert status == 0
     assert "dither psnr: " in out

@@ -26,15 +26,17 @@ _GAP = 4  # pixels between the parts of a picture
 class AttackResult:
     """What an attack shows of a secret, beside what it shows of control models.
 
-    Scores are each the largest over the attack's views, for the attacker knows when he sees it.
+    An attack has variants: thresholds, shares, clusters. Scores are each the largest over them, for the
+    attacker knows when he sees it; `best` is the one variant that shows most of the secret's shapes.
     """
 
     attack: str
     sentence: str
     parameters: dict[str, Parameter]
     with_key: bool  # no attack: shows what there is to find
-    views: int  # that the attacker looks at
-    best: str  # the view with the largest `gradient_coarse`
+    views: int  # variants that the attacker looks at
+    best: str  # the variant with the largest `LeakScores.evidence`: it is pictured, and gets the verdict
+    best_leak: LeakScores  # its scores less `control`
     scores: LeakScores
     control: LeakScores  # the same on the control models, their mean
     control_max: LeakScores  # the largest on any of them
@@ -56,7 +58,7 @@ def look_for_secret(
     `stego` and `controls`, one or more plain models of the cover, are in the cover's frame, `secret` in its
     own, and `frame` leads from there into the cover's. Of the test views at most `test_views` are used. The
     strictest assumption: the attacker stands where the secret was photographed. Pictures are uint8
-    [H, W, 3], by the attack's name: the best view, from the first test camera, of stego and of the first
+    [H, W, 3], by the attack's name: its best variant, from the first test camera, of stego and of the first
     control, and the photo. Raises UsageError for no control and for a secret without test views.
     """
     if not controls:
@@ -68,46 +70,50 @@ def look_for_secret(
     ]
     results, pictures = [], {}
     for each in attacks:
-        found, count, label, picture = _look(each, stego, views, secret.background)
-        innocent = [_look(each, model, views, secret.background, label) for model in controls]
-        control = LeakScores.combined(fmean, [one for one, *_ in innocent])
+        found = _look(each, stego, views, secret.background)
+        innocent = [_look(each, model, views, secret.background) for model in controls]
+        highest = [LeakScores.combined(max, [variant.scores for variant in one]) for one in innocent]
+        control = LeakScores.combined(fmean, highest)
+        best = max(found, key=lambda variant: (variant.scores - control).evidence())
+        scored = LeakScores.combined(max, [variant.scores for variant in found])
         results.append(
             AttackResult(
-                each.name,
-                each.sentence,
-                each.parameters,
-                each.with_key,
-                count,
-                label,
-                found,
-                control,
-                LeakScores.combined(max, [one for one, *_ in innocent]),
-                found - control,
+                attack=each.name,
+                sentence=each.sentence,
+                parameters=each.parameters,
+                with_key=each.with_key,
+                views=len(found),
+                best=best.label,
+                best_leak=best.scores - control,
+                scores=scored,
+                control=control,
+                control_max=LeakScores.combined(max, highest),
+                leak=scored - control,
             )
         )
-        pictures[each.name] = _beside([picture, innocent[0][-1], views[0].image])
+        same = next((variant for variant in innocent[0] if variant.label == best.label), innocent[0][0])
+        pictures[each.name] = _beside([best.picture, same.picture, views[0].image])
     return results, pictures
 
 
-@torch.no_grad()
-def _look(
-    attack: Attack, model: Gaussians, views: Sequence[View], background: Tensor, label: str | None = None
-) -> tuple[LeakScores, int, str, Tensor]:
-    """Look at all that the attack shows of a model: the largest scores, and how many views there are.
+@dataclass(frozen=True)
+class _Variant:
+    """One of the things that an attack makes of a model."""
 
-    And a picture [H, W, 3] uint8 of the view called `label`, or of the one that shows most, with its label.
-    """
-    rows: list[LeakScores] = []
-    pictured: tuple[str, Gaussians] | None = None
-    for name, shown in attack.show(model):
-        rows.append(scores(shown, views, background))
-        best = rows[-1].gradient_coarse == max(row.gradient_coarse for row in rows)
-        if pictured is None or (best if label is None else name == label):
-            pictured = name, shown
-    assert pictured is not None
-    name, shown = pictured
-    image = render(shown, views[0].camera, background).clamp(0, 1)
-    return LeakScores.combined(max, rows), len(rows), name, (image * 255).round().to(torch.uint8).cpu()
+    label: str
+    scores: LeakScores
+    picture: Tensor  # [H, W, 3] uint8, from the first view
+
+
+@torch.no_grad()
+def _look(attack: Attack, model: Gaussians, views: Sequence[View], background: Tensor) -> list[_Variant]:
+    """All that the attack shows of a model."""
+    found = []
+    for label, shown in attack.show(model):
+        image = render(shown, views[0].camera, background).clamp(0, 1)
+        picture = (image * 255).round().to(torch.uint8).cpu()
+        found.append(_Variant(label, scores(shown, views, background), picture))
+    return found
 
 
 def _beside(images: Sequence[Tensor]) -> Tensor:

@@ -16,6 +16,11 @@ from keyss.fitting.image_metrics import psnr
 from keyss.fitting.losses import Target, ssim
 from keyss.rendering import render
 
+# What a leak may come to before the secret's shapes show, and not haze: those after the fit of colours.
+PSNR_LIMIT = 1.0  # dB nearer to the secret's photos than a control comes
+SSIM_LIMIT = 0.05
+GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above a control's
+
 COARSE = 64  # pixels of the longer side, at which shapes that are slightly out of place still count
 
 
@@ -38,6 +43,18 @@ class LeakScores:
     def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
         """Each score by a function of that of all rows."""
         return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
+
+    def evidence(self) -> float:
+        """Of a leak, how much of the limits it takes: above 1 the secret's shapes show.
+
+        The largest share of PSNR and SSIM after the fit of colours, and of the coarse gradients. What haze
+        alone makes larger does not count.
+        """
+        return max(
+            self.psnr_fitted / PSNR_LIMIT,
+            self.ssim_fitted / SSIM_LIMIT,
+            self.gradient_coarse / GRADIENT_LIMIT,
+        )
 
     def __sub__(self, other: LeakScores) -> LeakScores:
         return LeakScores(*(a - b for a, b in zip(astuple(self), astuple(other), strict=True)))

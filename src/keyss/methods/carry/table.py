@@ -59,9 +59,9 @@ class Table:
 
     @property
     def total(self) -> int:
-        """Bits of a record."""
+        """Bits of a record: besides the numbers one for outliers, and two for quaternions."""
         numbers = sum(each * count for each, count in zip(self.bits, _NUMBERS, strict=False))
-        return 2 + numbers - 2 * CHROMA_FEWER * sum(BANDS[: self.sh_degree + 1])
+        return 3 + numbers - 2 * CHROMA_FEWER * sum(BANDS[: self.sh_degree + 1])
 
     @property
     def record_bytes(self) -> int:

@@ -37,6 +37,7 @@ _LEAST_GAP = 2.0**-9
 # of the secret's values to the other. Low bits that are overwritten move opacity logits most: those between
 # 16 and 32 by 2^-10, in bands 2.6 wide.
 _MARGIN = 2.0**-11
+_FARTHEST = 8.0  # an outlier is as many times further from the median than 95 % are
 
 # [CHANNELS, CHANNELS] orthonormal: three log scales and three colours become a sum and two differences each.
 _TAKING_APART = block_diag(np.eye(3), OPPONENT, OPPONENT, 1.0)
@@ -59,7 +60,7 @@ class RankShift:
         hidden = _inside(stego, band)
         visible = stego.opacities >= DRAWN_OPACITY
         own = _quantiles(_channels(stego[hidden]))
-        shown = _quantiles(_channels(stego[visible if visible.any() else hidden]))
+        shown = _quantiles(_bulk(_channels(stego[visible if visible.any() else hidden])))
         shown = _ascending(shown, _least_gaps(shown))
         shown[-1] = np.linspace(own[-1, 0], own[-1, -1], KNOTS)  # as transparent as they are
         tables = (torch.from_numpy(np.ascontiguousarray(table)).float() for table in (own, shown))
@@ -67,24 +68,30 @@ class RankShift:
 
     def encrypt(self, stego: Gaussians) -> Gaussians:
         """`stego` with this secret's Gaussians as they are published."""
-        return self._moved(stego, self.own, self.shown, 1)
+        return self._moved(stego, 1)
 
     def decrypt(self, stego: Gaussians) -> Gaussians:
         """What `encrypt` was given, to the precision of float32."""
-        return self._moved(stego, self.shown, self.own, -1)
+        return self._moved(stego, -1)
 
-    def _moved(self, stego: Gaussians, start: torch.Tensor, end: torch.Tensor, sign: int) -> Gaussians:
+    def _moved(self, stego: Gaussians, sign: int) -> Gaussians:
         hidden = _inside(stego, self.band)
         part = stego[hidden].to("cpu")
         values, shift = _channels(part), self._shifts(part)
         ranks = np.linspace(0, 1, KNOTS)
         moved = np.empty_like(values)
         inner = _MARGIN + (1 - 2 * _MARGIN) * ranks
-        rank_before, rank_after = (inner, ranks) if sign > 0 else (ranks, inner)
         for channel in range(CHANNELS):
-            before, after = start[channel].double().numpy(), end[channel].double().numpy()
-            rank = np.interp(values[:, channel], before, rank_before)
-            moved[:, channel] = np.interp((rank + sign * shift[:, channel]) % 1.0, rank_after, after)
+            own, shown = self.own[channel].double().numpy(), self.shown[channel].double().numpy()
+            centre, spread = own[KNOTS // 2], (own[3 * KNOTS // 4] - own[KNOTS // 4]) / 2
+            own = np.arcsinh((own - centre) / spread)
+            if sign > 0:
+                rank = np.interp(np.arcsinh((values[:, channel] - centre) / spread), own, inner)
+                moved[:, channel] = np.interp((rank + shift[:, channel]) % 1.0, ranks, shown)
+            else:
+                rank = np.interp(values[:, channel], shown, ranks)
+                position = np.interp((rank - shift[:, channel]) % 1.0, inner, own)
+                moved[:, channel] = centre + spread * np.sinh(position)
         columns = torch.from_numpy(moved @ _TAKING_APART).float().to(stego.device)
         means, log_scales, sh = stego.means.clone(), stego.log_scales.clone(), stego.sh.clone()
         opacity_logits = stego.opacity_logits.clone()
@@ -141,13 +148,24 @@ def _channels(part: Gaussians) -> Table:
     return apart
 
 
+def _bulk(values: Table) -> Table:
+    """`values` with NaN for outliers: else every 64th of what is published would lie between them and the
+    rest."""
+    if len(values) == 0:
+        return values
+    distance = np.abs(values - np.median(values, axis=0))
+    return np.where(
+        distance > _FARTHEST * np.quantile(distance, 0.95, axis=0, method="lower"), np.nan, values
+    )
+
+
 def _quantiles(values: Table) -> Table:
-    """[CHANNELS, KNOTS] values at equal steps of rank, strictly ascending."""
+    """[CHANNELS, KNOTS] values at equal steps of rank, strictly ascending; NaNs are left out."""
     if len(values) == 0:
         return np.tile(np.linspace(0, 1, KNOTS), (CHANNELS, 1))
-    found = np.quantile(values, np.linspace(0, 1, KNOTS), axis=0).T
-    reach = np.abs(found).max(axis=1, keepdims=True) + 1e-6
-    return _ascending(found, 2.0**-22 * reach)
+    found = np.nanquantile(values, np.linspace(0, 1, KNOTS), axis=0).T
+    sizes = np.maximum(np.abs(found[:, :-1]), np.abs(found[:, 1:]))
+    return _ascending(found, 2.0**-22 * (sizes + np.median(np.abs(found), axis=1, keepdims=True) + 1e-6))
 
 
 def _least_gaps(shown: Table) -> Table:

@@ -1,0 +1,71 @@
+"""Files that are no 3DGS model that keyss reads: what they are, and what a person can do with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from keyss.core.errors import InputError
+from keyss.files.streams import StandardInput
+
+CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
+_EXPORT = "export a .ply from the program that made it"
+_UNPACK = "unpack it, and give the folder or the .ply that is in it"
+_POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
+
+
+@dataclass(frozen=True)
+class _Kind:
+    name: str  # with its article
+    advice: str
+    suffixes: tuple[str, ...] = ()
+    magic: tuple[bytes, ...] = ()  # of which one begins the file
+
+
+# The first whose suffix fits, else the first whose magic does: some are gzip data or ZIP archives inside.
+_KINDS = (
+    _Kind("an SPZ model", CONVERT, (".spz",), (b"NGSP",)),
+    _Kind("an SOG model", CONVERT, (".sog",)),
+    _Kind("a .splat model", CONVERT, (".splat",)),
+    _Kind("a .ksplat model", CONVERT, (".ksplat",)),
+    _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
+    _Kind("a glTF model", _EXPORT, (".glb", ".gltf"), (b"glTF",)),
+    _Kind("a table", _EXPORT, (".csv", ".tsv")),
+    _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),
+    _Kind("a JSON file", "give the folder that it lies in", (".json",)),
+    _Kind("a PLY file under another name", "rename it to end in .ply", magic=(b"ply\n", b"ply\r")),
+    _Kind("gzip data, perhaps an SPZ model", CONVERT, (".gz",), (b"\x1f\x8b",)),
+    _Kind("a ZIP archive", _UNPACK, (".zip",), (b"PK\x03\x04",)),
+    _Kind("an archive", _UNPACK, (".tar", ".tgz", ".7z", ".rar"), (b"7z\xbc\xaf\x27\x1c", b"Rar!")),
+    _Kind(
+        "a picture",
+        _POSES,
+        (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic"),
+        (b"\x89PNG", b"\xff\xd8\xff"),
+    ),
+    _Kind("a video", _POSES, (".mp4", ".mov", ".mkv", ".avi", ".webm")),
+)
+
+
+def what_it_is(path: Path | StandardInput) -> str:
+    """What a file is that keyss does not read, by its name or its first bytes, and what to do.
+
+    To follow "expected ..., found". Raises InputError when it cannot be read.
+    """
+    try:
+        if not path.is_file():  # reading a pipe could wait for ever
+            return "neither a file nor a folder"
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not start:
+        return "an empty file"
+    by_suffix = (kind for kind in _KINDS if path.name.lower().endswith(kind.suffixes))
+    by_magic = (kind for kind in _KINDS if start.startswith(kind.magic))
+    kind = next(by_suffix, None) or next(by_magic, None)
+    if kind is None:
+        return "a file of no kind that keyss knows"  # none of its bytes: it may be a key
+    if kind.advice == CONVERT:
+        return f"{kind.name}, which keyss does not read yet; {CONVERT}"
+    return f"{kind.name}; {kind.advice}"

@@ -1,0 +1,262 @@
+"""Files and folders as people have them: taken where they can be, else called what they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from cli.said import SMALL, Said, assert_refused, listing
+from files.scene_files import (
+    camera_bytes,
+    counted,
+    photo,
+    save,
+    write_blender,
+    write_colmap,
+    write_nerfstudio,
+)
+
+Keyss = Callable[..., Said]
+
+
+def key(folder: Path) -> tuple[str, Path]:
+    return "--key-file", folder / "key.txt"
+
+
+@pytest.mark.parametrize("inside", ["", "publish"])
+def test_a_run_in_place_of_a_model_is_told_its_file(
+    keyss: Keyss, world: Path, tmp_path: Path, inside: str
+) -> None:
+    run, out = world / "hidden" / inside, tmp_path / "out"
+    give = f"found a folder; give {world / 'hidden' / 'publish' / 'stego.ply'}"
+    assert_refused(keyss("reveal", run, *key(world), "-o", tmp_path / "s.ply"), 4, give)
+    assert_refused(keyss("render", run, "--cameras", world / "a", "-o", out), 4, give)
+    hide = ("hide", "--cover", world / "a", "--secret", world / "b", *key(world), "-o", out)
+    assert_refused(keyss(*hide, "--cover-model", run), 4, give)
+    assert listing(tmp_path) == {}
+
+
+def test_a_run_in_place_of_a_scene_is_told_its_file(keyss: Keyss, world: Path, tmp_path: Path) -> None:
+    said = keyss("fit", world / "hidden", "-o", tmp_path / "out")
+    assert_refused(
+        said, 4, f"expected a scene, found a run; its model is {world / 'hidden/publish/stego.ply'}"
+    )
+
+
+def test_another_folder_in_place_of_a_model_is_called_one(keyss: Keyss, world: Path, tmp_path: Path) -> None:
+    for arguments in (
+        ("reveal", world / "a", *key(world)),
+        ("render", world / "a", "--cameras", world / "a"),
+    ):
+        said = keyss(*arguments, "-o", tmp_path / "out.ply")
+        assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.ply), found a folder")
+
+
+@pytest.mark.parametrize("inside", ["publish/stego.ply", "publish", "private", "private/config.json"])
+@pytest.mark.parametrize("command", ["evaluate", "audit", "report"])
+def test_what_lies_in_a_run_is_told_the_run(keyss: Keyss, world: Path, command: str, inside: str) -> None:
+    path = world / "hidden" / inside
+    said = keyss(command, path, *(() if command == "report" else key(world)))
+    kind = "a folder" if path.is_dir() else "a file"
+    assert_refused(said, 4, f"{path}: expected the folder of a run")
+    assert f"found {kind} in one; give {world / 'hidden'}" in said.err
+
+
+@pytest.mark.parametrize("path", ["key.txt", "a", "nowhere"])
+def test_what_is_no_run_is_not_evaluated(keyss: Keyss, world: Path, path: str) -> None:
+    said = keyss("evaluate", world / path, *key(world))
+    assert_refused(said, 4, f"{world / path}: expected the folder of a run, as `keyss hide` writes it")
+
+
+FOREIGN = {
+    "scene.spz": (b"\x1f\x8b\x08\0" * 9, "an SPZ model", "splat-transform"),
+    "scene.sog": (b"PK\x03\x04" * 9, "an SOG model", "splat-transform"),
+    "scene.splat": (bytes(64), "a .splat model", "splat-transform"),
+    "scene.csv": (b"x,y,z\n0,0,0\n", "a table", "export a .ply"),
+    "photo.jpg": (b"\xff\xd8\xff\xe0", "a picture", "poses"),
+    "archive": (b"PK\x03\x04" * 9, "a ZIP archive", "unpack"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_foreign_files_are_called_what_they_are(keyss: Keyss, world: Path, tmp_path: Path, name: str) -> None:
+    content, kind, advice = FOREIGN[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    before = listing(tmp_path)
+    hide = ("hide", *key(world), "-o", tmp_path / "out")
+    for said in (
+        keyss("info", path),
+        keyss(*hide, "--cover", path, "--secret", world / "b"),
+        keyss(*hide, "--cover", world / "a", "--secret", path),
+        keyss("reveal", path, *key(world), "-o", tmp_path / "s.ply"),
+        keyss("render", path, "--cameras", world / "a", "-o", tmp_path / "out"),
+        keyss("fit", path, "-o", tmp_path / "out"),
+    ):
+        assert_refused(said, 4, f"found {kind}")
+        assert str(path) in said.err
+        assert advice in said.err
+    assert listing(tmp_path) == before
+
+
+def test_a_key_file_in_place_of_a_model_is_not_quoted(keyss: Keyss, world: Path, tmp_path: Path) -> None:
+    (text,) = (world / "key.txt").read_text().split()
+    for arguments in (
+        ("info", world / "key.txt"),
+        ("reveal", world / "key.txt", *key(world), "-o", tmp_path / "s.ply"),
+    ):
+        said = keyss(*arguments)
+        assert_refused(said, 4, "found a file of no kind that keyss knows")
+        assert text[:3] not in said.err
+
+
+@contextmanager
+def unprivileged() -> Iterator[None]:
+    """As somebody whom permissions bind: tests may run as root."""
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        if root:
+            os.seteuid(0)
+
+
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """A folder that everybody may enter, as `tmp_path` is not."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        yield Path(folder)
+
+
+@pytest.mark.parametrize("closed", ["", "images", "sparse/0"])
+def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
+    keyss: Keyss, open_folder: Path, closed: str
+) -> None:
+    scene = write_colmap(open_folder / "scene")
+    (scene / closed).chmod(0)
+    commands = (
+        ("fit", scene, "-o", open_folder / "out"),
+        ("info", scene),
+        (
+            "hide",
+            "--cover",
+            scene,
+            "--secret",
+            scene,
+            "--key-file",
+            open_folder / "key",
+            "-o",
+            open_folder / "out",
+        ),
+        ("evaluate", scene, "--key-file", open_folder / "key"),
+    )
+    (open_folder / "key").write_text("q7Rv2LxT9bWm4KzD")
+    for command in commands:
+        keyss(
+            *[open_folder / "nowhere" if each is scene else each for each in command]
+        )  # imports all it needs
+        with unprivileged():
+            said = keyss(*command)
+        assert_refused(said, 4, str(scene))
+        if command[0] != "evaluate":
+            assert "ermission denied" in said.err
+    (scene / closed).chmod(0o700)
+
+
+def fitted(keyss: Keyss, scene: Path, out: Path, *extra: object) -> Said:
+    said = keyss("fit", scene, "-o", out, *SMALL, *extra)
+    assert said.status == 0, said.err
+    assert (out / "model.ply").stat().st_size > 0
+    return said
+
+
+def warnings_of(said: Said) -> list[str]:
+    return [line for line in said.err.splitlines() if line.startswith("keyss: warning: ")]
+
+
+def test_colmap_without_points_starts_from_random_ones(keyss: Keyss, tmp_path: Path) -> None:
+    scene = write_colmap(tmp_path / "scene", count=4)
+    (scene / "sparse/0/points3D.bin").unlink()
+    for out, seed in (("one", 3), ("two", 3), ("three", 4)):
+        (warning,) = warnings_of(fitted(keyss, scene, tmp_path / out, "--seed", seed))
+        assert "points3D.bin: there are no points; a fit starts from random ones" in warning
+    first, again, other = ((tmp_path / out / "model.ply").read_bytes() for out in ("one", "two", "three"))
+    assert first == again
+    assert first != other
+
+
+def test_colmap_with_shrunk_photos_only(keyss: Keyss, tmp_path: Path) -> None:
+    cameras = counted(camera_bytes(width=24, height=16, params=(20, 22, 12, 8)))
+    scene = write_colmap(tmp_path / "scene", count=4, cameras=cameras)
+    shutil.rmtree(scene / "images")
+    for i in range(4):
+        save(scene / "images_2" / f"{i:02}.png", photo(i))
+        save(scene / "images_4" / f"{i:02}.png", photo(i, size=(6, 4)))
+    assert warnings_of(fitted(keyss, scene, tmp_path / "out")) == []
+    assert json.loads(keyss("info", scene, "--json").out)["image_size"] == [12, 8]
+
+
+def test_colmaps_model_where_nerfstudio_keeps_it(keyss: Keyss, tmp_path: Path) -> None:
+    scene = write_colmap(tmp_path / "scene", count=4, model="colmap/sparse/0")
+    fitted(keyss, scene, tmp_path / "out")
+    assert json.loads(keyss("info", scene, "--json").out)["train_views"] == 3
+
+
+def test_nerfstudio_with_all_frames_for_training(keyss: Keyss, tmp_path: Path) -> None:
+    names = [f"images/frame_{i:05}.png" for i in range(10)]
+    scene = write_nerfstudio(tmp_path / "scene", count=10, train_filenames=names)
+    (warning,) = warnings_of(fitted(keyss, scene, tmp_path / "out"))
+    assert "`train_filenames` has all photos; every 8th of them is kept for testing" in warning
+    assert json.loads(keyss("info", scene, "--json").out)["test_views"] == 2
+
+
+MISSING = {
+    "colmap": (write_colmap, "images/01.png", "01.png"),
+    "blender": (write_blender, "train/r_1.png", "train/r_1"),
+    "nerfstudio": (write_nerfstudio, "images/frame_00001.png", "images/frame_00001.png"),
+}
+
+
+@pytest.mark.parametrize("layout", MISSING)
+def test_a_missing_photo_is_named_and_left_out_on_demand(keyss: Keyss, tmp_path: Path, layout: str) -> None:
+    write, path, name = MISSING[layout]
+    scene = write(tmp_path / "scene", count=4)
+    (scene / path).unlink()
+    said = keyss("fit", scene, "-o", tmp_path / "out", *SMALL)
+    assert_refused(said, 4, f"1 of 4 photos are missing: {name};")
+    assert "--skip-missing" in said.err
+    assert not (tmp_path / "out").exists()
+    (warning,) = warnings_of(fitted(keyss, scene, tmp_path / "out", "--skip-missing"))
+    assert warning.endswith(f"1 of 4 photos are missing and left out: {name}")
+    described = keyss("info", scene, "--json")
+    assert json.loads(described.out)["train_views"] == {"colmap": 2, "blender": 3, "nerfstudio": 2}[layout]
+    assert warnings_of(described) == [warning]
+
+
+def test_a_run_remembers_that_photos_were_missing(keyss: Keyss, world: Path, tmp_path: Path) -> None:
+    scene, run = write_colmap(tmp_path / "scene", count=4), tmp_path / "run"
+    (scene / "images/02.png").unlink()
+    hide = ("hide", "--cover", scene, "--secret", world / "b", *key(world), "--sidecar", "-o", run, *SMALL)
+    assert_refused(keyss(*hide), 4, "1 of 4 photos are missing: 02.png;")
+    said = keyss(*hide, "--skip-missing")
+    assert said.status == 0, said.err
+    assert json.loads((run / "private/config.json").read_text())["skip_missing"] is True
+    said = keyss("evaluate", run, *key(world))
+    assert said.status == 0, said.err
+    assert [line for line in warnings_of(said) if "left out: 02.png" in line]
+    stego, out = run / "publish/stego.ply", tmp_path / "pictures"
+    assert_refused(keyss("render", stego, "--cameras", scene, "-o", out), 4, "--skip-missing")
+    assert (
+        keyss("render", stego, "--cameras", scene, "-o", out, "--skip-missing", "--split", "all").status == 0
+    )
+    assert sorted(path.name for path in out.glob("*.png")) == ["00.png", "01.png", "03.png"]

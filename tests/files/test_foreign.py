@@ -1,0 +1,71 @@
+"""What people are told of files that keyss does not read, by name or by content."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import zipfile
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from files.scene_files import photo
+from keyss.core import InputError
+from keyss.files import load_scene, read_model
+from keyss.files.foreign import CONVERT, what_it_is
+
+
+def zipped() -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        archive.writestr("meta.json", "{}")
+    return data.getvalue()
+
+
+def pictured(kind: str) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(photo(0)).save(data, kind)
+    return data.getvalue()
+
+
+FILES = {  # name and content, and what they are
+    "a.spz": (gzip.compress(b"NGSP" + bytes(12)), f"an SPZ model, which keyss does not read yet; {CONVERT}"),
+    "A.SPZ": (b"NGSP" + bytes(12), "an SPZ model"),
+    "a.sog": (zipped(), f"an SOG model, which keyss does not read yet; {CONVERT}"),
+    "a.splat": (bytes(64), f"a .splat model, which keyss does not read yet; {CONVERT}"),
+    "a.ksplat": (bytes(64), "a .ksplat model"),
+    "a.csv": (b"x,y,z\n1,2,3\n", "a table; export a .ply"),
+    "a.zip": (zipped(), "a ZIP archive; unpack it"),
+    "a": (gzip.compress(b"1"), "gzip data, perhaps an SPZ model"),
+    "b": (b"NGSP" + bytes(12), "an SPZ model"),
+    "c": (zipped(), "a ZIP archive"),
+    "d": (pictured("PNG"), "a picture"),
+    "e.dat": (pictured("JPEG"), "a picture"),
+    "f": (b"ply\nformat ascii 1.0\n", "a PLY file under another name; rename it to end in .ply"),
+    "transforms.json": (b"{}", "a JSON file; give the folder that it lies in"),
+    "g.bin": (b"\x01\x02", "a file of no kind that keyss knows"),
+    "key.txt": (b"q7Rv2LxT9bWm4KzD", "a file of no kind that keyss knows"),
+    "h.spz": (b"", "an empty file"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
+    content, found = FILES[name]
+    (tmp_path / name).write_bytes(content)
+    assert what_it_is(tmp_path / name).startswith(found)
+    assert "q7R" not in what_it_is(tmp_path / name)
+    with pytest.raises(InputError) as refused:
+        load_scene(tmp_path / name)
+    assert f"{tmp_path / name}: expected a scene folder, found {found}" in str(refused.value)
+    if name != "f":  # which is read as what it is, whatever its name
+        with pytest.raises(InputError) as refused:
+            read_model(tmp_path / name)
+        assert f"{tmp_path / name}: expected a 3DGS model (.ply), found {found}" in str(refused.value)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert what_it_is(tmp_path / "pipe") == "neither a file nor a folder"
