@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -166,7 +167,7 @@ def test_keys_with_white_space_at_an_end_get_a_hint_without_the_key(
     said = capsys.readouterr().err
     assert words in said
     with (
-        pytest.raises(WrongKeyError, match=f"^nothing; the key {words}") as caught,
+        pytest.raises(WrongKeyError, match=re.escape(f"nothing; the key {words}")) as caught,
         hinting_at_white_space([end.format(key)]),
     ):
         raise WrongKeyError("nothing")
