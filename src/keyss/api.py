@@ -41,6 +41,7 @@ from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
+from keyss.runs.planning import Plan, check_disk, plan_hiding
 from keyss.runs.records import write_record
 from keyss.runs.revealing import RevealResult, reveal_model
 from keyss.runs.verifying import Verification, check_model, check_secret
@@ -159,13 +160,8 @@ def hide(
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
     is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
-    chosen, options = _method(method)
-    if not 1 <= len(secrets) <= chosen.most_secrets:
-        raise UsageError(
-            f"expected 1 to {chosen.most_secrets} secrets for the method {chosen.name}, got {len(secrets)}"
-        )
+    chosen, options = _method(method, secrets)
     keys = [secret.key for secret in secrets]
-    _check_keys(keys)
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
     models = [cover_model, *(secret.model for secret in secrets)]
@@ -191,6 +187,8 @@ def hide(
         )
     inputs = [_input(*each) for each in zip(sources, models, strict=True)]
     options = chosen.prepare(inputs, options)
+    if folder:
+        check_disk(folder.path, chosen, options, inputs)
     trains = chosen.trains or any(each.model is None for each in inputs)
     scenes = [
         as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
@@ -221,6 +219,39 @@ def hide(
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
     return HideResult(stego.gaussians, stego.sidecar, metrics)
+
+
+def plan(
+    cover: PathLike | Scene | Gaussians,
+    secrets: Sequence[Secret],
+    *,
+    method: str | MethodOptions = "learned",
+    width: int | None = None,
+    background: Background = None,
+    skip_missing: bool = False,
+    cover_model: PathLike | Gaussians | None = None,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+) -> Plan:
+    """What `hide` with these arguments will do, and what it will take: see `keyss.runs.planning`.
+
+    Refuses what `hide` would refuse before its first step, renders and trains for some seconds to time it,
+    and writes nothing. `out`: where the results would go; room for them is looked for. Raises
+    KeyssError and its children.
+    """
+    chosen, options = _method(method, secrets)
+    target = resolve_device(device)
+    sources = [cover, *(secret.scene for secret in secrets)]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    options = chosen.prepare(inputs, options)
+    if out is not None:
+        check_disk(Path(out), chosen, options, inputs)
+    scenes = [
+        as_scene(source, width, background, train_pictures=False, skip_missing=skip_missing)
+        for source in sources
+    ]
+    return plan_hiding(chosen, options, inputs, scenes, target, None if out is None else Path(out))
 
 
 def reveal(
@@ -389,12 +420,19 @@ def evaluate(
     return metrics
 
 
-def _method(chosen: str | MethodOptions) -> tuple[Method, MethodOptions]:
-    """A method and its options."""
+def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
+    """A method and its options. Raises UsageError for as many secrets, or for keys, as it cannot have."""
     if isinstance(chosen, MethodOptions):
-        return registry.of_options(chosen), chosen
-    method = registry.get(chosen)
-    return method, next(iter(method.presets.values()))
+        method, options = registry.of_options(chosen), chosen
+    else:
+        method = registry.get(chosen)
+        options = next(iter(method.presets.values()))
+    if not 1 <= len(secrets) <= method.most_secrets:
+        raise UsageError(
+            f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
+        )
+    _check_keys([secret.key for secret in secrets])
+    return method, options
 
 
 def _input(source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None) -> SceneInput:

@@ -64,6 +64,9 @@ def hide(
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
     ] = 20.0,
+    dry_run: Annotated[
+        bool, arg(help="Print plan, room, and estimates of time, memory and disk; write nothing.")
+    ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -80,7 +83,7 @@ def hide(
     """
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
-    from keyss.cli.tables import print_files, print_hiding
+    from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.progress import reporter
@@ -96,16 +99,33 @@ def hide(
     changes = {
         name: parse(value) if (parse := known[name][1].parse) else value
         for name, value in own.items()
-        if value not in (None, False)
+        if value is not None and value is not False
     }
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
     warn_of_doubtful_keys(opening)
+    secrets = [
+        api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)
+    ]
+    if dry_run:
+        planned = api.plan(
+            cover,
+            secrets,
+            method=options,
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            cover_model=cover_model,
+            device=device,
+            out=out,
+        )
+        print_plan(planned)
+        return
     result = api.hide(
         cover,
-        [api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)],
+        secrets,
         method=options,
         width=width,
         background=background,

@@ -35,6 +35,18 @@ class SceneInput:
 
 
 @dataclass(frozen=True)
+class Outlook:
+    """What is known of a hiding before it begins: of given models exactly, else as much as is allowed."""
+
+    gaussians: int  # of the published model, at most
+    sh_degree: int  # of the published model
+    asked: int  # Gaussians that the secrets have together, at most
+    capacity: int  # of these, how many fit
+    steps: int = 0  # of the method's own training
+    notes: tuple[str, ...] = ()  # what the options cost, a sentence each
+
+
+@dataclass(frozen=True)
 class Source:
     """One scene as a method gets it: pictures of it, and a plain 3DGS model."""
 
@@ -183,6 +195,9 @@ class Method(Protocol):
 
         Refuses what cannot work, before anything is trained. Raises UsageError and InputError.
         """
+
+    def outlook(self, inputs: Sequence[SceneInput], options: Any) -> Outlook:
+        """What will come of it; `options` are prepared."""
 
     def hide(self, cover: Source, secrets: Sequence[KeyedSource], options: Any, context: Context) -> Stego:
         """Hide the secrets; `options` are prepared. Raises KeyssError and its children, Interrupted."""

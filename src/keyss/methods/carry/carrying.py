@@ -66,15 +66,16 @@ def record_requests(models: Sequence[Gaussians]) -> list[RecordRequest]:
     return [record_request(len(model), model.sh_degree) for model in models]
 
 
-def check_degrees(channel: Channel, cover: Gaussians, secrets: Sequence[Gaussians]) -> None:
-    """Raise UsageError if not even one Gaussian of these secrets fits into a Gaussian of the cover."""
-    degree = max(secret.sh_degree for secret in secrets)
-    least, most = Table.floor(degree).record_bytes, channel.largest_record(cover.sh_degree)
+def check_degrees(channel: Channel, cover: int, secrets: Sequence[int]) -> None:
+    """Raise UsageError if not even one Gaussian of these SH degrees fits into a Gaussian of the cover's."""
+    degree = max(secrets, default=0)
+    least, most = Table.floor(degree).record_bytes, channel.largest_record(cover)
     if least > most:
+        how = "" if cover > 0 else " with `sh_degree=1`, or with `sidecar=True`,"
         raise UsageError(
-            f"a cover of SH degree {cover.sh_degree} cannot carry a secret of SH degree {degree}: one of its "
+            f"a cover of SH degree {cover} cannot carry a secret of SH degree {degree}: one of its "
             f"Gaussians has room for {most} bytes, and one of the secret's takes at least {least}; "
-            '`method="learned"` can hide it'
+            f'`method="learned"`{how} can hide it'
         )
 
 

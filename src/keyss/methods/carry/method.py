@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from keyss.channels.base import Content, Records
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.base import Content, RecordRequest, Records
+from keyss.channels.low_bits import LOW_BITS, LowBitsCover
+from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Context, KeyedSource, SceneInput, Source, Stego, advising
+from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.carrying import (
     NAME,
     CarriedSecret,
@@ -19,14 +21,15 @@ from keyss.methods.carry.carrying import (
     decode,
     encode_all,
     most_visible,
+    record_request,
     record_requests,
     subsampled_counts,
 )
-from keyss.methods.carry.dither import cost, dither
 from keyss.methods.carry.options import PRESETS, CarryOptions
+from keyss.methods.dither import cost, dither
 
 _PRUNE = "`prune_to_fit=True` leaves out the least visible"
-_DITHER = '`dither=True` gives it new low bits, at a price, and `method="learned", sidecar=True` needs none'
+_LEARNED = '`method="learned"` needs no low bits of the cover'
 
 
 class CarryMethod:
@@ -40,18 +43,46 @@ class CarryMethod:
     presets: Mapping[str, CarryOptions] = PRESETS
 
     def prepare(self, inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-        """Unchanged; refuses given models that do not fit, and a cover whose low bits are not random."""
+        """Unchanged; refuses models that will not fit, and a cover whose low bits are not random."""
         cover, *others = (each.model for each in inputs)
+        degree, *degrees = _degrees(inputs, options)
+        check_degrees(LOW_BITS, degree, degrees)
         secrets = [model for model in others if model is not None]
-        if cover is not None and secrets:
-            check_degrees(LOW_BITS, cover, secrets)
-        if cover is not None and not options.dither:
-            with advising(InputError, _DITHER):
-                prepared = LOW_BITS.prepare(cover)
-            if not options.prune_to_fit and len(secrets) == len(others):
-                with advising(UsageError, _PRUNE):
-                    prepared.plan_records(record_requests(secrets))
+        requests = (
+            record_requests(secrets) if len(secrets) == len(others) and not options.prune_to_fit else []
+        )
+        if cover is None:
+            if requests:
+                with advising(UsageError, _PRUNE):  # at best all of them can carry something
+                    plan_records(requests, options.fit.max_gaussians, degree)
+            return options
+        try:
+            prepared = _prepared(cover, options)
+        except InputError as error:
+            raise InputError(f"{error}; {_ways(cover, options, requests)}") from error
+        if requests:
+            with advising(UsageError, _PRUNE):
+                prepared.plan_records(requests)
+        elif len(secrets) == len(others):
+            subsampled_counts(prepared, secrets)
         return options
+
+    def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
+        """The cover as it is, and in it what its carriers have room for."""
+        sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
+        degrees = _degrees(inputs, options)
+        cover, notes = inputs[0].model, []
+        carriers = sizes[0]
+        if cover is not None:
+            prepared = _prepared(cover, options)
+            carriers = prepared.carriers
+            if options.dither:
+                psnr = cost(cover, prepared.cover)
+                notes.append(f"dithering leaves the cover at {psnr:.1f} dB PSNR against itself")
+        requests = list(map(record_request, sizes[1:], degrees[1:]))
+        asked = sum(sizes[1:])
+        fit = record_capacity(requests, carriers, degrees[0])
+        return Outlook(sizes[0], degrees[0], asked, min(asked, fit), notes=tuple(notes))
 
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: CarryOptions, context: Context
@@ -62,10 +93,8 @@ class CarryMethod:
         """
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
-        check_degrees(LOW_BITS, cover.model, models)
-        carrier = dither(cover.model, os.urandom(32)) if options.dither else cover.model
-        with advising(InputError, _DITHER):
-            prepared = LOW_BITS.prepare(carrier)
+        check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
+        prepared = _prepared(cover.model, options)
         details: dict[str, Any] = {
             "carriers": prepared.carriers,
             "capacity": prepared.record_capacity(record_requests(models)),
@@ -83,7 +112,7 @@ class CarryMethod:
             raise RuntimeError("what was written does not open again as it should")
         details["bits_per_gaussian"] = [each.bits for each in opened]
         if options.dither:
-            details["dither_psnr"] = round(cost(cover.model, carrier), 1)
+            details["dither_psnr"] = round(cost(cover.model, prepared.cover), 1)
         return Stego(stego, None, tuple(opened), seconds, details=details)
 
     def unpack(self, content: Content) -> CarriedSecret:
@@ -95,3 +124,26 @@ class CarryMethod:
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """None: without a key, low bits that carry something are as random as any."""
         return {}
+
+
+def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
+    """SH degrees of the models that are given, and of those that will be fitted."""
+    return [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
+
+
+def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
+    return LOW_BITS.prepare(dither(cover, os.urandom(32)) if options.dither else cover)
+
+
+def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
+    """What works for a cover whose low bits are not random."""
+    if options.dither:
+        return _LEARNED
+    try:
+        prepared = _prepared(cover, replace(options, dither=True))
+    except InputError:
+        return _LEARNED
+    dithering = "`dither=True` gives it new low bits"
+    if requests and sum(each.count for each in requests) > prepared.record_capacity(requests):
+        dithering += f" and {_PRUNE}"
+    return f"{dithering}, or {_LEARNED}"
