@@ -28,8 +28,12 @@ from keyss.methods.carry.carrying import (
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import cost, dither
 
-_PRUNE = "`prune_to_fit=True` leaves out the least visible"
+_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
+_DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
+_DITHER_AND_PRUNE = (
+    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
+)
 
 
 class CarryMethod:
@@ -43,28 +47,32 @@ class CarryMethod:
     presets: Mapping[str, CarryOptions] = PRESETS
 
     def prepare(self, inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-        """Unchanged; refuses models that will not fit, and a cover whose low bits are not random."""
+        """Refuses given models that will not fit, and a given cover whose low bits are not random.
+
+        Of models that are fitted first, sizes and low bits are not known: they are made to fit rather than
+        refused after their training.
+        """
         cover, *others = (each.model for each in inputs)
         degree, *degrees = _degrees(inputs, options)
         check_degrees(LOW_BITS, degree, degrees)
         secrets = [model for model in others if model is not None]
-        requests = (
-            record_requests(secrets) if len(secrets) == len(others) and not options.prune_to_fit else []
-        )
+        requests = record_requests(secrets)
         if cover is None:
-            if requests:
+            if requests and not options.prune_to_fit:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something
                     plan_records(requests, options.fit.max_gaussians, degree)
-            return options
+            return replace(options, dither=True, prune_to_fit=True)
+        too_large = requests if not options.prune_to_fit else []
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
-            raise InputError(f"{error}; {_ways(cover, options, requests)}") from error
-        if requests:
+            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
+        if too_large:
             with advising(UsageError, _PRUNE):
-                prepared.plan_records(requests)
-        elif len(secrets) == len(others):
-            subsampled_counts(prepared, secrets)
+                prepared.plan_records(too_large)
+        if len(secrets) < len(others):
+            return replace(options, prune_to_fit=True)
+        subsampled_counts(prepared, secrets)
         return options
 
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
@@ -76,7 +84,7 @@ class CarryMethod:
         if cover is not None:
             prepared = _prepared(cover, options)
             carriers = prepared.carriers
-            if options.dither:
+            if prepared.cover is not cover:
                 psnr = cost(cover, prepared.cover)
                 notes.append(f"dithering leaves the cover at {psnr:.1f} dB PSNR against itself")
         requests = list(map(record_request, sizes[1:], degrees[1:]))
@@ -94,7 +102,8 @@ class CarryMethod:
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
-        prepared = _prepared(cover.model, options)
+        with advising(InputError, _LEARNED if options.dither else _DITHER):
+            prepared = _prepared(cover.model, options)
         details: dict[str, Any] = {
             "carriers": prepared.carriers,
             "capacity": prepared.record_capacity(record_requests(models)),
@@ -111,7 +120,7 @@ class CarryMethod:
         if [len(each.gaussians) for each in opened] != [len(model) for model in models]:
             raise RuntimeError("what was written does not open again as it should")
         details["bits_per_gaussian"] = [each.bits for each in opened]
-        if options.dither:
+        if prepared.cover is not cover.model:
             details["dither_psnr"] = round(cost(cover.model, prepared.cover), 1)
         return Stego(stego, None, tuple(opened), seconds, details=details)
 
@@ -132,7 +141,13 @@ def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
 
 
 def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
-    return LOW_BITS.prepare(dither(cover, os.urandom(32)) if options.dither else cover)
+    """The cover as it is, if that will do."""
+    try:
+        return LOW_BITS.prepare(cover)
+    except InputError:
+        if not options.dither:
+            raise
+    return LOW_BITS.prepare(dither(cover, os.urandom(32)))
 
 
 def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
@@ -140,10 +155,8 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
     if options.dither:
         return _LEARNED
     try:
-        prepared = _prepared(cover, replace(options, dither=True))
+        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))
     except InputError:
         return _LEARNED
-    dithering = "`dither=True` gives it new low bits"
-    if requests and sum(each.count for each in requests) > prepared.record_capacity(requests):
-        dithering += f" and {_PRUNE}"
-    return f"{dithering}, or {_LEARNED}"
+    fits = sum(each.count for each in requests) <= (prepared.record_capacity(requests) if requests else 0)
+    return _DITHER if fits else _DITHER_AND_PRUNE
