@@ -301,8 +301,6 @@ def reveal(
             out=out,
             overwrite=overwrite,
         )
-    for sentence in revealed.warnings:
-        print(f"keyss: warning: {sentence}", file=sys.stderr)
     remains = revealed.remains
     of = f" of {remains.hidden:,}" if remains.hidden else ""
     print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
@@ -330,13 +328,14 @@ def verify(
     from msgspec import to_builtins
 
     from keyss import api
-    from keyss.cli.keys import key_of_file
+    from keyss.cli.keys import hinting_at_white_space, key_of_file
     from keyss.cli.tables import print_facts
     from keyss.core.errors import InputError
     from keyss.runs.records import record_bytes
 
     key = key_of_file(key_file) if key_file else None
-    found = api.verify(model, key, decoder=decoder, device=device)
+    with hinting_at_white_space([key] if key else []):
+        found = api.verify(model, key, decoder=decoder, device=device)
     if json_:
         print(record_bytes(found).decode(), end="")
     else:

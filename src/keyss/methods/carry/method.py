@@ -26,10 +26,12 @@ from keyss.methods.carry.carrying import (
     subsampled_counts,
 )
 from keyss.methods.carry.options import PRESETS, CarryOptions
+from keyss.methods.carry.quantise import out_of_range
 from keyss.methods.dither import cost, dither
 
 _PRUNE = "`prune_to_fit=True` leaves out the least visible"
 _LEARNED = '`method="learned"` needs no low bits of the cover'
+_SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
 
 
 class CarryMethod:
@@ -60,11 +62,8 @@ class CarryMethod:
             prepared = _prepared(cover, options)
         except InputError as error:
             raise InputError(f"{error}; {_ways(cover, options, requests)}") from error
-        if requests:
-            with advising(UsageError, _PRUNE):
-                prepared.plan_records(requests)
-        elif len(secrets) == len(others):
-            subsampled_counts(prepared, secrets)
+        if len(secrets) == len(others):
+            _counts(prepared, secrets, options)
         return options
 
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
@@ -100,19 +99,27 @@ class CarryMethod:
             "capacity": prepared.record_capacity(record_requests(models)),
             "gaussians_before_pruning": [len(model) for model in models],
         }
-        if options.prune_to_fit:
-            counts = subsampled_counts(prepared, models)
-            models = [most_visible(model, count) for model, count in zip(models, counts, strict=True)]
-        with advising(UsageError, _PRUNE):
-            records = encode_all(prepared, models)
+        whole, counts = models, _counts(prepared, models, options)
+        models = [most_visible(model, count) for model, count in zip(whole, counts, strict=True)]
+        records = encode_all(prepared, models)
         stego = prepared.embed(list(zip(keys, records, strict=True)))
         opened = [self.unpack(LOW_BITS.extract(stego, key)) for key in keys]
         seconds = time.monotonic() - start
         if [len(each.gaussians) for each in opened] != [len(model) for model in models]:
             raise RuntimeError("what was written does not open again as it should")
         details["bits_per_gaussian"] = [each.bits for each in opened]
+        if any(clamped := [out_of_range(model) for model in models]):
+            details["gaussians_with_clamped_numbers"] = clamped
+        if options.prune_to_fit:
+            pairs = list(zip(whole, models, strict=True))
+            details["share_kept_by_pruning"] = [round(len(kept) / len(model), 4) for model, kept in pairs]
+            details["pruned_secret_psnr_against_the_whole"] = [
+                None if kept is model else round(cost(model, kept), 1) for model, kept in pairs
+            ]
         if options.dither:
-            details["dither_psnr"] = round(cost(cover.model, prepared.cover), 1)
+            details["dithered_cover_psnr_against_the_one_before"] = round(
+                cost(cover.model, prepared.cover), 1
+            )
         return Stego(stego, None, tuple(opened), seconds, details=details)
 
     def unpack(self, content: Content) -> CarriedSecret:
@@ -147,3 +154,17 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
     if requests and sum(each.count for each in requests) > prepared.record_capacity(requests):
         dithering += f" and {_PRUNE}"
     return f"{dithering}, or {_LEARNED}"
+
+
+def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryOptions) -> list[int]:
+    """How many Gaussians of each model are carried: all, unless pruning may leave some out.
+
+    Raises UsageError if they do not fit.
+    """
+    with advising(UsageError, _SIDECAR):
+        kept = subsampled_counts(prepared, models)  # refuses where pruning would not help either
+    if options.prune_to_fit:
+        return kept
+    with advising(UsageError, _PRUNE):
+        prepared.plan_records(record_requests(models))
+    return [len(model) for model in models]
