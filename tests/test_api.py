@@ -80,11 +80,13 @@ def test_metrics_have_their_shape(run: Path) -> None:
     metrics = json.loads((run / "private" / "metrics.json").read_text())
     assert set(metrics) == {
         *("method", "cover", "secrets", "baseline", "wrong_key", "chance_level", "gaussians"),
+        *("photos", "against_plain"),
         *("secret_gaussians", "iterations", "seconds", "width", "seed", "details", "version", "keyss"),
     }
     assert metrics["method"] == "learned"
     assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim"}
-    assert set(metrics["baseline"]) == {"cover", "secrets"}
+    assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians"}
+    assert metrics["photos"] == [True, True]
     wrong = metrics["wrong_key"]
     assert wrong["keys"] == 32
     assert set(wrong["vs_cover"]) == set(wrong["vs_secrets"][0]) == {"mean", "min", "max"}

@@ -183,9 +183,17 @@ def hide(
     if out is not None:
         told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
         folder = RunFolder(
-            out, "hide", told, onto=("scenes",), writes=(STEGO, CONFIG), overwrite=overwrite, resume=resume
+            out,
+            "hide",
+            told,
+            onto=("scenes",),
+            writes=(STEGO, CONFIG),
+            inputs=[Path(each) for each in (*sources, *models) if isinstance(each, str | Path)],
+            overwrite=overwrite,
+            resume=resume,
         )
-    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    arguments = ["cover_model", *["model"] * len(secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
     options = chosen.prepare(inputs, options)
     if folder:
         check_disk(folder.path, chosen, options, inputs)
@@ -291,8 +299,6 @@ def reveal(
         out=out,
         overwrite=overwrite,
     )
-    for sentence in found.warnings:
-        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     return found.gaussians
 
 
@@ -308,7 +314,7 @@ def reveal_counted(
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> RevealResult:
-    """`reveal`, with the number of Gaussians that were hidden and its warnings in the result."""
+    """`reveal`, with the number of Gaussians that were hidden in the result."""
     target = resolve_device(device)
     beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
     inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
@@ -325,6 +331,8 @@ def reveal_counted(
     )
     if not force:
         found.check_usable()
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     if path is not None:
         write_model(path, found.gaussians)
     return found
@@ -374,7 +382,8 @@ def render(
     folder) gets a PNG per camera.
     """
     target = resolve_device(device)
-    folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
+    inputs = [Path(model)] if isinstance(model, str | Path) else []
+    folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
     scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
@@ -435,10 +444,15 @@ def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Met
     return method, options
 
 
-def _input(source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None) -> SceneInput:
-    """A scene and the plain model that is given with it, or that it is."""
+def _input(
+    source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None, argument: str
+) -> SceneInput:
+    """A scene and the plain model that is given with it as `argument`, or that it is. Raises UsageError."""
     photos = isinstance(source, Scene) or not is_model(source)
-    if not photos and model is None:
+    if not photos:
+        if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
+            what = "a model in memory" if isinstance(source, Gaussians) else source
+            raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
         model = source  # type: ignore[assignment]
     return SceneInput(None if model is None else as_model(model), photos)
 
@@ -447,8 +461,12 @@ def _check_keys(keys: Sequence[str]) -> None:
     """Raise UsageError for keys that cannot be, or are the same to key derivation, before any work."""
     cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
     derived = [DerivedKey(key, cheap) for key in keys]
-    if any(a.equals(b) for a, b in combinations(derived, 2)):
-        raise UsageError("two secrets have the same key: each needs its own")
+    for (i, a), (j, b) in combinations(enumerate(derived, 1), 2):
+        if a.equals(b):
+            raise UsageError(
+                f"secrets {i} and {j} have the same key, which can open one of them only: give each its own "
+                "(`keyss keygen` makes one)"
+            )
 
 
 def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:

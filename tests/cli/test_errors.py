@@ -89,6 +89,22 @@ def _without_clip(folder: Path) -> list[object]:
     return _hide(folder, key_encoder="clip", clip_model=folder / "a")
 
 
+def _plain(folder: Path, name: str) -> Path:
+    return folder / "hidden" / "private" / f"{name}.ply"
+
+
+def _reveal(folder: Path, *extra: object, key: Path | None = None) -> list[object]:
+    stego, key = folder / "hidden" / "publish" / "stego.ply", key or folder / "key.txt"
+    return ["reveal", stego, "--key-file", key, "-o", folder / "secret.ply", *extra]
+
+
+def _spaced_key(folder: Path) -> Path:
+    path = folder / "spaced.txt"
+    path.write_text((folder / "key.txt").read_text().strip() + " \n")
+    path.chmod(0o600)
+    return path
+
+
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
@@ -145,6 +161,23 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         "config.json",
         lambda f: ["evaluate", f / "a", "--key-file", f / "key.txt"],
     ),
+    "a model of a model": (
+        2,
+        "leave out --cover-model",
+        lambda f: _hide(f, cover=_plain(f, "cover"), cover_model=_plain(f, "secret-1")),
+    ),
+    "a model of a secret model": (
+        2,
+        "leave out --secret-model",
+        lambda f: _hide(f, secret=_plain(f, "secret-1"), secret_model=_plain(f, "cover")),
+    ),
+    "a missing decoder": (4, "error: nope: expected a file", lambda f: _reveal(f, "--decoder", "nope")),
+    "two keys for one secret": (
+        2,
+        "one --key-file, got 2",
+        lambda f: _reveal(f, "--key-file", f / "wrong.txt"),
+    ),
+    "key with a space": (3, "ends with a space", lambda f: _reveal(f, key=_spaced_key(f))),
     "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
     "info of another file": (4, "key.txt", lambda f: ["info", f / "key.txt"]),
     "clip without a model": (6, "--clip-model", _without_clip),

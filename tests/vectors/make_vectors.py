@@ -78,7 +78,9 @@ def main() -> None:
     sealed = {"key": key, "method": payload.method, "payload": payload.data.hex()}
     (FOLDER / "sidecar.json").write_text(json.dumps(sealed, indent=1) + "\n")
     (FOLDER / "sidecar.sealed").write_bytes(encrypt_sidecar([(key, payload)], entropy=bytes(32)))
-    stego = embed(trained_like(400), [(key, trained_like(8, 1, 1))], entropy=bytes(32))
+    secret = trained_like(8, 1, 1)
+    secret.means[0, 0] = 1e6  # an outlier
+    stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
     write_ply(FOLDER / "carried.ply", stego)
 
 

@@ -87,6 +87,7 @@ def hide(
     from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.progress import reporter
+    from keyss.rendering.orbit import is_model
 
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
@@ -103,6 +104,18 @@ def hide(
     }
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
+    given = [cover_model or cover, *(secret_model or secret)]
+    if not chosen.trains and all(map(is_model, given)):
+        training = {
+            "--preset": preset != next(iter(chosen.presets)),
+            "--iterations": iterations is not None,
+            "--max-gaussians": max_gaussians is not None,
+        }
+        if idle := [flag for flag, is_given in training.items() if is_given]:
+            raise UsageError(
+                f"{' and '.join(idle)}: nothing is trained when --method {method} gets models of all scenes; "
+                f"leave {'it' if len(idle) == 1 else 'them'} out"
+            )
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
     warn_of_doubtful_keys(opening)
@@ -288,8 +301,6 @@ def reveal(
             out=out,
             overwrite=overwrite,
         )
-    for sentence in revealed.warnings:
-        print(f"keyss: warning: {sentence}", file=sys.stderr)
     remains = revealed.remains
     of = f" of {remains.hidden:,}" if remains.hidden else ""
     print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
@@ -317,13 +328,14 @@ def verify(
     from msgspec import to_builtins
 
     from keyss import api
-    from keyss.cli.keys import key_of_file
+    from keyss.cli.keys import hinting_at_white_space, key_of_file
     from keyss.cli.tables import print_facts
     from keyss.core.errors import InputError
     from keyss.runs.records import record_bytes
 
     key = key_of_file(key_file) if key_file else None
-    found = api.verify(model, key, decoder=decoder, device=device)
+    with hinting_at_white_space([key] if key else []):
+        found = api.verify(model, key, decoder=decoder, device=device)
     if json_:
         print(record_bytes(found).decode(), end="")
     else:

@@ -134,6 +134,9 @@ def info(
 
     example: keyss info runs/hidden/publish/stego.ply
     """
+    import json
+    import sys
+
     from msgspec import to_builtins
 
     from keyss.cli.tables import print_facts
@@ -142,6 +145,11 @@ def info(
 
     facts = describe(path)
     if json_:
-        print(record_bytes(facts).decode(), end="")
+        text = record_bytes(facts).decode()
+        try:
+            text.encode(sys.stdout.encoding or "utf-8")
+        except UnicodeEncodeError:
+            text = json.dumps(json.loads(text), indent=2) + "\n"  # all of it in ASCII
+        print(text, end="")
     else:
         print_facts(to_builtins(facts))

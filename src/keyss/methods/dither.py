@@ -62,10 +62,13 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
 
 
 def cost(before: Gaussians, after: Gaussians) -> float:
-    """PSNR in dB of views around a model, before and after; at most 120."""
+    """PSNR in dB of views around a model, between before and after; at most 120."""
     cameras = orbit(before, _SIZE, _VIEWS)
     error = torch.stack(
-        [(render(before, camera) - render(after, camera)).square().mean() for camera in cameras]
+        [
+            (render(before, camera).clamp(0, 1) - render(after, camera).clamp(0, 1)).square().mean()
+            for camera in cameras
+        ]
     )
     return float(-10 * torch.log10(error.mean().clamp_min(1e-12)))
 

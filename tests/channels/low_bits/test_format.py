@@ -87,8 +87,8 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     (count,) = struct.unpack_from("<I", header)
     assert count == EXPECTED["count"]
 
-    bits = header[4]  # of a coordinate
-    lines = [struct.unpack_from("<3f", header, 12 + 12 * axis) for axis in range(3)]
+    bits, skipped = header[4], 3 + 3 * header[6]  # of a coordinate; of outliers and quaternions before it
+    lines = [struct.unpack_from("<2f2e", header, 12 + 12 * axis) for axis in range(3)]
     means = set()
     for identity, low in gaussians:
         for slot in range(cells):
@@ -96,10 +96,12 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
             for label in ("record", "copy"):
                 if (record := _decrypted(data_key, label, identity, cell, slot)) is not None:
                     whole = int.from_bytes(record, "big")
-                    codes = [whole >> 8 * size - bits * (axis + 1) & (1 << bits) - 1 for axis in range(3)]
+                    shifts = [8 * size - skipped - bits * (axis + 1) for axis in range(3)]
+                    codes = [whole >> shift & (1 << bits) - 1 for shift in shifts]
+                    outlier = whole >> 8 * size - 1
                     places = [
-                        centre + spread * np.sinh((2 * code / ((1 << bits) - 1) - 1) * reach)
-                        for code, (centre, spread, reach) in zip(codes, lines, strict=True)
+                        centre + spread * np.sinh((2 * code / ((1 << bits) - 1) - 1) * (far if outlier else reach))
+                        for code, (centre, spread, reach, far) in zip(codes, lines, strict=True)
                     ]
                     means.add(tuple(float(np.float32(place)) for place in places))
-    np.testing.assert_allclose(sorted(means), sorted(map(tuple, EXPECTED["means"])), atol=1e-6)
+    np.testing.assert_allclose(sorted(means), sorted(map(tuple, EXPECTED["means"])), atol=1e-6, rtol=1e-6)

@@ -26,6 +26,7 @@ from keyss.methods.carry.carrying import (
     subsampled_counts,
 )
 from keyss.methods.carry.options import PRESETS, CarryOptions
+from keyss.methods.carry.quantise import out_of_range
 from keyss.methods.dither import cost, dither
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
@@ -34,6 +35,7 @@ _DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
 _DITHER_AND_PRUNE = (
     f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
 )
+_SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
 
 
 class CarryMethod:
@@ -62,17 +64,15 @@ class CarryMethod:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something
                     plan_records(requests, options.fit.max_gaussians, degree)
             return replace(options, dither=True, prune_to_fit=True)
-        too_large = requests if not options.prune_to_fit else []
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
-            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
-        if too_large:
-            with advising(UsageError, _PRUNE):
-                prepared.plan_records(too_large)
+            raise InputError(
+                f"{error}; {_ways(cover, options, [] if options.prune_to_fit else requests)}"
+            ) from error
         if len(secrets) < len(others):
             return replace(options, prune_to_fit=True)
-        subsampled_counts(prepared, secrets)
+        _counts(prepared, secrets, options)
         return options
 
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
@@ -109,19 +109,27 @@ class CarryMethod:
             "capacity": prepared.record_capacity(record_requests(models)),
             "gaussians_before_pruning": [len(model) for model in models],
         }
-        if options.prune_to_fit:
-            counts = subsampled_counts(prepared, models)
-            models = [most_visible(model, count) for model, count in zip(models, counts, strict=True)]
-        with advising(UsageError, _PRUNE):
-            records = encode_all(prepared, models)
+        whole, counts = models, _counts(prepared, models, options)
+        models = [most_visible(model, count) for model, count in zip(whole, counts, strict=True)]
+        records = encode_all(prepared, models)
         stego = prepared.embed(list(zip(keys, records, strict=True)))
         opened = [self.unpack(LOW_BITS.extract(stego, key)) for key in keys]
         seconds = time.monotonic() - start
         if [len(each.gaussians) for each in opened] != [len(model) for model in models]:
             raise RuntimeError("what was written does not open again as it should")
         details["bits_per_gaussian"] = [each.bits for each in opened]
+        if any(clamped := [out_of_range(model) for model in models]):
+            details["gaussians_with_clamped_numbers"] = clamped
+        if options.prune_to_fit:
+            pairs = list(zip(whole, models, strict=True))
+            details["share_kept_by_pruning"] = [round(len(kept) / len(model), 4) for model, kept in pairs]
+            details["pruned_secret_psnr_against_the_whole"] = [
+                None if kept is model else round(cost(model, kept), 1) for model, kept in pairs
+            ]
         if prepared.cover is not cover.model:
-            details["dither_psnr"] = round(cost(cover.model, prepared.cover), 1)
+            details["dithered_cover_psnr_against_the_one_before"] = round(
+                cost(cover.model, prepared.cover), 1
+            )
         return Stego(stego, None, tuple(opened), seconds, details=details)
 
     def unpack(self, content: Content) -> CarriedSecret:
@@ -160,3 +168,17 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
         return _LEARNED
     fits = sum(each.count for each in requests) <= (prepared.record_capacity(requests) if requests else 0)
     return _DITHER if fits else _DITHER_AND_PRUNE
+
+
+def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryOptions) -> list[int]:
+    """How many Gaussians of each model are carried: all, unless pruning may leave some out.
+
+    Raises UsageError if they do not fit.
+    """
+    with advising(UsageError, _SIDECAR):
+        kept = subsampled_counts(prepared, models)  # refuses where pruning would not help either
+    if options.prune_to_fit:
+        return kept
+    with advising(UsageError, _PRUNE):
+        prepared.plan_records(record_requests(models))
+    return [len(model) for model in models]

@@ -30,7 +30,7 @@ from keyss.methods.base import Frame, Remains
 from keyss.methods.learned.decoder import Decoder, DecoderShape, parse_mask
 from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift
 
-FORMAT, VERSION = "keyss-secret", 4
+FORMAT, VERSION = "keyss-secret", 5
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size

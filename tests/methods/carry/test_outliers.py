@@ -1,0 +1,127 @@
+"""Outliers of a carried secret: whatever they are, the bulk comes back as precisely as without them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import keyss
+from channels.low_bits.trained_like import trained_like
+from keyss import Gaussians, Secret
+from keyss.core.gaussians import DRAWN_OPACITY
+from keyss.files.ply import write_ply
+from keyss.methods.carry.quantise import Codec, outliers
+from keyss.methods.carry.table import Table
+from keyss.rendering import render
+from tiny_scenes import ring_cameras
+
+KEY = "a key of many characters: 93hXmQ2"
+NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
+LARGEST = float(np.finfo(np.float32).max)
+# What somebody may find in a file: far, huge, flat, opaque, glaring, without a length.
+HOSTILE = (
+    *(("means", value) for value in (1e3, -1e10, 1e15, 1e30, LARGEST)),
+    *(("log_scales", value) for value in (-30.0, -LARGEST, 10.0, 80.0)),
+    *(("opacity_logits", value) for value in (-LARGEST, 16.0, LARGEST)),
+    *(("sh", value) for value in (1e3, -1e10, LARGEST)),
+    *(("quats", value) for value in (0.0, 1e-20, 1e20, LARGEST)),
+)
+
+
+def _bulk(count: int, seed: int = 0, degree: int = 3) -> Gaussians:
+    """Seen whole by `ring_cameras`, with colours that go together."""
+    model = trained_like(count, seed, degree)
+    sh = 0.25 * model.sh + 0.75 * model.sh[:, :, :1]
+    return Gaussians(model.means / 4, model.quats, model.log_scales + 1, model.opacity_logits, sh)
+
+
+def _with(model: Gaussians, rows: torch.Tensor, name: str, value: float) -> Gaussians:
+    changed = model.map(torch.clone)
+    getattr(changed, name)[rows] = value
+    return changed
+
+
+def _coded(model: Gaussians, bits: int) -> Gaussians:
+    table = Table.of_size(bits, model.sh_degree)
+    assert table is not None
+    codec = Codec.fit(model, table)
+    assert Codec.unpack(codec.pack()) == codec
+    back = codec.decode(codec.encode(model))
+    assert all(torch.isfinite(getattr(back, name)).all() for name in NAMES)
+    return back
+
+
+def _psnr(one: Gaussians, other: Gaussians) -> float:
+    views = [(render(each, camera).clamp(0, 1) for each in (one, other)) for camera in ring_cameras(2)]
+    error = torch.stack([(a - b).square().mean() for a, b in views]).mean()
+    return float(-10 * torch.log10(error))
+
+
+@pytest.mark.parametrize(("name", "value"), HOSTILE)
+@pytest.mark.parametrize("bits", [264, 568])
+def test_one_outlier_costs_the_bulk_less_than_a_tenth_of_a_decibel(
+    bits: int, name: str, value: float
+) -> None:
+    model = _bulk(1000)
+    changed = _with(model, torch.tensor([17]), name, value)
+    rest = torch.arange(1000) != 17
+    plain = _coded(model, bits)
+    assert _psnr(model[rest], _coded(changed, bits)[rest]) > _psnr(model[rest], plain[rest]) - 0.1
+    # With the outlier: one that is drawn is drawn, one that is not stays away.
+    assert _psnr(changed, _coded(changed, bits)) > _psnr(model, plain) - 3
+
+
+@given(st.data(), st.integers(0, 3), st.sampled_from([0, 22, 300]), st.floats(0, 0.04))
+@settings(max_examples=30, deadline=None, database=None)
+def test_no_share_of_hostile_values_takes_a_bit_from_the_bulk(
+    data: st.DataObject, degree: int, more: int, share: float
+) -> None:
+    """At most twice the error that the same lines make of the bulk alone: half of a bit on average."""
+    model = _bulk(300, data.draw(st.integers(0, 9)), degree)
+    changed = model.map(torch.clone)
+    bad = torch.zeros(300, dtype=torch.bool)
+    finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
+    for _ in range(int(300 * share)):
+        row, name = data.draw(st.integers(0, 299)), data.draw(st.sampled_from(NAMES))
+        getattr(changed, name)[row] = data.draw(finite)
+        bad[row] = True
+    bits = Table.floor(degree).total + more
+    alone, found = _coded(model, bits), _coded(changed, bits)
+    usual = ~bad & ~torch.from_numpy(outliers(changed))
+    assert int(usual.sum()) >= 300 - int(bad.sum()) - 15
+    for name in NAMES[:1] + NAMES[2:]:
+        own, now = (
+            (getattr(each, name) - getattr(model, name))[usual].double().square().mean().sqrt()
+            for each in (alone, found)
+        )
+        assert float(now) <= 2 * float(own) + 1e-6, name
+
+
+def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:
+    model = _with(_bulk(200), torch.tensor([3]), "means", 1e30)
+    assert model.overflow.nonzero().tolist() == [[3]]
+    back = _coded(model, 568)
+    assert float(back.opacities[3]) < DRAWN_OPACITY
+    assert float(back.means[3].abs().max()) < 2e15
+
+
+@pytest.mark.parametrize("value", [1e10, 1e30])
+def test_a_secret_with_an_outlier_is_carried_from_file_to_file(tmp_path: Path, value: float) -> None:
+    secret = _with(_bulk(900, 1), torch.tensor([5]), "means", value)
+    write_ply(tmp_path / "secret.ply", secret)
+    write_ply(tmp_path / "cover.ply", trained_like(2000))
+    result = keyss.hide(
+        tmp_path / "cover.ply",
+        [Secret(tmp_path / "secret.ply", KEY)],
+        method="carry",
+        width=48,
+        out=tmp_path / "run",
+    )
+    assert result.metrics.secrets[0].psnr > 50
+    assert result.metrics.details.get("gaussians_with_clamped_numbers") == ([1] if value > 1e15 else None)
+    assert _psnr(secret, keyss.reveal(result.stego, KEY)) > 60
