@@ -251,7 +251,8 @@ def plan(
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
     models = [cover_model, *(secret.model for secret in secrets)]
-    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    arguments = ["cover_model", *["model"] * len(secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
     options = chosen.prepare(inputs, options)
     if out is not None:
         check_disk(Path(out), chosen, options, inputs)
