@@ -71,11 +71,15 @@ def check_degrees(channel: Channel, cover: int, secrets: Sequence[int]) -> None:
     degree = max(secrets, default=0)
     least, most = Table.floor(degree).record_bytes, channel.largest_record(cover)
     if least > most:
-        how = "" if cover > 0 else " with `sh_degree=1`, or with `sidecar=True`,"
+        how = (
+            '`method="learned"` can hide it'
+            if cover > 0
+            else '`method="learned", sh_degree=1` or `method="learned", sidecar=True` can hide it'
+        )
         raise UsageError(
             f"a cover of SH degree {cover} cannot carry a secret of SH degree {degree}: one of its "
             f"Gaussians has room for {most} bytes, and one of the secret's takes at least {least}; "
-            f'`method="learned"`{how} can hide it'
+            f"{how}"
         )
 
 

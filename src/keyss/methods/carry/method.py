@@ -29,9 +29,13 @@ from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.carry.quantise import out_of_range
 from keyss.methods.dither import cost, dither
 
-_PRUNE = "`prune_to_fit=True` leaves out the least visible"
+_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
 _SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
+_DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
+_DITHER_AND_PRUNE = (
+    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
+)
 
 
 class CarryMethod:
@@ -45,25 +49,29 @@ class CarryMethod:
     presets: Mapping[str, CarryOptions] = PRESETS
 
     def prepare(self, inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-        """Unchanged; refuses models that will not fit, and a cover whose low bits are not random."""
+        """Refuses given models that will not fit, and a given cover whose low bits are not random.
+
+        Of models that are fitted first, sizes and low bits are not known: they are made to fit rather than
+        refused after their training.
+        """
         cover, *others = (each.model for each in inputs)
         degree, *degrees = _degrees(inputs, options)
         check_degrees(LOW_BITS, degree, degrees)
         secrets = [model for model in others if model is not None]
-        requests = (
-            record_requests(secrets) if len(secrets) == len(others) and not options.prune_to_fit else []
-        )
+        requests = record_requests(secrets)
         if cover is None:
-            if requests:
+            if requests and not options.prune_to_fit:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something
                     plan_records(requests, options.fit.max_gaussians, degree)
-            return options
+            return replace(options, dither=True, prune_to_fit=True)
+        too_large = requests if not options.prune_to_fit else []
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
-            raise InputError(f"{error}; {_ways(cover, options, requests)}") from error
-        if len(secrets) == len(others):
-            _counts(prepared, secrets, options)
+            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
+        if len(secrets) < len(others):
+            return replace(options, prune_to_fit=True)
+        _counts(prepared, secrets, options)
         return options
 
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
@@ -75,7 +83,7 @@ class CarryMethod:
         if cover is not None:
             prepared = _prepared(cover, options)
             carriers = prepared.carriers
-            if options.dither:
+            if prepared.cover is not cover:
                 psnr = cost(cover, prepared.cover)
                 notes.append(f"dithering leaves the cover at {psnr:.1f} dB PSNR against itself")
         requests = list(map(record_request, sizes[1:], degrees[1:]))
@@ -93,7 +101,8 @@ class CarryMethod:
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
-        prepared = _prepared(cover.model, options)
+        with advising(InputError, _LEARNED if options.dither else _DITHER):
+            prepared = _prepared(cover.model, options)
         details: dict[str, Any] = {
             "carriers": prepared.carriers,
             "capacity": prepared.record_capacity(record_requests(models)),
@@ -110,13 +119,13 @@ class CarryMethod:
         details["bits_per_gaussian"] = [each.bits for each in opened]
         if any(clamped := [out_of_range(model) for model in models]):
             details["gaussians_with_clamped_numbers"] = clamped
-        if options.prune_to_fit:
+        if any(kept is not model for model, kept in zip(whole, models, strict=True)):
             pairs = list(zip(whole, models, strict=True))
             details["share_kept_by_pruning"] = [round(len(kept) / len(model), 4) for model, kept in pairs]
             details["pruned_secret_psnr_against_the_whole"] = [
                 None if kept is model else round(cost(model, kept), 1) for model, kept in pairs
             ]
-        if options.dither:
+        if prepared.cover is not cover.model:
             details["dithered_cover_psnr_against_the_one_before"] = round(
                 cost(cover.model, prepared.cover), 1
             )
@@ -139,7 +148,13 @@ def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
 
 
 def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
-    return LOW_BITS.prepare(dither(cover, os.urandom(32)) if options.dither else cover)
+    """The cover as it is, if that will do."""
+    try:
+        return LOW_BITS.prepare(cover)
+    except InputError:
+        if not options.dither:
+            raise
+    return LOW_BITS.prepare(dither(cover, os.urandom(32)))
 
 
 def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
@@ -147,13 +162,11 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
     if options.dither:
         return _LEARNED
     try:
-        prepared = _prepared(cover, replace(options, dither=True))
+        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))
     except InputError:
         return _LEARNED
-    dithering = "`dither=True` gives it new low bits"
-    if requests and sum(each.count for each in requests) > prepared.record_capacity(requests):
-        dithering += f" and {_PRUNE}"
-    return f"{dithering}, or {_LEARNED}"
+    fits = sum(each.count for each in requests) <= (prepared.record_capacity(requests) if requests else 0)
+    return _DITHER if fits else _DITHER_AND_PRUNE
 
 
 def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryOptions) -> list[int]:
