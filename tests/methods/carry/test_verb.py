@@ -156,7 +156,7 @@ def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) ->
     (secret,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
     assert plain is not None
     assert secret.psnr == pytest.approx(plain.psnr, abs=0.05)
-    revealed = keyss.reveal(tmp_path / "run/stego.ply", KEY)
+    revealed = keyss.reveal(tmp_path / "run/publish/stego.ply", KEY)
     assert (len(revealed),) == result.metrics.secret_gaussians
     with pytest.raises(UsageError, match="scenes in memory"):
         keyss.evaluate(tmp_path / "run", [KEY])
