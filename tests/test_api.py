@@ -130,7 +130,9 @@ def test_existing_models_are_bounds_and_are_not_fitted_again(
     given = run / "private" / "cover.ply"
     secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
     keyss.hide(folders[0], [secret], method=SIDECAR, cover_model=given, out=tmp_path / "again")
-    assert (tmp_path / "again" / "publish" / "stego.ply").read_bytes() == (run / "publish" / "stego.ply").read_bytes()
+    assert (tmp_path / "again" / "publish" / "stego.ply").read_bytes() == (
+        run / "publish" / "stego.ply"
+    ).read_bytes()
 
 
 def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ A record holds everything that renders: position, log scales, opacity logit, dir
 - of three colours their brightness and two differences, which are small, on a line of their own;
 - of a quaternion the three smallest components, of which none is above sqrt(1/2), and which is left out.
 
-Lines are fitted to the bulk. A Gaussian with a number far outside of it is an *outlier*: one bit of its record
-says so, and its numbers go through the same lines with a longer reach. So outliers cost the bulk nothing but
-that bit, whatever their numbers are. Numbers so large that nothing is drawn, or nothing else, are clamped.
+Lines are fitted to the bulk. A Gaussian with a number far outside of it is an *outlier*: one bit of its
+record says so, and its numbers go through the same lines with a longer reach. So outliers cost the bulk
+nothing but that bit, whatever their numbers are. Numbers so large that nothing is drawn, or nothing else, are clamped.
 """
 
 from __future__ import annotations
@@ -316,7 +316,7 @@ def _sample(values: Floats) -> Floats:
 def _numbers(gaussians: Gaussians, table: Table) -> Iterator[_Numbers]:
     """All numbers but the quaternions, those of each line together, in the order in which they are stored.
 
-    A Gaussian that is never drawn becomes transparent, so that its numbers in the limits are not drawn either.
+    A Gaussian that is never drawn becomes transparent, so that it is not drawn when it is clamped, either.
     """
     means, log_scales, _, opacity, *colours = table.bits
     positions = _doubles(gaussians.means.clamp(-MAX_COORDINATE, MAX_COORDINATE))
