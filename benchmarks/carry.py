@@ -32,7 +32,7 @@ from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.methods.carry.carrying import record_request
-from keyss.methods.carry.dither import cost
+from keyss.methods.dither import cost
 from keyss.rendering import render
 from methods.carry.carried import embed, extract
 

@@ -22,6 +22,7 @@ from keyss import FitConfig, LearnedOptions, Secret
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
 from keyss.runs.config import read_config
+from keyss.runs.files import STEGO
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = LearnedOptions(
@@ -79,11 +80,13 @@ def test_metrics_have_their_shape(run: Path) -> None:
     metrics = json.loads((run / "private" / "metrics.json").read_text())
     assert set(metrics) == {
         *("method", "cover", "secrets", "baseline", "wrong_key", "chance_level", "gaussians"),
+        *("photos", "against_plain"),
         *("secret_gaussians", "iterations", "seconds", "width", "seed", "details", "version", "keyss"),
     }
     assert metrics["method"] == "learned"
     assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim"}
-    assert set(metrics["baseline"]) == {"cover", "secrets"}
+    assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians"}
+    assert metrics["photos"] == [True, True]
     wrong = metrics["wrong_key"]
     assert wrong["keys"] == 32
     assert set(wrong["vs_cover"]) == set(wrong["vs_secrets"][0]) == {"mean", "min", "max"}
@@ -130,9 +133,7 @@ def test_existing_models_are_bounds_and_are_not_fitted_again(
     given = run / "private" / "cover.ply"
     secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
     keyss.hide(folders[0], [secret], method=SIDECAR, cover_model=given, out=tmp_path / "again")
-    assert (tmp_path / "again" / "publish" / "stego.ply").read_bytes() == (
-        run / "publish" / "stego.ply"
-    ).read_bytes()
+    assert (tmp_path / "again" / STEGO).read_bytes() == (run / STEGO).read_bytes()
 
 
 def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:

@@ -15,16 +15,16 @@ from keyss import _threads  # noqa: F401  before anything imports torch
 from keyss._version import __version__
 
 if TYPE_CHECKING:
-    from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal
-    from keyss.core import Camera, Gaussians, KeyssError, Scene, View, WrongKeyError
+    from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal, verify
+    from keyss.core import Camera, Gaussians, KeyssError, KeyssWarning, Scene, View, WrongKeyError
     from keyss.files import load_scene, read_model, write_model
     from keyss.fitting import FitConfig
     from keyss.keys import generate_key
     from keyss.methods.registry import CarryOptions, LearnedOptions
     from keyss.runs.describe import info
 
-__all__ = ["HideResult", "Secret", "__version__", "evaluate", "fit", "hide", "render", "reveal"]
-__all__ += ["Camera", "Gaussians", "KeyssError", "Scene", "View", "WrongKeyError"]
+__all__ = ["HideResult", "Secret", "__version__", "evaluate", "fit", "hide", "render", "reveal", "verify"]
+__all__ += ["Camera", "Gaussians", "KeyssError", "KeyssWarning", "Scene", "View", "WrongKeyError"]
 __all__ += ["CarryOptions", "FitConfig", "LearnedOptions"]
 __all__ += ["generate_key", "info", "load_scene", "read_model", "write_model"]
 

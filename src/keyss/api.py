@@ -5,6 +5,7 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from keyss.audit.run import audit as audit
-from keyss.core.errors import QualityError, UsageError
+from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import png_bytes
@@ -40,7 +41,10 @@ from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
+from keyss.runs.planning import Plan, check_disk, plan_hiding
 from keyss.runs.records import write_record
+from keyss.runs.revealing import RevealResult, reveal_model
+from keyss.runs.verifying import Verification, check_model, check_secret
 
 WRONG_KEYS = 32
 MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
@@ -156,13 +160,8 @@ def hide(
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
     is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
-    chosen, options = _method(method)
-    if not 1 <= len(secrets) <= chosen.most_secrets:
-        raise UsageError(
-            f"expected 1 to {chosen.most_secrets} secrets for the method {chosen.name}, got {len(secrets)}"
-        )
+    chosen, options = _method(method, secrets)
     keys = [secret.key for secret in secrets]
-    _check_keys(keys)
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
     models = [cover_model, *(secret.model for secret in secrets)]
@@ -184,10 +183,20 @@ def hide(
     if out is not None:
         told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
         folder = RunFolder(
-            out, "hide", told, onto=("scenes",), writes=(STEGO, CONFIG), overwrite=overwrite, resume=resume
+            out,
+            "hide",
+            told,
+            onto=("scenes",),
+            writes=(STEGO, CONFIG),
+            inputs=[Path(each) for each in (*sources, *models) if isinstance(each, str | Path)],
+            overwrite=overwrite,
+            resume=resume,
         )
-    inputs = [_input(*each) for each in zip(sources, models, strict=True)]
+    arguments = ["cover_model", *["model"] * len(secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
     options = chosen.prepare(inputs, options)
+    if folder:
+        check_disk(folder.path, chosen, options, inputs)
     trains = chosen.trains or any(each.model is None for each in inputs)
     scenes = [
         as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
@@ -220,6 +229,40 @@ def hide(
     return HideResult(stego.gaussians, stego.sidecar, metrics)
 
 
+def plan(
+    cover: PathLike | Scene | Gaussians,
+    secrets: Sequence[Secret],
+    *,
+    method: str | MethodOptions = "learned",
+    width: int | None = None,
+    background: Background = None,
+    skip_missing: bool = False,
+    cover_model: PathLike | Gaussians | None = None,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+) -> Plan:
+    """What `hide` with these arguments will do, and what it will take: see `keyss.runs.planning`.
+
+    Refuses what `hide` would refuse before its first step, renders and trains for some seconds to time it,
+    and writes nothing. `out`: where the results would go; room for them is looked for. Raises
+    KeyssError and its children.
+    """
+    chosen, options = _method(method, secrets)
+    target = resolve_device(device)
+    sources = [cover, *(secret.scene for secret in secrets)]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    arguments = ["cover_model", *["model"] * len(secrets)]
+    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
+    options = chosen.prepare(inputs, options)
+    if out is not None:
+        check_disk(Path(out), chosen, options, inputs)
+    scenes = [
+        as_scene(source, width, background, train_pictures=False, skip_missing=skip_missing)
+        for source in sources
+    ]
+    return plan_hiding(chosen, options, inputs, scenes, target, None if out is None else Path(out))
+
+
 def reveal(
     stego: PathLike | Gaussians,
     key: str,
@@ -237,23 +280,89 @@ def reveal(
     Which method hid it shows itself. `frame`: "secret" gives it in its own frame, so that its cameras fit it;
     "cover" leaves it where it was hidden, which a carried one never was. If Gaussians were lost, the others
     make up for them (`keyss.core.pruning_compensation`). `force` is for models that were quantised: it skips
-    the check that the secret belongs to this one.
+    the check that the secret belongs to this one, and takes as little of it as there is.
 
-    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if there is one, else what
-    lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for a key that
-    opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for files that
-    are not what they should be or do not belong together.
+    `decoder`: a sidecar, or its bytes; by default the one beside the model's file if it opens and belongs to
+    it, else what lies in the model's low bits. `out` (a file) gets the revealed PLY. Raises WrongKeyError for
+    a key that opens nothing (with `decoy` the cover comes instead, see `keyss.methods.decoy`), InputError for
+    files that are not what they should be or do not belong together, and where less than a tenth of the
+    secret is left. Warns (KeyssWarning) of more than a hundredth that is missing, and of a sidecar beside
+    the file that was passed over. `reveal_counted` and `verify` tell how much there is.
     """
+    found = reveal_counted(
+        stego,
+        key,
+        decoder=decoder,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
+    return found.gaussians
+
+
+def reveal_counted(
+    stego: PathLike | Gaussians,
+    key: str,
+    *,
+    decoder: PathLike | bytes | None = None,
+    frame: Frame = "secret",
+    decoy: bool = False,
+    force: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> RevealResult:
+    """`reveal`, with the number of Gaussians that were hidden in the result."""
     target = resolve_device(device)
-    path = None if out is None else check_model_output(out, overwrite)
-    model = as_model(stego)
-    if decoder is None and not isinstance(stego, Gaussians):
-        decoder = sidecar_beside(Path(stego))
-    secret = open_file(model, key, decoder, decoy=decoy)
-    found = secret.reveal(model.to(target), frame=frame, force=force)
+    beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
+    inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
+    path = None if out is None else check_model_output(out, overwrite, inputs)
+    found = reveal_model(
+        as_model(stego),
+        key,
+        device=target,
+        decoder=decoder,
+        beside=beside,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+    )
+    if not force:
+        found.check_usable()
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     if path is not None:
-        write_model(path, found)
+        write_model(path, found.gaussians)
     return found
+
+
+def verify(
+    model: PathLike | Gaussians,
+    key: str | None = None,
+    *,
+    decoder: PathLike | bytes | None = None,
+    device: Backend = "auto",
+) -> Verification:
+    """Whether a model is sound and, with a key, whether all is there that the key opens; nothing is written.
+
+    Without a key, nothing that comes back says whether something is hidden. `decoder`: see `reveal`. Raises
+    InputError for a file that is no whole and finite model or not the one the secret was hidden in,
+    WrongKeyError for a key that opens nothing, UsageError for a decoder without a key.
+    """
+    if key is None and decoder is not None:
+        raise UsageError("a sidecar is verified with its key: give `key`, or leave out `decoder`")
+    target = resolve_device(device)
+    name = "model" if isinstance(model, Gaussians) else str(model)
+    gaussians = as_model(model)
+    secret = None
+    if key is not None:
+        beside = None if isinstance(model, Gaussians) else sidecar_beside(Path(model))
+        found = reveal_model(gaussians, key, device=target, decoder=decoder, beside=beside)
+        secret = check_secret(found)
+    return Verification(name, check_model(gaussians), secret)
 
 
 def render(
@@ -274,7 +383,8 @@ def render(
     folder) gets a PNG per camera.
     """
     target = resolve_device(device)
-    folder = RunFolder(out, "render", overwrite=overwrite) if out is not None else None
+    inputs = [Path(model)] if isinstance(model, str | Path) else []
+    folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     gaussians = as_model(model).to(target)
     scene = as_scene(cameras, width, background, skip_missing=skip_missing)
     views: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
@@ -293,7 +403,8 @@ def evaluate(
     seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
-    """Measure a folder that `hide` made again, from its files and the test views; rewrites its `metrics.json`.
+    """Measure a folder that `hide` made again, from its files and the test views; rewrites its
+    `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
     by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
@@ -319,18 +430,30 @@ def evaluate(
     return metrics
 
 
-def _method(chosen: str | MethodOptions) -> tuple[Method, MethodOptions]:
-    """A method and its options."""
+def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
+    """A method and its options. Raises UsageError for as many secrets, or for keys, as it cannot have."""
     if isinstance(chosen, MethodOptions):
-        return registry.of_options(chosen), chosen
-    method = registry.get(chosen)
-    return method, next(iter(method.presets.values()))
+        method, options = registry.of_options(chosen), chosen
+    else:
+        method = registry.get(chosen)
+        options = next(iter(method.presets.values()))
+    if not 1 <= len(secrets) <= method.most_secrets:
+        raise UsageError(
+            f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
+        )
+    _check_keys([secret.key for secret in secrets])
+    return method, options
 
 
-def _input(source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None) -> SceneInput:
-    """A scene and the plain model that is given with it, or that it is."""
+def _input(
+    source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None, argument: str
+) -> SceneInput:
+    """A scene and the plain model that is given with it as `argument`, or that it is. Raises UsageError."""
     photos = isinstance(source, Scene) or not is_model(source)
-    if not photos and model is None:
+    if not photos:
+        if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
+            what = "a model in memory" if isinstance(source, Gaussians) else source
+            raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
         model = source  # type: ignore[assignment]
     return SceneInput(None if model is None else as_model(model), photos)
 
@@ -359,8 +482,8 @@ def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
         if least > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
             raise QualityError(
                 f"{who} comes out at {each.psnr:.1f} dB against its plain model, and empty pictures "
-                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, and "
-                "with `resume=True` nothing is trained again"
+                f"at {each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it all the same, "
+                "and with `resume=True` nothing is trained again"
             )
 
 

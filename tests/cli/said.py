@@ -30,7 +30,7 @@ METRICS = HideMetrics(
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
 COMMANDS = [command.__name__ for command in commands.ALL]
-PROGRAM = [sys.executable, "-c", "import sys; from keyss.cli import main; sys.exit(main())"]
+PROGRAM = [sys.executable, "-m", "keyss"]
 
 
 @dataclass(frozen=True)

@@ -109,8 +109,8 @@ class TestArguments:
     @pytest.mark.parametrize(
         ("extra", "words"),
         [
-            (("--iterations", 0), "iterations"),
-            (("--max-gaussians", -5), "max_gaussians"),
+            (("--iterations", 0), "--iterations: expected"),
+            (("--max-gaussians", -5), "--max-gaussians: expected"),
             (("--seed", -1), "--seed"),
             (("--seed", 10**30), "--seed"),
             (("--mask", "op,colour"), "colour"),
@@ -129,6 +129,30 @@ class TestArguments:
         monkeypatch.setenv("KEYSS_KEY", "k")
         assert_refused(keyss("hide", "--cover", "A", "--secret", "B", "-o", "out", *extra), 2, words)
         assert hidden == []
+
+    @pytest.mark.parametrize(
+        ("extra", "words"),
+        [
+            (("--iterations", 7), "--iterations: nothing is trained"),
+            (("--preset", "quick", "--max-gaussians", 9), "--preset and --max-gaussians: nothing is trained"),
+        ],
+    )
+    def test_what_has_no_effect_is_refused(
+        self,
+        keyss: Callable[..., Said],
+        hidden: list[Any],
+        monkeypatch: pytest.MonkeyPatch,
+        extra: tuple[object, ...],
+        words: str,
+    ) -> None:
+        monkeypatch.setenv("KEYSS_KEY", "k")
+        carry = ("hide", "--method", "carry", "-o", "out", *extra)
+        assert_refused(keyss(*carry, "--cover", "a.ply", "--secret", "b.ply"), 2, words)
+        models = ("--cover-model", "a.ply", "--secret-model", "b.ply")
+        assert_refused(keyss(*carry, "--cover", "A", "--secret", "B", *models), 2, words)
+        assert hidden == []
+        assert keyss(*carry, "--cover", "a.ply", "--secret", "B").status == 0
+        assert keyss("hide", "-o", "out", *extra, "--cover", "a.ply", "--secret", "b.ply").status == 0
 
     def test_hide_needs_a_secret(self, keyss: Callable[..., Said], hidden: list[Any]) -> None:
         assert keyss("hide", "--cover", "A", "-o", "out").status == 2

@@ -13,6 +13,8 @@ import pytest
 from cli.said import SMALL, Said, assert_refused, listing
 from files.scene_files import photo, save, write_colmap
 
+STEGO = "hidden/publish/stego.ply"
+
 
 def _scene_with(change: Callable[[Path], None]) -> Callable[[Path], list[object]]:
     """`fit` on a COLMAP scene after `change`."""
@@ -87,6 +89,22 @@ def _without_clip(folder: Path) -> list[object]:
     return _hide(folder, key_encoder="clip", clip_model=folder / "a")
 
 
+def _plain(folder: Path, name: str) -> Path:
+    return folder / "hidden" / "private" / f"{name}.ply"
+
+
+def _reveal(folder: Path, *extra: object, key: Path | None = None) -> list[object]:
+    stego, key = folder / "hidden" / "publish" / "stego.ply", key or folder / "key.txt"
+    return ["reveal", stego, "--key-file", key, "-o", folder / "secret.ply", *extra]
+
+
+def _spaced_key(folder: Path) -> Path:
+    path = folder / "spaced.txt"
+    path.write_text((folder / "key.txt").read_text().strip() + " \n")
+    path.chmod(0o600)
+    return path
+
+
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "missing folder": (4, "nowhere", lambda f: ["fit", f / "nowhere", "-o", f / "out"]),
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
@@ -106,7 +124,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
     "key file empty": (4, "keyss keygen", _empty_key),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
-    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / "hidden/publish/stego.ply", "-o", f / "s.ply"]),
+    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / STEGO, "-o", f / "s.ply"]),
     "header truncated": (4, "stego.ply", _ply_with(lambda data: data[:100])),
     "data truncated": (4, "stego.ply", _ply_with(lambda data: data[:-1])),
     "negative count": (4, "stego.ply", _ply_with(_with_count("-3"))),
@@ -126,23 +144,40 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         "--overwrite",
         lambda f: [
             "reveal",
-            f / "hidden/publish/stego.ply",
+            f / STEGO,
             "--key-file",
             f / "key.txt",
             "-o",
-            f / "hidden/publish/stego.ply",
+            f / STEGO,
         ],
     ),
     "folder of the file missing": (
         5,
         "nowhere",
-        lambda f: ["reveal", f / "hidden/publish/stego.ply", "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
+        lambda f: ["reveal", f / STEGO, "--key-file", f / "key.txt", "-o", f / "nowhere/s.ply"],
     ),
     "evaluate without a run": (
         4,
         "config.json",
         lambda f: ["evaluate", f / "a", "--key-file", f / "key.txt"],
     ),
+    "a model of a model": (
+        2,
+        "leave out --cover-model",
+        lambda f: _hide(f, cover=_plain(f, "cover"), cover_model=_plain(f, "secret-1")),
+    ),
+    "a model of a secret model": (
+        2,
+        "leave out --secret-model",
+        lambda f: _hide(f, secret=_plain(f, "secret-1"), secret_model=_plain(f, "cover")),
+    ),
+    "a missing decoder": (4, "error: nope: expected a file", lambda f: _reveal(f, "--decoder", "nope")),
+    "two keys for one secret": (
+        2,
+        "one --key-file, got 2",
+        lambda f: _reveal(f, "--key-file", f / "wrong.txt"),
+    ),
+    "key with a space": (3, "ends with a space", lambda f: _reveal(f, key=_spaced_key(f))),
     "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
     "info of another file": (4, "key.txt", lambda f: ["info", f / "key.txt"]),
     "clip without a model": (6, "--clip-model", _without_clip),

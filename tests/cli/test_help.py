@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import COMMANDS, Said
+from keyss import __version__
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.methods import registry
 
@@ -19,8 +20,8 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        making = ["keygen", "fit", "hide", "reveal", "render"]
-        judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo"]
+        making = ["keygen", "fit", "hide", "reveal", "verify", "render"]
+        judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "version"]
         assert making + judging == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)
@@ -34,7 +35,7 @@ class TestHelp:
     def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
         out = keyss(command, "--help").out
         assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "demo"})
-        computing = {"fit", "hide", "reveal", "render", "evaluate", "audit", "demo"}
+        computing = {"fit", "hide", "reveal", "verify", "render", "evaluate", "audit", "demo"}
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 
@@ -56,9 +57,9 @@ class TestHelp:
         for name, method in registry.METHODS.items():
             presets["hide", "--method", name] = {each: own.fit for each, own in method.presets.items()}
         for command, fits in presets.items():
-            said = " ".join(keyss(*command, "--help").out.replace("│", " ").split())
+            said = "".join(keyss(*command, "--help").out.replace("│", " ").split())
             for name, fit in fits.items():
-                assert f"{name} {fit.iterations:,} and {fit.max_gaussians:,}" in said
+                assert f"{name}{fit.iterations:,}and{fit.max_gaussians:,}" in said
 
     @pytest.mark.parametrize("method", ["learned", "carry"])
     def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:
@@ -73,13 +74,20 @@ class TestHelp:
         program += "assert not {'torch', 'keyss.methods'} & set(sys.modules)"
         subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
 
+    @pytest.mark.parametrize("arguments", [("--version",), ("-V",), ("version",)])
+    def test_of_the_version(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:
+        assert keyss(*arguments) == Said(0, f"{__version__}\n", "")
+
+    def test_comes_without_being_asked_for(self, keyss: Callable[..., Said]) -> None:
+        assert keyss() == keyss("--help")
+
     def test_an_unknown_method_names_those_there_are(self, keyss: Callable[..., Said]) -> None:
         said = keyss("hide", "--method", "none", "--cover", "A", "--secret", "B", "-o", "out")
         assert said.status == 2
         assert "learned" in said.err
         assert "carry" in said.err
 
-    @pytest.mark.parametrize("arguments", [(), ("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
+    @pytest.mark.parametrize("arguments", [("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
     def test_wrong_usage_exits_with_2(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:
         said = keyss(*arguments)
         assert said.status == 2

@@ -168,9 +168,21 @@ def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
         with unprivileged():
             said = keyss(*command)
         assert_refused(said, 4, str(scene))
-        if command[0] != "evaluate":
-            assert "ermission denied" in said.err
+        assert "ermission denied" in said.err or (command[0] == "evaluate" and closed)
     (scene / closed).chmod(0o700)
+
+
+def test_a_run_of_somebody_else_s_is_an_input_that_cannot_be_read(
+    keyss: Keyss, world: Path, open_folder: Path
+) -> None:
+    run = shutil.copytree(world / "hidden", open_folder / "run")
+    (open_folder / "key").write_text("q7Rv2LxT9bWm4KzD")
+    keyss("evaluate", open_folder / "nowhere", *("--key-file", open_folder / "key"))  # imports all it needs
+    (run / "private").chmod(0)
+    with unprivileged():
+        said = keyss("evaluate", run, "--key-file", open_folder / "key")
+    (run / "private").chmod(0o700)
+    assert_refused(said, 4, f"{run}: cannot be read: Permission denied")
 
 
 def fitted(keyss: Keyss, scene: Path, out: Path, *extra: object) -> Said:

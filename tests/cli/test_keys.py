@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import getpass
 import os
+import re
 from pathlib import Path
 
 import pytest
 
-from keyss.cli.keys import key_of_file, keys, warn_of_doubtful_keys
-from keyss.core import InputError, UsageError
+from keyss.cli.keys import hinting_at_white_space, key_of_file, keys, warn_of_doubtful_keys
+from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.keys import generate_key
 
 
@@ -82,6 +83,8 @@ def test_as_many_files_as_secrets(tmp_path: Path) -> None:
     assert keys([path, path], 2) == ["k", "k"]
     with pytest.raises(UsageError, match="got 1"):
         keys([path], 2)
+    with pytest.raises(UsageError, match="one --key-file, got 2"):
+        keys([path, path], 1)
 
 
 def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,3 +148,29 @@ def test_weak_keys_get_a_warning_without_the_key(capsys: pytest.CaptureFixture[s
     assert "key 2: " in said
     assert "bits" in said
     assert "hunter2" not in said
+
+
+@pytest.mark.parametrize(
+    ("end", "words"),
+    [
+        ("{} ", "ends with a space"),
+        ("{}\n", "ends with a line break"),
+        ("\t{}", "begins with white space"),
+        (" {}\n", "begins with a space"),
+    ],
+)
+def test_keys_with_white_space_at_an_end_get_a_hint_without_the_key(
+    capsys: pytest.CaptureFixture[str], end: str, words: str
+) -> None:
+    key = generate_key(20)
+    warn_of_doubtful_keys([end.format(key)])
+    said = capsys.readouterr().err
+    assert words in said
+    with (
+        pytest.raises(WrongKeyError, match=re.escape(f"nothing; the key {words}")) as caught,
+        hinting_at_white_space([end.format(key)]),
+    ):
+        raise WrongKeyError("nothing")
+    assert key not in said + str(caught.value)
+    with pytest.raises(WrongKeyError, match="^nothing$"), hinting_at_white_space([key]):
+        raise WrongKeyError("nothing")

@@ -58,7 +58,8 @@ class TestTheWholePath:
         self, keyss: Callable[..., Said], world: Path, tmp_path: Path
     ) -> None:
         out = tmp_path / "secret.ply"
-        arguments = ["reveal", world / "hidden" / "publish" / "stego.ply", "--key-file", world / "wrong.txt", "-o", out]
+        stego = world / "hidden" / "publish" / "stego.ply"
+        arguments = ["reveal", stego, "--key-file", world / "wrong.txt", "-o", out]
         assert_refused(keyss(*arguments), 3, "opens nothing")
         assert listing(tmp_path) == {}
 

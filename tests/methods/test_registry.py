@@ -27,6 +27,7 @@ from keyss.methods.base import (
     Frame,
     KeyedSource,
     MethodOptions,
+    Remains,
     SceneInput,
     Source,
     Stego,
@@ -56,6 +57,12 @@ class OpenedWhole:
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         return self.model
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), len(revealed))
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        pass
 
     def fingerprint(self) -> str:
         return f"{len(self.model):016x}"

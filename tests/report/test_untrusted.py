@@ -28,6 +28,8 @@ def run(run_folder: Path, tmp_path: Path) -> Path:
 
 
 def test_no_audit_says_how_to_get_one(tmp_path: Path) -> None:
+    (tmp_path / "private").mkdir()
+    (tmp_path / "private" / "config.json").write_text("{}")
     with pytest.raises(InputError, match=r"found nothing there; `keyss audit .* makes one"):
         read_audit(tmp_path)
 

@@ -52,6 +52,7 @@ ALL_FINE: list[Change] = [
     ("stegexpose.control.stegexpose.roc", NEUTRAL),
     (SPAM, None),
     (SPAM_CONTROL, None),
+    ("stegexpose.sealwatch_missing", None),
 ]
 
 
@@ -241,6 +242,8 @@ def test_a_reader_that_was_not_there_is_not_measured(fine: Data) -> None:
     assert headline(verdicts(found)) == (
         "All 10 measures are within their limits. Not measured: reading by splat-transform."
     )
+    without = changed(fine, ("stegexpose.sealwatch_missing", "get it with pip"))
+    assert judged(without)["sealwatch on renders"].word == "not measured"
     readers[0]["loads"] = False
     line = judged(changed(fine, ("speed.readers", readers)))["reading by other programs"]
     assert (line.word, line.value) == ("missed", "by gsply; not by plyfile")

@@ -36,6 +36,13 @@ def test_what_was_written_comes_back(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "record.json").read_text())["version"] == 3
 
 
+def test_names_of_files_that_are_no_text_are_written_all_the_same() -> None:
+    """As Python gives them: with a surrogate for every byte that the locale does not know."""
+    name = "Füchse".encode().decode("ascii", "surrogateescape") + b"\xff".decode("utf-8", "surrogateescape")
+    data = record_bytes(Record(name=name, scores={name: Scores((1.0,), None)}))
+    assert list(json.loads(data)["scores"]) == [json.loads(data)["name"]] == ["Füchse\ufffd"]
+
+
 def test_numbers_that_json_does_not_have_become_null() -> None:
     data = json.loads(record_bytes(Scores((1.0,), math.nan)))
     assert data == {"values": [1.0], "best": None}

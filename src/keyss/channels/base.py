@@ -8,7 +8,7 @@ model is lost of them, and no more.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +27,8 @@ class Payload:
 
     method: str  # who reads them, 1 to METHOD_BYTES ASCII characters
     data: bytes
+    # Where it was cut into chunks that were read: those left and those that there were.
+    chunks: tuple[int, int] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

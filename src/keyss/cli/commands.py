@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
-from keyss.cli.hiding import hide, reveal
+from keyss.cli.hiding import hide, reveal, verify
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import fit, info, render
 
@@ -23,11 +23,18 @@ def keygen(
         int | None, optional("N", "Number of characters, 5.95 bits each.", "16, or what --bits needs")
     ] = None,
     bits: Annotated[int | None, optional("N", "Strength in bits instead of a length.", "none")] = None,
+    out: Annotated[
+        Path | None,
+        optional(
+            "FILE", "New file for the key, which nobody else can read.", "the standard output", aliases=["-o"]
+        ),
+    ] = None,
 ) -> None:
-    """Print a new random key.
+    """Make a new random key.
 
-    example: keyss keygen > key.txt
+    example: keyss keygen -o key.txt
     """
+    from keyss.cli.keys import write_new_key
     from keyss.core.errors import UsageError
     from keyss.keys import generate_key, length_for
 
@@ -37,7 +44,12 @@ def keygen(
         raise UsageError(f"--bits: expected at least 1, got {bits}")
     if length is None:
         length = 16 if bits is None else length_for(bits)
-    print(generate_key(length))
+    key = generate_key(length)
+    if out is None:
+        print(key)
+        return
+    write_new_key(out, key)
+    print(f"{out}: a key of {length} characters; keep a copy, for nothing is opened without it")
 
 
 def demo(
@@ -79,4 +91,4 @@ def version() -> None:
     print(__version__)
 
 
-ALL = (keygen, fit, hide, reveal, render, evaluate, audit, report, steganalyze, info, demo, version)
+ALL = (keygen, fit, hide, reveal, verify, render, evaluate, audit, report, steganalyze, info, demo, version)

@@ -22,7 +22,7 @@ NO_ROOM = OutputError.exit_status
 _ABOUT = """Hide a 3D Gaussian Splatting scene inside another one and open it only with a key.
 
 A key comes from --key-file, from the environment variable KEYSS_KEY, or from a hidden prompt. Results go to
-the standard output, progress and errors to the standard error stream."""
+the standard output, progress and errors to the standard error stream. `keyss --version` tells the version."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,7 +12,7 @@ _ASSIGNMENTS = re.compile(rf"`({_ASSIGNMENT}(?:, ?{_ASSIGNMENT})*)`")
 _NAME = re.compile(r"`([a-z_]\w*)`")
 
 # Named otherwise on the command line.
-_OTHERWISE = {"key": "key-file", "keys": "key-file", "secrets": "secret"}
+_OTHERWISE = {"key": "key-file", "keys": "key-file", "secrets": "secret", "model": "secret-model"}
 
 
 def as_flags(message: str, options: Collection[str]) -> str:

@@ -6,6 +6,7 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 import inspect
+import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -63,6 +64,9 @@ def hide(
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
     ] = 20.0,
+    dry_run: Annotated[
+        bool, arg(help="Print plan, room, and estimates of time, memory and disk; write nothing.")
+    ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -79,10 +83,11 @@ def hide(
     """
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
-    from keyss.cli.tables import print_files, print_hiding
+    from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.progress import reporter
+    from keyss.rendering.orbit import is_model
 
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
@@ -95,16 +100,45 @@ def hide(
     changes = {
         name: parse(value) if (parse := known[name][1].parse) else value
         for name, value in own.items()
-        if value not in (None, False)
+        if value is not None and value is not False
     }
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
+    given = [cover_model or cover, *(secret_model or secret)]
+    if not chosen.trains and all(map(is_model, given)):
+        training = {
+            "--preset": preset != next(iter(chosen.presets)),
+            "--iterations": iterations is not None,
+            "--max-gaussians": max_gaussians is not None,
+        }
+        if idle := [flag for flag, is_given in training.items() if is_given]:
+            raise UsageError(
+                f"{' and '.join(idle)}: nothing is trained when --method {method} gets models of all scenes; "
+                f"leave {'it' if len(idle) == 1 else 'them'} out"
+            )
     models = secret_model or (None,) * len(secret)
     opening = keys(key_file, len(secret), confirm=True)
     warn_of_doubtful_keys(opening)
+    secrets = [
+        api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)
+    ]
+    if dry_run:
+        planned = api.plan(
+            cover,
+            secrets,
+            method=options,
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            cover_model=cover_model,
+            device=device,
+            out=out,
+        )
+        print_plan(planned)
+        return
     result = api.hide(
         cover,
-        [api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)],
+        secrets,
         method=options,
         width=width,
         background=background,
@@ -219,13 +253,13 @@ def _flags(method: Method) -> set[str]:
 
 
 def reveal(
-    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply.")],
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply, or - for stdin.")],
     *,
     key_file: Annotated[
         UseAppendAction[tuple[Path, ...]],
         optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt"),
     ] = (),
-    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write.")],
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write, or - for stdout.")],
     decoder: Annotated[
         Path | None,
         optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
@@ -235,7 +269,11 @@ def reveal(
     ] = "secret",
     decoy: Annotated[bool, arg(help="With a wrong key, write the cover instead of failing.")] = False,
     force: Annotated[
-        bool, arg(help="For a .ply that was quantised: skip the check that the decoder belongs to it.")
+        bool,
+        arg(
+            help="For a .ply that was quantised or pruned: skip the check that the decoder belongs to it, "
+            "and write what there is."
+        ),
     ] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -243,13 +281,16 @@ def reveal(
     """Bring a secret back with its key.
 
     example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
+
+    example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
     """
     from keyss import api
     from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.files.streams import is_standard
 
     (key,) = keys(key_file, 1)
     with hinting_at_white_space([key]):
-        revealed = api.reveal(
+        revealed = api.reveal_counted(
             stego,
             key,
             decoder=decoder,
@@ -260,4 +301,44 @@ def reveal(
             out=out,
             overwrite=overwrite,
         )
-    print(f"{out}: {len(revealed):,} Gaussians")
+    remains = revealed.remains
+    of = f" of {remains.hidden:,}" if remains.hidden else ""
+    print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
+
+
+def verify(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
+    *,
+    key_file: Annotated[
+        Path | None, optional("FILE", "File with a key: check what it opens.", "the model alone is checked")
+    ] = None,
+    decoder: Annotated[
+        Path | None,
+        optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
+    ] = None,
+    json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
+    device: Device = "auto",
+) -> None:
+    """Check that a model is sound and, with a key, that all of its secret is there.
+
+    Exit status 0 says so, 3 that the key opens nothing, 4 that something is wrong.
+
+    example: keyss verify stego.ply --key-file key.txt
+    """
+    from msgspec import to_builtins
+
+    from keyss import api
+    from keyss.cli.keys import hinting_at_white_space, key_of_file
+    from keyss.cli.tables import print_facts
+    from keyss.core.errors import InputError
+    from keyss.runs.records import record_bytes
+
+    key = key_of_file(key_file) if key_file else None
+    with hinting_at_white_space([key] if key else []):
+        found = api.verify(model, key, decoder=decoder, device=device)
+    if json_:
+        print(record_bytes(found).decode(), end="")
+    else:
+        print_facts(to_builtins(found))
+    if found.problems:
+        raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.errors import InputError, OutputError, UsageError, WrongKeyError
 
 VARIABLE = "KEYSS_KEY"
 MAX_FILE_BYTES = 4096
@@ -69,6 +69,27 @@ def _white_space(key: str) -> str | None:
     which = key[0] if end == "begins" else key[-1]
     kind = "a space" if which == " " else "a line break" if which in "\r\n" else "white space"
     return f"the key {end} with {kind}, which is a part of it"
+
+
+def write_new_key(path: Path, key: str) -> None:
+    """Write a key file that only its owner can read. Raises OutputError where there is anything already."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise OutputError(f"{path} exists, and a key is never replaced: choose another name") from error
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            os.fchmod(descriptor, 0o600)  # whatever the umask
+            file.write(f"{key}\n")
+            file.flush()
+            os.fsync(descriptor)
+    except BaseException as error:
+        path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        raise
 
 
 def key_of_file(path: Path) -> str:

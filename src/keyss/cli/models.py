@@ -91,7 +91,7 @@ def fit_with_presets() -> Callable[..., None]:
 
 
 def render(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply.")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
     *,
     cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
     out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
@@ -124,7 +124,8 @@ def render(
 
 def info(
     path: Annotated[
-        Positional[Path], arg(metavar="FILE", help="A .ply, a scene folder, a sidecar or a result folder.")
+        Positional[Path],
+        arg(metavar="FILE", help="A .ply (- for stdin), a scene folder, a sidecar or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
@@ -133,6 +134,9 @@ def info(
 
     example: keyss info runs/hidden/publish/stego.ply
     """
+    import json
+    import sys
+
     from msgspec import to_builtins
 
     from keyss.cli.tables import print_facts
@@ -141,6 +145,11 @@ def info(
 
     facts = describe(path)
     if json_:
-        print(record_bytes(facts).decode(), end="")
+        text = record_bytes(facts).decode()
+        try:
+            text.encode(sys.stdout.encoding or "utf-8")
+        except UnicodeEncodeError:
+            text = json.dumps(json.loads(text), indent=2) + "\n"  # all of it in ASCII
+        print(text, end="")
     else:
         print_facts(to_builtins(facts))

@@ -1,9 +1,9 @@
 """The process around the command line: signals, standard streams, and how it ends.
 
-Python turns Ctrl-C into an exception wherever it happens to be. In the middle of an import that is a traceback,
-or worse: native libraries such as torch's do not survive being loaded half, and crash when they are loaded
-again or when the interpreter shuts down. So this module, which imports next to nothing, is ready for signals
-before anything else is loaded, and ends the process itself.
+Python turns Ctrl-C into an exception wherever it happens to be. In the middle of an import that is a
+traceback, or worse: native libraries such as torch's do not survive being loaded half, and crash when they
+are loaded again or when the interpreter shuts down. So this module, which imports next to nothing, is ready
+for signals before anything else is loaded, and ends the process itself.
 """
 
 from __future__ import annotations
@@ -101,8 +101,8 @@ class _Unfailing(io.FileIO):
 def prepare_streams() -> None:
     """Make the standard streams ones that are there and take every character.
 
-    A stream that is closed becomes one that is empty: the next file that is opened must not get its number, or
-    what is printed ends up in a result.
+    A stream that is closed becomes one that is empty: the next file that is opened must not get its number,
+    or what is printed ends up in a result.
     """
     for number in range(3):
         try:

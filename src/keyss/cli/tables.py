@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
+    from keyss.runs.planning import Plan
 
 
 class Console(RichConsole):
@@ -31,8 +32,8 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
     differ = any(other not in (own, None) for own, other in sizes)
     rows = [
-        _scene_row(name, *qualities, own, other if differ else None)
-        for name, *qualities, (own, other) in zip(names, found, plain, sizes, strict=True)
+        _scene_row(name, own, other, size, others if differ else None)
+        for name, own, other, (size, others) in zip(names, found, plain, sizes, strict=True)
     ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
@@ -58,6 +59,33 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
         console.print(line, highlight=False, soft_wrap=True)
     for name, value in metrics.details.items():
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False)
+
+
+def print_plan(plan: Plan) -> None:
+    """Stages, room and estimates of a run that has not begun."""
+    table = _table("stage", "steps", "Gaussians", "time, about", texts=1)
+    for stage in plan.stages:
+        steps = f"{stage.steps:,}" if stage.steps else ""
+        table.add_row(stage.name, steps, f"{stage.gaussians:,}", _duration(stage.seconds))
+    table.add_row("all", "", "", _duration(plan.seconds))
+    Console().print(table)
+    outlook = plan.outlook
+    free = "" if plan.free_bytes is None else f", {plan.free_bytes / 1e6:,.0f} MB free"
+    _print_columns(
+        [
+            ("method", plan.method),
+            ("room", f"{outlook.capacity:,} of the secrets' {outlook.asked:,} Gaussians"),
+            (
+                "published",
+                f"up to {outlook.gaussians:,} Gaussians of SH degree {outlook.sh_degree}, "
+                f"{plan.file_bytes / 1e6:,.1f} MB",
+            ),
+            ("memory", f"about {plan.memory_bytes / 1e9:.1f} GB"),
+            ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included{free}"),
+            *(("note", note) for note in outlook.notes),
+        ]
+    )
+    print("Nothing was written. Times are extrapolated from a few steps, and rough.")
 
 
 def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool) -> list[str]:
@@ -119,6 +147,13 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
     _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
 
 
+def _duration(seconds: float) -> str:
+    """As precise as an estimate is."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
     """Two columns of plain text: paths must come out whole and as they are, however narrow the terminal."""
     width = max((len(name) for name, _ in rows), default=0)
@@ -172,5 +207,5 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case list() | tuple():
-            return ", ".join(_text(item) for item in value)
+            return ", ".join(_text(item) for item in value) or "none"
     return str(value)

@@ -58,9 +58,9 @@ class KeyssWarning(UserWarning):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or another signal during long work, after saving to `checkpoint` (None: there was none to write).
+    """Ctrl-C or another signal during long work, after `iteration` steps.
 
-    `iteration`: how many steps are done.
+    What is done was saved to `checkpoint` (None: there was none to write).
     """
 
     def __init__(

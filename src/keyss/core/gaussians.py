@@ -56,9 +56,9 @@ class Gaussians:
         far = ~(self.means.abs() <= MAX_COORDINATE).all(1)
         large = ~(self.log_scales <= MAX_LOG_SCALE).all(1)
         long = ~(self.quats.double().norm(dim=1) <= MAX_LENGTH)
-        bright = ~(self.sh.abs() < MAX_COLOUR).flatten(1).all(1)
-        overflow: Tensor = far | large | long | bright
-        return overflow
+        coloured: Tensor = (self.sh.abs() < MAX_COLOUR).flatten(1).all(1)
+        outside: Tensor = far | large | long | ~coloured
+        return outside
 
     @property
     def sh_degree(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import stat
 from collections.abc import Iterator
@@ -12,17 +13,25 @@ from pathlib import Path
 from typing import BinaryIO
 
 from keyss.core.errors import OutputError
+from keyss.files.streams import StandardOutput
 
 
 @contextmanager
-def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
+def atomic_write(path: Path | str | StandardOutput) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; on success fsync it and rename it to `path`.
+
+    What goes to standard output is held in memory until it is whole.
 
     On any failure the temporary file is removed and `path` is as it was; one that a killed process left is
     used again. Only the owner may read the file (mode 0600): most of what this program writes is a secret, or
     tells of one. Raises OutputError when the system refuses (disk full, no permission, missing folder), and
     when another process is writing the same file.
     """
+    if isinstance(path, StandardOutput):
+        buffer = io.BytesIO()
+        yield buffer
+        path.write(buffer.getbuffer())
+        return
     path = Path(path)
     temporary = path.with_name(f".{path.name}.unfinished")
     try:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from keyss.core.errors import InputError
+from keyss.files.streams import StandardInput
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _EXPORT = "export a .ply from the program that made it"
@@ -46,7 +47,7 @@ _KINDS = (
 )
 
 
-def what_it_is(path: Path) -> str:
+def what_it_is(path: Path | StandardInput) -> str:
     """What a file is that keyss does not read, by its name or its first bytes, and what to do.
 
     To follow "expected ..., found". Raises InputError when it cannot be read.

@@ -5,15 +5,16 @@ A new format is a module with a reader and a writer, and one entry in `FORMATS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.foreign import what_it_is
-from keyss.files.output import check_output_file
+from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.ply import read_ply, write_ply
+from keyss.files.streams import StandardInput, StandardOutput, is_standard
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,11 @@ class ModelFormat:
     name: str
     suffixes: tuple[str, ...]  # in lower case and with the dot; the first is the usual one
     magic: bytes  # the first bytes of every file
-    read: Callable[[Path], Gaussians]  # on the CPU; raises InputError
-    write: Callable[[Path, Gaussians], None]  # atomically; raises OutputError
+    read: Callable[[Path | StandardInput], Gaussians]  # on the CPU; raises InputError
+    write: Callable[[Path | StandardOutput, Gaussians], None]  # atomically; raises OutputError
 
+
+_COMPRESSED = ".compressed.ply"  # another format, which programs know by this name
 
 FORMATS = [ModelFormat("PLY", (".ply",), b"ply", read_ply, write_ply)]
 
@@ -36,28 +39,35 @@ def is_model_path(path: Path | str) -> bool:
 
 
 def read_model(path: Path | str) -> Gaussians:
-    """The model at `path`, on the CPU. The format is told by the first bytes.
+    """The model at `path`, on the CPU. The format is told by the first bytes; "-" is standard input.
 
     Raises InputError for a file that is missing, of no known format, named as one of another format, or not
     a whole and finite model.
     """
-    return _by_content(Path(path)).read(Path(path))
+    source = StandardInput() if is_standard(path) else Path(path)
+    return _by_content(source).read(source)
 
 
 def write_model(path: Path | str, model: Gaussians) -> None:
-    """Atomically write `model` in the format that the suffix of `path` names.
+    """Atomically write `model` in the format that the suffix of `path` names; as PLY to "-", standard output.
 
     Raises UsageError for an unknown suffix, OutputError for a model that is empty or not finite and when the
     system refuses.
     """
-    _for_writing(path).write(Path(path), model)
+    _for_writing(path).write(StandardOutput() if is_standard(path) else Path(path), model)
 
 
-def check_model_output(path: Path | str, overwrite: bool) -> Path:
-    """`path`, if `write_model` may write there: see `check_output_file`, and UsageError for its suffix."""
-    path = check_output_file(path, overwrite)
+def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path] = ()) -> Path:
+    """`path`, if `write_model` may write there: UsageError for its suffix, and see `check_output_file`.
+
+    None of the `inputs` may be overwritten, whatever name leads to it.
+    """
     _for_writing(path)
-    return path
+    if is_standard(path):
+        StandardOutput().check()
+        return Path(path)
+    check_not_an_input(path, inputs)
+    return check_output_file(path, overwrite)
 
 
 def _by_suffix(path: Path | str) -> ModelFormat | None:
@@ -66,13 +76,13 @@ def _by_suffix(path: Path | str) -> ModelFormat | None:
 
 
 def _for_writing(path: Path | str) -> ModelFormat:
-    found = _by_suffix(path)
-    if found is None:
+    found = FORMATS[0] if is_standard(path) else _by_suffix(path)
+    if found is None or Path(path).name.lower().endswith(_COMPRESSED):
         raise UsageError(f"cannot write a model as {path}: expected a name that ends in {_known()}")
     return found
 
 
-def _by_content(path: Path) -> ModelFormat:
+def _by_content(path: Path | StandardInput) -> ModelFormat:
     try:
         if path.is_dir():
             raise InputError(f"{path}: expected the file of a 3DGS model ({_known()}), found a folder")
@@ -85,7 +95,7 @@ def _by_content(path: Path) -> ModelFormat:
     found = next((each for each in FORMATS if start.startswith(each.magic)), None)
     if found is None:
         raise InputError(f"{path}: expected a 3DGS model ({_known()}), found {what_it_is(path)}")
-    named = _by_suffix(path) or found
+    named = _by_suffix(str(path)) or found
     if named is not found:
         raise InputError(
             f"{path}: the name says {named.name}, but the content is {found.name}; "

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
-from keyss.core.errors import OutputError
+from keyss.core.errors import OutputError, UsageError
+
+
+def check_not_an_input(path: Path | str, inputs: Iterable[Path]) -> None:
+    """Raise UsageError if one of the `inputs` would be overwritten, by whatever name or link."""
+    for each in inputs:
+        with suppress(OSError):  # one of them is not there
+            if os.path.samefile(path, each):
+                raise UsageError(f"{path} is the input {each}: choose another name for the output")
 
 
 def check_output_file(path: Path | str, overwrite: bool) -> Path:

@@ -18,13 +18,14 @@ import torch
 from keyss.core import Gaussians, InputError, OutputError
 from keyss.files.atomic import atomic_write
 from keyss.files.ply_table import ply_header, read_vertices
+from keyss.files.streams import StandardInput, StandardOutput
 
 # Stands in for an infinite opacity logit. Converters write infinities for opacities of 0 and 1; a larger
 # bound would not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
 OPACITY_LOGIT_BOUND = 16.0
 
 
-def write_ply(path: Path | str, gaussians: Gaussians) -> None:
+def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
     """Atomically write `gaussians` to `path` as little-endian float32 in the Inria layout.
 
     Normals are zeros, infinite opacity logits become +-OPACITY_LOGIT_BOUND, and the bytes depend on the
@@ -49,7 +50,7 @@ def write_ply(path: Path | str, gaussians: Gaussians) -> None:
         file.write(rows.data)
 
 
-def read_ply(path: Path | str) -> Gaussians:
+def read_ply(path: Path | str | StandardInput) -> Gaussians:
     """Read a 3DGS model: float32 tensors on the CPU, SH of the file's own degree.
 
     Properties are found by name, in any order and of any scalar type; normals, unknown properties,
@@ -72,7 +73,7 @@ def read_ply(path: Path | str) -> Gaussians:
     )
 
 
-def _model_properties(found: Set[str], path: Path | str) -> list[str]:
+def _model_properties(found: Set[str], path: Path | str | StandardInput) -> list[str]:
     """Names of the properties that make a model. Raises InputError if any is missing."""
     rest = {name for name in found if re.fullmatch(r"f_rest_[0-9]+", name)}
     names = _model_names(len(rest) // 3 + 1)

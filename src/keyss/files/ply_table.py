@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from keyss.core.errors import InputError
 from keyss.files.layout import PointCloud
+from keyss.files.streams import StandardInput
 
 _MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
@@ -35,7 +36,7 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 
 
 def read_vertices(
-    path: Path | str, choose: Callable[[dict[str, str]], list[str]]
+    path: Path | str | StandardInput, choose: Callable[[dict[str, str]], list[str]]
 ) -> tuple[list[str], npt.NDArray[np.float32]]:
     """The vertex properties that `choose` picks, and their values [N, len(names)] in that order.
 
@@ -44,7 +45,7 @@ def read_vertices(
     elements and bytes after the data are ignored. Raises InputError for a file that is missing, damaged
     or too short, and for list properties up to the vertices.
     """
-    path = Path(path)
+    path = Path(path) if isinstance(path, str) else path
     if not path.is_file():
         raise InputError(f"{path}: expected a .ply file, but there is no such file")
     try:
@@ -75,7 +76,7 @@ class _Element:
         return sum(int(code[1]) for code in self.properties.values())
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str | None, list[_Element], _Element]:
+def _read_header(file: BinaryIO, path: Path | StandardInput) -> tuple[str | None, list[_Element], _Element]:
     """(byte order or None for ascii, elements before the vertices, the vertices); the data come next."""
     lines = _header_lines(file, path)
     if lines[0] != "ply":
@@ -111,7 +112,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str | None, list[_Element]
     return formats[0], before, vertex
 
 
-def _header_lines(file: BinaryIO, path: Path) -> list[str]:
+def _header_lines(file: BinaryIO, path: Path | StandardInput) -> list[str]:
     """The header's lines without their ends, end_header left out."""
     lines: list[str] = []
     left = _MAX_HEADER_BYTES
@@ -135,10 +136,12 @@ def _read_rows(
     before: list[_Element],
     vertex: _Element,
     names: list[str],
-    path: Path,
+    path: Path | StandardInput,
 ) -> npt.NDArray[np.float32]:
     """[N, len(names)] values of the vertices. Raises InputError when the file is too short for them."""
-    left = os.fstat(file.fileno()).st_size - file.tell()
+    start = file.tell()
+    left = file.seek(0, os.SEEK_END) - start
+    file.seek(start)
     if byte_order is None:
         # Every value takes a digit and a separator; the file's last separator may be missing.
         skipped = sum(element.count * len(element.properties) for element in before)
@@ -170,7 +173,7 @@ def _read_rows(
 
 
 def _read_ascii(
-    file: BinaryIO, skipped: int, vertex: _Element, names: list[str], path: Path
+    file: BinaryIO, skipped: int, vertex: _Element, names: list[str], path: Path | StandardInput
 ) -> npt.NDArray[np.float32]:
     """The values in text, after `skipped` values. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)

@@ -79,11 +79,11 @@ def train(
     """Take `run` to its last iteration; returns the seconds spent, those before a resume included.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds`, on Ctrl-C, SIGTERM and SIGHUP
-    (raises Interrupted) and at the end; with `resume`, it continues from there if the file exists. `fingerprint`
-    (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of another one
-    raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global random
-    state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given back
-    to the caller.
+    (raises Interrupted) and at the end; with `resume`, it continues from there if the file exists.
+    `fingerprint` (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of
+    another one raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global
+    random state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given
+    back to the caller.
     """
     reporter = reporter or SilentReporter()
     spent = 0.0

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from argon2.exceptions import HashingError
 from argon2.low_level import Type, hash_secret_raw
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
@@ -48,23 +49,33 @@ def length_for(bits: int) -> int:
     return math.ceil(bits / math.log2(len(ALPHABET)))
 
 
+TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4
+MOST = 4  # times the memory, and times the work, that this program asks for: a file may come from anybody
+
+
 @dataclass(frozen=True)
 class KeyDerivation:
     """Argon2id's public parameters; what a file states is held to a floor and a ceiling."""
 
     salt: bytes
-    time_cost: int = 3  # passes
-    memory_kib: int = 64 * 1024
-    parallelism: int = 4
+    time_cost: int = TIME_COST  # passes
+    memory_kib: int = MEMORY_KIB
+    parallelism: int = PARALLELISM
 
     def __post_init__(self) -> None:
         if len(self.salt) != SALT_BYTES:
             raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(self.salt)}")
-        ranges = (("time_cost", 1, 16), ("memory_kib", 8 * 1024, 1024 * 1024), ("parallelism", 1, 16))
+        ranges = (("time_cost", 1, 16), ("memory_kib", 8 * 1024, MOST * MEMORY_KIB), ("parallelism", 1, 16))
         for name, low, high in ranges:
             value = getattr(self, name)
             if not (type(value) is int and low <= value <= high):
                 raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
+        work, most = self.time_cost * self.memory_kib, MOST * TIME_COST * MEMORY_KIB
+        if work > most:
+            raise InputError(
+                f"key derivation: expected passes times KiB of at most {most:,}, {MOST} times what this "
+                f"program asks for, got {self.time_cost} times {self.memory_kib:,}"
+            )
 
 
 def expand(secret: bytes, label: str, length: int) -> bytes:
@@ -87,21 +98,27 @@ class DerivedKey:
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:
-        """Takes about 0.1 s. Raises UsageError for an empty or overlong key."""
+        """Takes about 0.1 s. Raises UsageError for an empty or overlong key, InputError without memory."""
         text = unicodedata.normalize("NFKC", key).encode()
         if not text:
             raise UsageError("the key is empty")
         if len(text) > MAX_KEY_BYTES:
             raise UsageError(f"the key is longer than {MAX_KEY_BYTES} bytes")
-        self._master = hash_secret_raw(
-            text,
-            derivation.salt,
-            time_cost=derivation.time_cost,
-            memory_cost=derivation.memory_kib,
-            parallelism=derivation.parallelism,
-            hash_len=MASTER_BYTES,
-            type=Type.ID,
-        )
+        try:
+            self._master = hash_secret_raw(
+                text,
+                derivation.salt,
+                time_cost=derivation.time_cost,
+                memory_cost=derivation.memory_kib,
+                parallelism=derivation.parallelism,
+                hash_len=MASTER_BYTES,
+                type=Type.ID,
+            )
+        except HashingError as error:
+            raise InputError(
+                f"deriving a key takes {derivation.memory_kib // 1024} MiB of memory, which the system does "
+                f"not give: {error}"
+            ) from error
 
     @staticmethod
     def of_master(master: bytes) -> DerivedKey:

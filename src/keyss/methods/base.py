@@ -35,6 +35,18 @@ class SceneInput:
 
 
 @dataclass(frozen=True)
+class Outlook:
+    """What is known of a hiding before it begins: of given models exactly, else as much as is allowed."""
+
+    gaussians: int  # of the published model, at most
+    sh_degree: int  # of the published model
+    asked: int  # Gaussians that the secrets have together, at most
+    capacity: int  # of these, how many fit
+    steps: int = 0  # of the method's own training
+    notes: tuple[str, ...] = ()  # what the options cost, a sentence each
+
+
+@dataclass(frozen=True)
 class Source:
     """One scene as a method gets it: pictures of it, and a plain 3DGS model."""
 
@@ -60,6 +72,26 @@ class Context:
     reporter: Reporter | None = None
 
 
+@dataclass(frozen=True)
+class Remains:
+    """How much of a secret a model still gives."""
+
+    found: int  # Gaussians
+    hidden: int  # Gaussians that there were; 0: not known
+    chunks: tuple[int, int] | None = None  # of its payload: those left and those there were; None: no chunks
+    slack: float = 0.0  # share by which the numbers may differ although nothing was lost
+
+    @property
+    def share(self) -> float:
+        """Of the hidden Gaussians those found: 0 to 1, more where Gaussians were added."""
+        return self.found / self.hidden if self.hidden else float(self.found > 0)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was lost or added."""
+        return abs(self.share - 1) <= self.slack and (self.chunks is None or self.chunks[0] == self.chunks[1])
+
+
 class Opened(Protocol):
     """A secret as its key opens it, before it is revealed."""
 
@@ -80,6 +112,12 @@ class Opened(Protocol):
 
         Raises InputError for a model that it does not belong to, UsageError for a frame that it never was in.
         """
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        """How much of the secret there is in what `reveal` gave."""
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        """Raise InputError if the secret was hidden in another model, as one out of a sidecar may be."""
 
     def fingerprint(self) -> str:
         """16 hexadecimal digits by which a run knows its secrets; they say nothing without the secret."""
@@ -157,6 +195,9 @@ class Method(Protocol):
 
         Refuses what cannot work, before anything is trained. Raises UsageError and InputError.
         """
+
+    def outlook(self, inputs: Sequence[SceneInput], options: Any) -> Outlook:
+        """What will come of it; `options` are prepared."""
 
     def hide(self, cover: Source, secrets: Sequence[KeyedSource], options: Any, context: Context) -> Stego:
         """Hide the secrets; `options` are prepared. Raises KeyssError and its children, Interrupted."""

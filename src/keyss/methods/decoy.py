@@ -9,7 +9,7 @@ import torch
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
-from keyss.methods.base import Frame
+from keyss.methods.base import Frame, Remains
 
 _STRENGTH = 0.02  # standard deviation of the changes of opacity logits
 _MOVE = 1e-4  # of turns (radians), shifts (of the model's size) and changes of scale
@@ -50,6 +50,13 @@ class Decoy:
         if (drawn := shown.opacities >= DRAWN_OPACITY).any():
             shown = shown[drawn]
         return shown if frame == "cover" else self.frame.inverse().apply_gaussians(shown)
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        """All of it: a decoy is never damaged."""
+        return Remains(len(revealed), len(revealed))
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        """It does: it is made of that model."""
 
     def fingerprint(self) -> str:
         """Of a decoy there is none that a run could know."""

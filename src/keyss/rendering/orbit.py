@@ -86,9 +86,9 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
 def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
     """[3] where what can be seen of a model lies, and how far it reaches (world units).
 
-    Gaussians count by opacity and size, a huge one no more than ten typical large ones. The radius holds
-    nine tenths of them, but is at most three times that of the nearer half: around an object, that is all of
-    it; in an unbounded scene, its middle.
+    Gaussians count by opacity and size, a huge one no more than ten typical large ones. The radius holds nine
+    tenths of them, but is at most three times that of the nearer half: around an object, that is all of it;
+    in an unbounded scene, its middle.
     """
     scales = model.scales.sort(dim=1).values
     weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu().nan_to_num(0.0)

@@ -1,9 +1,9 @@
 """What the numbers of an audit come to: one line each, with a word.
 
 *fine*: within the limit. *visible*: somebody without the key may see that something is hidden, or see
-something of it. *missed*: nothing shows, but the hiding does not do as well as it should. *not measured*: what
-it takes was not there. All limits are here, but for those of leaks: `keyss.measure.leaks.scores` has them, for
-by them it is chosen what is pictured.
+something of it. *missed*: nothing shows, but the hiding does not do as well as it should. *not measured*:
+what it takes was not there. All limits are here, but for those of leaks: `keyss.measure.leaks.scores` has
+them, for by them it is chosen what is pictured.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from keyss.core.scene import Scene
 from keyss.files.foreign import what_it_is
 from keyss.files.models import is_model_path, read_model
 from keyss.files.scenes import load_scene
+from keyss.files.streams import is_standard
 from keyss.runs.files import METRICS, MODEL, STEGO
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import read_sidecar
@@ -36,7 +37,7 @@ class ModelInfo:
 
     kind: str
     path: str
-    bytes: int
+    bytes: int | None  # None: of standard input
     gaussians: int
     sh_degree: int
     bounding_box: tuple[Corner, Corner]
@@ -78,7 +79,8 @@ class SidecarInfo:
 
 
 def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    """What is in a PLY, a sidecar, a scene folder or a folder of results. Raises InputError.
+    """What is in a PLY, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
+    InputError.
 
     Photos that a scene names but that are not there are left out, with a KeyssWarning.
     """
@@ -89,6 +91,8 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
 
 
 def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
+    if is_standard(path):
+        return _model_info(path)
     if path.is_dir():
         if (path / STEGO).exists():
             return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
@@ -119,7 +123,7 @@ def _model_info(path: Path) -> ModelInfo:
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
-        bytes=path.stat().st_size,
+        bytes=None if is_standard(path) else path.stat().st_size,
         gaussians=len(model),
         sh_degree=model.sh_degree,
         bounding_box=(_rounded(model.means.amin(0)), _rounded(model.means.amax(0))),

@@ -38,6 +38,12 @@ def run_folder(path: Path) -> Path:
     """
     if is_run(path):
         return path
+    try:
+        (path / CONFIG).stat()
+    except PermissionError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except OSError:
+        pass
     expected = f"{path}: expected the folder of a run, as `keyss hide` writes it"
     if not os.path.lexists(path):
         raise InputError(f"{expected}; there is nothing of that name")

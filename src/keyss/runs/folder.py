@@ -20,6 +20,7 @@ import msgspec
 from keyss._version import __version__
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.files.lock import held_by, lock
+from keyss.files.output import check_not_an_input
 from keyss.runs.records import read_record, write_record
 
 PUBLISH, PRIVATE = "publish", "private"
@@ -50,7 +51,8 @@ class RunFolder:
 
     `arguments`: JSON-able, what `resume` compares. `onto`: stages whose results are there already and stay;
     those of all other stages are replaced, which takes `overwrite`. `writes`: names of files to come, as far
-    as they are known; one that is somebody else's is never replaced.
+    as they are known; one that is somebody else's is never replaced. `inputs`: what is read; none of it may
+    be among what is replaced.
 
     Nothing is created before `work`. Raises OutputError when the folder is not empty and neither `overwrite`
     nor `resume` is given, when there is nothing to resume, and when another process is at work in it;
@@ -65,6 +67,7 @@ class RunFolder:
         *,
         onto: Collection[str] = (),
         writes: Collection[str] = (),
+        inputs: Collection[Path] = (),
         overwrite: bool = False,
         resume: bool = False,
     ) -> None:
@@ -78,6 +81,8 @@ class RunFolder:
             if not self.path.is_dir():
                 raise OutputError(f"{self.path} exists and is not a folder")
             self._check(overwrite, resume)
+            if overwrite:
+                self._refuse_inputs(inputs)
         for name in writes:
             _refuse_foreign(self.path, name)
 
@@ -103,6 +108,12 @@ class RunFolder:
             raise OutputError(
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
             )
+
+    def _refuse_inputs(self, inputs: Collection[Path]) -> None:
+        """Raise UsageError if one of them would be replaced."""
+        for stage, names in read_manifest(self.path).files.items():
+            for name in names if stage not in self.onto else ():
+                check_not_an_input(self.path / name, inputs)
 
     def _check_same(self, running: Running) -> None:
         """Raise OutputError unless this is the run that was interrupted."""

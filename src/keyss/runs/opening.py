@@ -8,12 +8,13 @@ from pathlib import Path
 
 import torch
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import read_model
 from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
+from keyss.files.streams import is_standard
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
@@ -23,6 +24,11 @@ from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 
 MOST_SIDECAR_BYTES = 1 << 30
+OPENS_NOTHING = (
+    "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
+    "(converted or quantised, moved, scaled, edited or trained on); its sidecar "
+    f"({Path(SIDECAR).name}) may be missing or another one; or nothing is hidden here"
+)
 
 
 @dataclass(frozen=True)
@@ -87,14 +93,19 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
 
 
 def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
-    """The secret that the key opens; see `registry.open_model`. Errors name the sidecar's file."""
-    if sidecar is None or isinstance(sidecar, bytes):
-        return registry.open_model(stego, key, sidecar=sidecar, decoy=decoy)
-    data = read_sidecar(Path(sidecar))
+    """The secret that the key opens; see `registry.open_model`. Errors name the sidecar's file.
+
+    A key that opens nothing is told so in the same words whatever there is: they say nothing of the file.
+    """
+    data = read_sidecar(Path(sidecar)) if isinstance(sidecar, str | Path) else sidecar
     try:
         return registry.open_model(stego, key, sidecar=data, decoy=decoy)
+    except WrongKeyError as error:
+        raise WrongKeyError(OPENS_NOTHING) from error
     except InputError as error:
-        raise InputError(f"{sidecar}: {error}") from error
+        if isinstance(sidecar, str | Path):
+            raise InputError(f"{sidecar}: {error}") from error
+        raise
 
 
 def read_sidecar(path: Path) -> bytes:
@@ -104,6 +115,8 @@ def read_sidecar(path: Path) -> bytes:
 
 def sidecar_beside(stego: Path) -> Path | None:
     """The sidecar beside a model's file, if there is one."""
+    if is_standard(stego):
+        return None
     path = stego.with_name(Path(SIDECAR).name)
     return path if path.exists() else None
 

@@ -57,5 +57,23 @@ def write_record(path: Path, record: Any) -> None:
 
 
 def record_bytes(record: Any) -> bytes:
-    """JSON of a dataclass, for people and programs; NaN and infinite numbers become null."""
-    return msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
+    """JSON of a dataclass, for people and programs; NaN and infinite numbers become null.
+
+    Of a file's name that is not text in this locale, UTF-8 is taken, and other bytes become U+FFFD.
+    """
+    try:
+        data = msgspec.json.encode(record)
+    except UnicodeEncodeError:
+        data = msgspec.json.encode(_as_text(msgspec.to_builtins(record)))
+    return msgspec.json.format(data, indent=2) + b"\n"
+
+
+def _as_text(value: Any) -> Any:
+    match value:
+        case str():
+            return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+        case dict():
+            return {_as_text(key): _as_text(each) for key, each in value.items()}
+        case list() | tuple():
+            return [_as_text(each) for each in value]
+    return value

@@ -272,9 +272,9 @@ def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> 
 
 
 def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
-    with pytest.raises(UsageError, match=r"too small.*Gaussians \(`max_gaussians=\d+`\) would do"):
+    with pytest.raises(UsageError, match=r"too small.*Gaussians would do"):
         embed_derived(trained_like(300), [(keys(), PAYLOAD)])
-    with pytest.raises(UsageError, match="spherical harmonics"):
+    with pytest.raises(UsageError, match="SH degree 0"):
         check_payload_fits(100, 10_000, 1, sh_degree=0)
     with pytest.raises(UsageError, match="for each of 2 secrets"):
         check_payload_fits(126_000, 5_000, 2, sh_degree=3)

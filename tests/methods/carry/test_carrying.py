@@ -78,11 +78,11 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
         with pytest.raises(
             UsageError, match=f"SH degree 1 cannot carry a secret of SH degree {secret_degree}"
         ):
-            check_degrees(LOW_BITS, model, [hidden])
+            check_degrees(LOW_BITS, model.sh_degree, [hidden.sh_degree])
         with pytest.raises(UsageError, match="room for records of"):
             embed_derived(model, [(own, hidden)])
         return
-    check_degrees(LOW_BITS, model, [hidden])
+    check_degrees(LOW_BITS, model.sh_degree, [hidden.sh_degree])
     carried = extract_derived(LowBitsReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
     assert len(carried.gaussians) == 900
@@ -90,7 +90,7 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
 
 def test_a_cover_without_spherical_harmonics_is_refused() -> None:
     with pytest.raises(UsageError, match="SH degree 0 cannot carry"):
-        check_degrees(LOW_BITS, trained_like(50, sh_degree=0), [trained_like(50, 1, 0)])
+        check_degrees(LOW_BITS, 0, [0])
     with pytest.raises(UsageError, match="room for records of 0 bytes"):
         embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
     with pytest.raises(WrongKeyError):

@@ -119,7 +119,7 @@ def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
 
 def test_a_model_too_small_for_its_low_bits_is_refused_before_any_work() -> None:
     large = replace(CONFIG, decoder="network", hidden=(128, 128))
-    with pytest.raises(UsageError, match=r"too small.*`max_gaussians=\d+`.*`sidecar=True`"):
+    with pytest.raises(UsageError, match=r"too small.*max_gaussians.*sidecar"):
         hide_scenes(_scenes()[0], KEYS, large)
 
 

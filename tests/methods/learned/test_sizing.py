@@ -24,9 +24,8 @@ def test_one_model_hides_in_another_without_photos() -> None:
 
 
 def test_what_is_asked_for_is_kept() -> None:
-    models = [random_gaussians(120, sh_degree=0), random_gaussians(70, sh_degree=0)]
+    models = [random_gaussians(120), random_gaussians(70)]
     inputs = [SceneInput(model, photos=False) for model in models]
-    assert sized(LearnedOptions(), inputs).fit.sh_degree == 1
     asked = LearnedOptions().with_fit(iterations=900, max_gaussians=500)
     found = sized(asked, inputs)
     assert (found.fit.iterations, found.fit.max_gaussians) == (900, 500)
@@ -34,3 +33,15 @@ def test_what_is_asked_for_is_kept() -> None:
     assert sized(too_few, inputs) == too_few  # something has to be left out: a training like any other
     assert sized(asked, [inputs[0], SceneInput(models[1], photos=True)]) == asked
     assert sized(asked, [inputs[0], SceneInput(None, photos=True)]) == asked
+
+
+def test_harmonics_are_those_of_the_cover_unless_asked_for() -> None:
+    for cover in range(4):
+        model, secret = random_gaussians(120, sh_degree=cover), random_gaussians(70, sh_degree=2)
+        for photos in (True, False):
+            inputs = [SceneInput(model, photos), SceneInput(secret, photos)]
+            assert sized(LearnedOptions(), inputs).fit.sh_degree == cover
+            assert sized(LearnedOptions(sh_degree=1), inputs).fit.sh_degree == 1
+    fitted = [SceneInput(None, photos=True), SceneInput(secret, photos=True)]
+    assert sized(LearnedOptions(), fitted).fit.sh_degree == 3
+    assert sized(LearnedOptions(sh_degree=2), fitted).fit.sh_degree == 2

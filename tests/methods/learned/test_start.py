@@ -13,7 +13,7 @@ from keyss.fitting.config import FitConfig
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions
-from keyss.methods.learned.start import _shares, make_start
+from keyss.methods.learned.start import divided, make_start
 from keyss.methods.learned.targets import PlacedScene
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -23,13 +23,13 @@ from tiny_scenes import random_gaussians, tiny_scene
 )
 def test_shares_use_all_there_is_and_no_more(parts: list[tuple[int, float]], total: int) -> None:
     available, weights = [n for n, _ in parts], [w for _, w in parts]
-    shares = _shares(available, weights, total)
+    shares = divided(available, weights, total)
     assert all(0 <= share <= n for share, n in zip(shares, available, strict=True))
     assert sum(shares) == min(total, sum(available))
 
 
 def test_shares_follow_the_weights() -> None:
-    assert _shares([1000, 1000], [1, 0.5], 300) == [200, 100]
+    assert divided([1000, 1000], [1, 0.5], 300) == [200, 100]
 
 
 def _placed(count: int) -> list[PlacedScene]:

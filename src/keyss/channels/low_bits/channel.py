@@ -168,7 +168,8 @@ class LowBitsReader:
     def _payload(self, found: PayloadParameters, data_key: bytes) -> Payload:
         chunks = self._decrypt(_chunk_cipher(data_key, self.sh_degree))
         encrypted = found.spread.decode(chunks, found.size)
-        return Payload(found.method, decrypt(expand(data_key, _PAYLOAD_KEY, 32), encrypted, _ASSOCIATED))
+        data = decrypt(expand(data_key, _PAYLOAD_KEY, 32), encrypted, _ASSOCIATED)
+        return Payload(found.method, data, found.spread.left(chunks))
 
     def _records(self, found: RecordParameters, data_key: bytes) -> Records:
         room = self.low.shape[1] // found.cells - TAG_BYTES

@@ -62,8 +62,7 @@ class Spread:
     def decode(self, chunks: Bytes, size: int) -> bytes:
         """The first `size` bytes from numbered chunks in any order. Raises InputError if too few are left."""
         blocks: list[dict[int, Bytes]] = [{} for _ in range(self.blocks)]
-        numbers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
-        for number, chunk in zip(numbers.tolist(), chunks[:, NUMBER_BYTES:], strict=True):
+        for number, chunk in zip(_numbers(chunks).tolist(), chunks[:, NUMBER_BYTES:], strict=True):
             if number < self.blocks * self.n:
                 blocks[number // self.n][number % self.n] = chunk
         decoded = (reed_solomon.decode(rows, self.k, self.n) for rows in blocks)
@@ -74,6 +73,18 @@ class Spread:
                 "blocks are lost"
             )
         return np.concatenate(whole).tobytes()[:size]
+
+    def left(self, chunks: Bytes) -> tuple[int, int]:
+        """How many of the different chunks are among these, and how many there are."""
+        every = self.blocks * self.n
+        numbers = np.unique(_numbers(chunks))
+        return int((numbers < every).sum()), every
+
+
+def _numbers(chunks: Bytes) -> npt.NDArray[np.int64]:
+    """[C] the numbers of numbered chunks."""
+    numbers: npt.NDArray[np.int64] = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
+    return numbers
 
 
 def chunk_bytes(sh_degree: int) -> int:
@@ -111,24 +122,29 @@ def carriers_for(size: int, secrets: int, sh_degree: int) -> int:
     return bisect_left(range(enough), size, key=lambda each: payload_capacity(each, secrets, sh_degree))
 
 
-def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
-    """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained."""
+def check_payload_fits(
+    compressed: int, gaussians: int, secrets: int, sh_degree: int, *, usable: float = TYPICAL_SHARE
+) -> None:
+    """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained.
+
+    `usable`: the share of its Gaussians whose low bits will be random.
+    """
     size = encrypted_size(compressed)
-    if payload_capacity(int(gaussians * TYPICAL_SHARE), secrets, sh_degree) < size:
-        raise UsageError(too_small(gaussians, TYPICAL_SHARE, size, secrets, sh_degree))
+    if payload_capacity(int(gaussians * usable), secrets, sh_degree) < size:
+        raise UsageError(too_small(gaussians, usable, size, secrets, sh_degree))
 
 
 def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree: int) -> str:
     """What to tell the owner of a model of which a share `usable` can be used."""
     if chunk_bytes(sh_degree) == 0:
-        return "a model without spherical harmonics has no room for anything in its low bits"
+        return "a model of SH degree 0 has no room for anything in its low bits"
     need = carriers_for(size, secrets, sh_degree) / max(usable, 0.01)
     digits = max(0, len(str(int(need))) - 2)
     rounded = math.ceil(need / 10**digits) * 10**digits
     each = "" if secrets == 1 else f" for each of {secrets} secrets"
     return (
         f"a model of {gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low bits; "
-        f"{rounded:,} Gaussians (`max_gaussians={rounded}`) would do"
+        f"{rounded:,} Gaussians would do"
     )
 
 

@@ -19,7 +19,7 @@ from keyss.channels.base import Channel, PreparedCover, RecordPlan, RecordReques
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
-from keyss.methods.base import Frame
+from keyss.methods.base import Frame, Remains
 from keyss.methods.carry.quantise import Codec
 from keyss.methods.carry.table import Table
 
@@ -45,6 +45,12 @@ class CarriedSecret:
             )
         return compensate_pruning(self.gaussians, self.count)
 
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), self.count)
+
+    def check_belongs_to(self, stego: Gaussians) -> None:
+        """It does: every record is bound to the Gaussian that it came out of."""
+
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
@@ -60,15 +66,20 @@ def record_requests(models: Sequence[Gaussians]) -> list[RecordRequest]:
     return [record_request(len(model), model.sh_degree) for model in models]
 
 
-def check_degrees(channel: Channel, cover: Gaussians, secrets: Sequence[Gaussians]) -> None:
-    """Raise UsageError if not even one Gaussian of these secrets fits into a Gaussian of the cover."""
-    degree = max(secret.sh_degree for secret in secrets)
-    least, most = Table.floor(degree).record_bytes, channel.largest_record(cover.sh_degree)
+def check_degrees(channel: Channel, cover: int, secrets: Sequence[int]) -> None:
+    """Raise UsageError if not even one Gaussian of these SH degrees fits into a Gaussian of the cover's."""
+    degree = max(secrets, default=0)
+    least, most = Table.floor(degree).record_bytes, channel.largest_record(cover)
     if least > most:
-        raise UsageError(
-            f"a cover of SH degree {cover.sh_degree} cannot carry a secret of SH degree {degree}: one of its "
-            f"Gaussians has room for {most} bytes, and one of the secret's takes at least {least}; "
+        how = (
             '`method="learned"` can hide it'
+            if cover > 0
+            else '`method="learned", sh_degree=1` or `method="learned", sidecar=True` can hide it'
+        )
+        raise UsageError(
+            f"a cover of SH degree {cover} cannot carry a secret of SH degree {degree}: one of its "
+            f"Gaussians has room for {most} bytes, and one of the secret's takes at least {least}; "
+            f"{how}"
         )
 
 

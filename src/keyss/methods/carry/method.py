@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from keyss.channels.base import Content, PreparedCover, Records
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.base import Content, RecordRequest, Records
+from keyss.channels.low_bits import LOW_BITS, LowBitsCover
+from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Context, KeyedSource, SceneInput, Source, Stego, advising
+from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.carrying import (
     NAME,
     CarriedSecret,
@@ -19,16 +21,21 @@ from keyss.methods.carry.carrying import (
     decode,
     encode_all,
     most_visible,
+    record_request,
     record_requests,
     subsampled_counts,
 )
-from keyss.methods.carry.dither import cost, dither
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.carry.quantise import out_of_range
+from keyss.methods.dither import cost, dither
 
-_PRUNE = "`prune_to_fit=True` leaves out the least visible"
+_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
+_LEARNED = '`method="learned"` needs no low bits of the cover'
 _SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
-_DITHER = f"`dither=True` gives it new low bits, at a price, and {_SIDECAR}"
+_DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
+_DITHER_AND_PRUNE = (
+    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
+)
 
 
 class CarryMethod:
@@ -42,16 +49,47 @@ class CarryMethod:
     presets: Mapping[str, CarryOptions] = PRESETS
 
     def prepare(self, inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-        """Unchanged; refuses given models that do not fit, and a cover whose low bits are not random."""
+        """Refuses given models that will not fit, and a given cover whose low bits are not random.
+
+        Of models that are fitted first, sizes and low bits are not known: they are made to fit rather than
+        refused after their training.
+        """
         cover, *others = (each.model for each in inputs)
+        degree, *degrees = _degrees(inputs, options)
+        check_degrees(LOW_BITS, degree, degrees)
         secrets = [model for model in others if model is not None]
-        if cover is not None and secrets:
-            check_degrees(LOW_BITS, cover, secrets)
-        if cover is not None:
-            prepared = _prepared(_carrier(cover, options), options)
-            if len(secrets) == len(others):
-                _counts(prepared, secrets, options)
+        requests = record_requests(secrets)
+        if cover is None:
+            if requests and not options.prune_to_fit:
+                with advising(UsageError, _PRUNE):  # at best all of them can carry something
+                    plan_records(requests, options.fit.max_gaussians, degree)
+            return replace(options, dither=True, prune_to_fit=True)
+        too_large = requests if not options.prune_to_fit else []
+        try:
+            prepared = _prepared(cover, options)
+        except InputError as error:
+            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
+        if len(secrets) < len(others):
+            return replace(options, prune_to_fit=True)
+        _counts(prepared, secrets, options)
         return options
+
+    def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
+        """The cover as it is, and in it what its carriers have room for."""
+        sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
+        degrees = _degrees(inputs, options)
+        cover, notes = inputs[0].model, []
+        carriers = sizes[0]
+        if cover is not None:
+            prepared = _prepared(cover, options)
+            carriers = prepared.carriers
+            if prepared.cover is not cover:
+                psnr = cost(cover, prepared.cover)
+                notes.append(f"dithering leaves the cover at {psnr:.1f} dB PSNR against itself")
+        requests = list(map(record_request, sizes[1:], degrees[1:]))
+        asked = sum(sizes[1:])
+        fit = record_capacity(requests, carriers, degrees[0])
+        return Outlook(sizes[0], degrees[0], asked, min(asked, fit), notes=tuple(notes))
 
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: CarryOptions, context: Context
@@ -62,9 +100,9 @@ class CarryMethod:
         """
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
-        check_degrees(LOW_BITS, cover.model, models)
-        carrier = _carrier(cover.model, options)
-        prepared = _prepared(carrier, options)
+        check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
+        with advising(InputError, _LEARNED if options.dither else _DITHER):
+            prepared = _prepared(cover.model, options)
         details: dict[str, Any] = {
             "carriers": prepared.carriers,
             "capacity": prepared.record_capacity(record_requests(models)),
@@ -81,14 +119,16 @@ class CarryMethod:
         details["bits_per_gaussian"] = [each.bits for each in opened]
         if any(clamped := [out_of_range(model) for model in models]):
             details["gaussians_with_clamped_numbers"] = clamped
-        if options.prune_to_fit:
+        if any(kept is not model for model, kept in zip(whole, models, strict=True)):
             pairs = list(zip(whole, models, strict=True))
             details["share_kept_by_pruning"] = [round(len(kept) / len(model), 4) for model, kept in pairs]
             details["pruned_secret_psnr_against_the_whole"] = [
                 None if kept is model else round(cost(model, kept), 1) for model, kept in pairs
             ]
-        if options.dither:
-            details["dithered_cover_psnr_against_the_one_before"] = round(cost(cover.model, carrier), 1)
+        if prepared.cover is not cover.model:
+            details["dithered_cover_psnr_against_the_one_before"] = round(
+                cost(cover.model, prepared.cover), 1
+            )
         return Stego(stego, None, tuple(opened), seconds, details=details)
 
     def unpack(self, content: Content) -> CarriedSecret:
@@ -102,18 +142,34 @@ class CarryMethod:
         return {}
 
 
-def _carrier(cover: Gaussians, options: CarryOptions) -> Gaussians:
-    """The cover, with new low bits if that is wanted."""
-    return dither(cover, os.urandom(32)) if options.dither else cover
+def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
+    """SH degrees of the models that are given, and of those that will be fitted."""
+    return [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
 
 
-def _prepared(carrier: Gaussians, options: CarryOptions) -> PreparedCover:
-    """Raises InputError for low bits that are not random."""
-    with advising(InputError, _SIDECAR if options.dither else _DITHER):
-        return LOW_BITS.prepare(carrier)
+def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
+    """The cover as it is, if that will do."""
+    try:
+        return LOW_BITS.prepare(cover)
+    except InputError:
+        if not options.dither:
+            raise
+    return LOW_BITS.prepare(dither(cover, os.urandom(32)))
 
 
-def _counts(prepared: PreparedCover, models: Sequence[Gaussians], options: CarryOptions) -> list[int]:
+def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
+    """What works for a cover whose low bits are not random."""
+    if options.dither:
+        return _LEARNED
+    try:
+        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))
+    except InputError:
+        return _LEARNED
+    fits = sum(each.count for each in requests) <= (prepared.record_capacity(requests) if requests else 0)
+    return _DITHER if fits else _DITHER_AND_PRUNE
+
+
+def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryOptions) -> list[int]:
     """How many Gaussians of each model are carried: all, unless pruning may leave some out.
 
     Raises UsageError if they do not fit.

@@ -12,7 +12,8 @@ A record holds everything that renders: position, log scales, opacity logit, dir
 
 Lines are fitted to the bulk. A Gaussian with a number far outside of it is an *outlier*: one bit of its
 record says so, and its numbers go through the same lines with a longer reach. So outliers cost the bulk
-nothing but that bit, whatever their numbers are. Numbers so large that nothing is drawn, or nothing else, are clamped.
+nothing but that bit, whatever their numbers are. Numbers so large that nothing is drawn, or nothing else, are
+clamped.
 """
 
 from __future__ import annotations
@@ -316,7 +317,8 @@ def _sample(values: Floats) -> Floats:
 def _numbers(gaussians: Gaussians, table: Table) -> Iterator[_Numbers]:
     """All numbers but the quaternions, those of each line together, in the order in which they are stored.
 
-    A Gaussian that is never drawn becomes transparent, so that it is not drawn when it is clamped, either.
+    A Gaussian that is never drawn becomes transparent, so that its numbers in the limits are not drawn
+    either.
     """
     means, log_scales, _, opacity, *colours = table.bits
     positions = _doubles(gaussians.means.clamp(-MAX_COORDINATE, MAX_COORDINATE))

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from keyss.channels.base import Content, Payload
 from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.low_bits.bits import usable_carriers
 from keyss.channels.low_bits.spread import check_payload_fits
 from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.alignment import align
@@ -26,8 +30,9 @@ from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.base import Context, KeyedSource, Opened, SceneInput, Source, Stego, advising
+from keyss.keys.derivation import SALT_BYTES, expand
+from keyss.methods.base import Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego, advising
+from keyss.methods.dither import cost, dither, raised
 from keyss.methods.learned.attacks import known_remaps
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.decoder import Decoder
@@ -35,10 +40,13 @@ from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, decoder_shape, sized, training_options
 from keyss.methods.learned.payload import ANCHORS, HiddenSecret, choose_anchors, pack_secret, unpack_secret
 from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift, match_quaternion_lengths
+from keyss.methods.learned.start import divided
 from keyss.methods.learned.targets import PlacedScene
 
 NAME = "learned"
-SIDECAR_ADVICE = "`sidecar=True` writes a file beside it instead"
+# Of the Gaussians before training, which brings those that it reaches, about half and more, to 0.72.
+LEAST_USABLE_AT_START = 0.28
+_SIDECAR = "`sidecar=True` writes a file beside it instead"
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
 
@@ -60,6 +68,29 @@ class LearnedMethod:
             check_room(options, [each.model for each in inputs])
         return options
 
+    def outlook(self, inputs: Sequence[SceneInput], options: LearnedOptions) -> Outlook:
+        """All that is within the cap; notes say what is lost of harmonics of a higher degree."""
+        training = training_options(options).fit
+        sizes = [training.max_gaussians if each.model is None else len(each.model) for each in inputs]
+        degree = training.sh_degree
+        notes = []
+        for role, each in zip(("the cover", *["a secret"] * len(inputs[1:])), inputs, strict=True):
+            if each.model is not None and each.model.sh_degree > degree:
+                psnr = cost(each.model, each.model.with_sh_degree(degree))
+                notes.append(
+                    f"{role} of SH degree {each.model.sh_degree} gets degree {degree}: {psnr:.1f} dB PSNR "
+                    "against itself"
+                )
+        weights = [1.0] + [options.secret_share] * (len(sizes) - 1)
+        return Outlook(
+            gaussians=min(training.max_gaussians, sum(sizes)),
+            sh_degree=degree,
+            asked=sum(sizes[1:]),
+            capacity=sum(divided(sizes, weights, training.max_gaussians)[1:]),
+            steps=training.iterations,
+            notes=tuple(notes),
+        )
+
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context
     ) -> Stego:
@@ -70,10 +101,15 @@ class LearnedMethod:
         """
         options = training_options(options)
         sources, keys = [cover, *(each.source for each in secrets)], [each.key for each in secrets]
-        models = [source.model.with_sh_degree(options.fit.sh_degree) for source in sources]
         scenes = [source.scene for source in sources]
         derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.seed))
         derived = [DerivedKey(key, derivation) for key in keys]
+        # What training does not reach keeps its low bits: those of a quantised model would be no good.
+        entropy = hashlib.sha256(b"keyss/v1/dither" + b"".join(key.expand("writer", 32) for key in derived))
+        models = [
+            with_low_bits(source.model, options.fit.sh_degree, expand(entropy.digest(), f"model/{index}", 32))
+            for index, source in enumerate(sources)
+        ]
         encoder = encoder_of(options)
         embeddings = (
             [key.embedding() for key in derived] if encoder is None else [encoder(key) for key in keys]
@@ -128,19 +164,29 @@ class LearnedMethod:
             drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
             packed.append(pack_secret(replace(secret, count=int(drawn.sum()))))
         payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
-        sidecar, entropy = None, _discarded(run, derived)
-        if options.sidecar:
-            sidecar = encrypt_sidecar(payloads, entropy=entropy)
-        else:
-            with advising(KeyssError, SIDECAR_ADVICE):
-                stego = LOW_BITS.prepare(stego).embed(payloads, entropy=entropy)
-        return Stego(stego, sidecar, tuple(map(unpack_secret, packed)), seconds, options.fit.iterations)
+        sidecar, discarded = None, _discarded(run, derived)
+        details: dict[str, Any] = {}
+        if any(source.model.sh_degree > options.fit.sh_degree for source in sources):
+            details["psnr_of_fewer_harmonics"] = [
+                round(cost(source.model, source.model.with_sh_degree(options.fit.sh_degree)), 1)
+                for source in sources
+                if source.model.sh_degree > options.fit.sh_degree
+            ]
+        if not options.sidecar:
+            try:
+                stego = LOW_BITS.prepare(stego).embed(payloads, entropy=discarded)
+            except KeyssError as error:  # of fitted models that is not known before; the training is not lost
+                details["sidecar_because"] = str(error)
+        if options.sidecar or "sidecar_because" in details:
+            sidecar = encrypt_sidecar(payloads, entropy=discarded)
+        opened = tuple(map(unpack_secret, packed))
+        return Stego(stego, sidecar, opened, seconds, options.fit.iterations, details)
 
     def unpack(self, content: Content) -> Opened:
         """A decoder, and where the secret lies. Raises InputError for damage."""
         if not isinstance(content, Payload):
             raise InputError("the hidden secret is damaged: expected one payload, got records")
-        return unpack_secret(content.data)
+        return replace(unpack_secret(content.data), chunks=content.chunks)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """The opacity remaps of a warm start are in the source; nothing else is known without a key."""
@@ -154,17 +200,47 @@ def encoder_of(options: LearnedOptions) -> Callable[[str], Tensor] | None:
     return _clip_keys(options.clip_model or MODEL)
 
 
-def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:
-    """Raise UsageError if the payloads will hardly fit into the model that is to be trained.
+def with_low_bits(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
+    """`model` as the joint training starts from it, with low bits that are random before the first step."""
+    first, second = (expand(entropy, f"start/{index}", 32) for index in range(2))
+    return dither(raised(model.with_sh_degree(min(sh_degree, model.sh_degree)), sh_degree, first), second)
 
-    `models`: of the cover and of the secrets, those that are known. A warm start from them adds no Gaussians.
+
+def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:
+    """Raise UsageError or InputError if the payloads will not fit into the model that is to be trained.
+
+    `models`: of the cover and of the secrets, those that are known. A warm start from them adds no Gaussians
+    and leaves the low bits of some as they are.
     """
     options = training_options(options)
-    gaussians, known = options.fit.max_gaussians, [model for model in models if model is not None]
-    if options.start == "warm" and len(known) == len(models):
-        gaussians = min(gaussians, sum(len(model) for model in known))
-    with advising(UsageError, SIDECAR_ADVICE):
-        check_payload_fits(_largest_payload(options), gaussians, len(models) - 1, options.fit.sh_degree)
+    degree, cap = options.fit.sh_degree, options.fit.max_gaussians
+    known = [model for model in models if model is not None]
+    payload, secrets = _largest_payload(options), len(models) - 1
+    if degree == 0:
+        with advising(UsageError, f"`sh_degree=1` makes room{_growth(known)}, {_SIDECAR}"):
+            check_payload_fits(payload, cap, secrets, degree)
+    if options.start != "warm" or len(known) < len(models):
+        with advising(UsageError, f"a larger `max_gaussians` makes room, {_SIDECAR}"):
+            check_payload_fits(payload, cap, secrets, degree)
+        return
+    started = [with_low_bits(model, degree, os.urandom(32)) for model in known]
+    usable = np.concatenate([usable_carriers(model) for model in started])
+    share = float(usable.mean())
+    if share < LEAST_USABLE_AT_START:
+        raise InputError(
+            f"only {share:.0%} of the Gaussians could have random low bits, the others hold equal values; "
+            f"{_SIDECAR}"
+        )
+    with advising(UsageError, _SIDECAR):
+        check_payload_fits(payload, min(cap, len(usable)), secrets, degree, usable=share)
+
+
+def _growth(models: Sequence[Gaussians]) -> str:
+    """What it costs that a model of SH degree 0 gets degree 1."""
+    if not models:
+        return ""
+    before, after = (len(models[0]) * 4 * (14 + 3 * count) / 1e6 for count in (1, 4))
+    return f" (the cover's own Gaussians take {after:.1f} MB then instead of {before:.1f})"
 
 
 def _largest_payload(options: LearnedOptions) -> int:

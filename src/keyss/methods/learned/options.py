@@ -25,6 +25,14 @@ class LearnedOptions(MethodOptions):
     iterations: int | None = None
     max_gaussians: int | None = None
 
+    sh_degree: Annotated[
+        int | None,
+        CommandLineOption(
+            "Degree of the published model's spherical harmonics, 0 to 3; without it the cover's.",
+            metavar="N",
+        ),
+    ] = None
+
     start: Annotated[
         Literal["warm", "points"],
         CommandLineOption("Start from plain models, or from sparse points (the paper's)."),
@@ -115,12 +123,17 @@ class LearnedOptions(MethodOptions):
 
 
 def sized(options: LearnedOptions, inputs: Sequence[SceneInput]) -> LearnedOptions:
-    """`options` for the cover and secrets of `inputs`; unchanged where one of them has photos.
+    """`options` for the cover and secrets of `inputs`, with the SH degree of the published model.
 
     Where models are all there is, the published model holds the Gaussians of all of them unless
     `options.max_gaussians` says otherwise. If nothing has to be left out the start is right already: the
     training is short and gentle, for large steps would only do harm.
     """
+    degree, cover = options.sh_degree, inputs[0].model
+    if degree is None and cover is not None and options.start == "warm":
+        degree = cover.sh_degree
+    if degree is not None:
+        options = replace(options, fit=replace(options.fit, sh_degree=degree))
     models = [each.model for each in inputs if each.model is not None and not each.photos]
     total = sum(len(model) for model in models)
     if len(models) < len(inputs) or (options.max_gaussians or total) < total:
@@ -129,8 +142,6 @@ def sized(options: LearnedOptions, inputs: Sequence[SceneInput]) -> LearnedOptio
         options.fit,
         iterations=options.iterations or min(options.fit.iterations, MODEL_ITERATIONS),
         max_gaussians=options.max_gaussians or max(16, total),
-        # Degree 1 is the least: spherical harmonics above the constant ones are where most low bits are.
-        sh_degree=max(1, *(model.sh_degree for model in models)),
     )
     return replace(options, fit=fit, warm_rate=MODEL_RATE * options.warm_rate)
 
@@ -145,7 +156,7 @@ def training_options(options: LearnedOptions) -> LearnedOptions:
 def decoder_shape(options: LearnedOptions) -> DecoderShape:
     """Kind and sizes of the decoder; most have the same names."""
     shape = {name: getattr(options, name) for name in vars(DecoderShape()) if hasattr(options, name)}
-    return DecoderShape(kind=options.decoder, sh_degree=options.fit.sh_degree, **shape)
+    return DecoderShape(**shape | {"kind": options.decoder, "sh_degree": options.fit.sh_degree})
 
 
 def chosen_scenes(which: Scenes, count: int) -> list[int]:

@@ -26,7 +26,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.base import Frame
+from keyss.methods.base import Frame, Remains
 from keyss.methods.learned.decoder import Decoder, DecoderShape, parse_mask
 from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift
 
@@ -35,6 +35,7 @@ ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
 _ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
+_SLACK = 0.01  # of the Gaussians: rounding takes some over the limit of what is drawn, and others back
 _WEIGHTS = "decoder."
 # What reading a damaged header or damaged weights can raise.
 _LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
@@ -81,6 +82,7 @@ class HiddenSecret:
     # opacities to nothing, and some drop the colours of what is transparent.
     faint: Tensor | None = None
     count: int = 0  # Gaussians that the secret has when it is revealed from a whole file; 0: not known
+    chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
@@ -95,8 +97,8 @@ class HiddenSecret:
             stego = self.with_faint(stego)
         decoded = self.decode(stego, self.embedding)
         if (drawn := decoded.opacities >= DRAWN_OPACITY).any():
-            decoded = decoded[drawn]
-        decoded = compensate_pruning(decoded, self.count).to("cpu")
+            decoded = compensate_pruning(decoded[drawn], self.count)
+        decoded = decoded.to("cpu")
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
@@ -108,6 +110,11 @@ class HiddenSecret:
             stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device)
         )
         return decoded
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        """None where nothing of what was revealed is ever drawn."""
+        found = int((revealed.opacities >= DRAWN_OPACITY).sum())
+        return Remains(found, self.count, self.chunks, _SLACK)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(pack_secret(self)).hexdigest()[:16]

@@ -149,7 +149,8 @@ def _channels(part: Gaussians) -> Table:
 
 
 def _bulk(values: Table) -> Table:
-    """`values` with NaN for outliers: else a 64th of what is published would lie between them and the rest."""
+    """`values` with NaN for outliers: else every 64th of what is published would lie between them and the
+    rest."""
     if len(values) == 0:
         return values
     distance = np.abs(values - np.median(values, axis=0))

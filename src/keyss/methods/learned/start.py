@@ -35,7 +35,7 @@ def _from_points(
     fit = config.fit
     chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in chosen]
-    shares = _shares([len(points) for points, _ in clouds], [1.0] * len(clouds), fit.max_gaussians)
+    shares = divided([len(points) for points, _ in clouds], [1.0] * len(clouds), fit.max_gaussians)
     parts = [
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
         for (points, colors), share in zip(clouds, shares, strict=True)
@@ -49,7 +49,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gauss
     # What is never drawn would lie among the hidden.
     plains = [plain[(plain.opacity_logits > DRAWN_LOGIT) & ~plain.overflow] for plain in plains]
     weights = [1.0] + [config.secret_share] * (len(scenes) - 1)
-    shares = _shares([len(plain) for plain in plains], weights, config.fit.max_gaussians)
+    shares = divided([len(plain) for plain in plains], weights, config.fit.max_gaussians)
     chosen = [
         _most_contributing(plain, placed.scene, share)
         for plain, placed, share in zip(plains, scenes, shares, strict=True)
@@ -61,7 +61,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gauss
     return Gaussians.cat(parts)
 
 
-def _shares(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
+def divided(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
     """`total` items divided by `weights`, nowhere more than `available`; what is left over is given on."""
     shares = [0] * len(available)
     while (left := total - sum(shares)) > 0:

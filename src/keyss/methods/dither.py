@@ -9,6 +9,8 @@ seen is whether anything is in the low bits.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -23,6 +25,7 @@ _FEW = 0.8  # share of different values below which a property was quantised; in
 _SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
 _VIEWS, _SIZE = 4, 256
+_FAINT = 1e-3  # standard deviation of harmonics that a model does not have
 
 Floats = npt.NDArray[np.float32]
 
@@ -38,11 +41,24 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
         columns = values.view(len(values), -1).numpy()
         for column in range(3 if name == "sh" else 0, columns.shape[1]):
             if not _is_natural(columns[:, column]):
-                random = stream(entropy, f"carry/dither/{name}/{column}", 8 * len(columns))
+                random = stream(entropy, f"dither/{name}/{column}", 8 * len(columns))
                 noise = np.frombuffer(random, "<u8").astype(np.float64) / 2.0**63 - 1
                 columns[:, column] = _dithered(columns[:, column], noise)
         changed[name] = values
     return Gaussians(means=model.means, **changed)
+
+
+def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
+    """`model` with harmonics up to `sh_degree`, those that it does not have too small to be seen.
+
+    Zeros have no low bits that could be replaced. A model of this degree or more stays as it is.
+    """
+    count = 3 * ((sh_degree + 1) ** 2 - model.sh.shape[1])
+    if count <= 0:
+        return model
+    seed = int.from_bytes(stream(entropy, "dither/raised", 8), "little") >> 1
+    noise = torch.randn(len(model), count // 3, 3, generator=torch.Generator().manual_seed(seed))
+    return replace(model, sh=torch.cat([model.sh, _FAINT * noise.to(model.sh)], dim=1))
 
 
 def cost(before: Gaussians, after: Gaussians) -> float:

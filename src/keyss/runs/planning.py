@@ -1,0 +1,307 @@
+"""What a hiding will take, before it begins: steps, room, time, memory, disk.
+
+Sizes follow from the models and the options. Times are those of a few steps at the sizes to come, on this
+machine and while it does what else it does, extrapolated: rough, mostly within a factor of two.
+"""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from keyss.core.errors import OutputError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene, View
+from keyss.fitting.config import FitConfig
+from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.parameters import (
+    initial_gaussians,
+    initial_points,
+    make_optimizers,
+    to_gaussians,
+    to_parameters,
+)
+from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput
+from keyss.rendering import render, render_with_meta
+from keyss.rendering.orbit import TEST_EVERY, VIEWS
+
+_PROBES = 3  # steps that are timed, after one that is not
+_WATCHED = 8  # views that a training looks at every `evaluate_every` steps
+_KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and opening it again
+_CODING_SECONDS = 2e-5  # for each Gaussian of the published model: finding carriers, encrypting, writing
+_STATE_COPIES = 3  # numbers that a checkpoint has for one of a model: itself and two moments
+_OTHER_BYTES = 4 << 20  # records in JSON, locks, and what a file system adds
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a run."""
+
+    name: str
+    steps: int  # 0 where nothing is trained
+    gaussians: int  # at its end, at most
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A whole run. Times, memory and disk are estimates."""
+
+    method: str
+    stages: tuple[Stage, ...]
+    outlook: Outlook
+    file_bytes: int  # of the published model, at most
+    disk_bytes: int  # of all files that are there at the same time, checkpoints included
+    free_bytes: int | None  # where they are to be written, None without such a place
+    memory_bytes: int
+
+    @property
+    def seconds(self) -> float:
+        return sum(stage.seconds for stage in self.stages)
+
+
+def plan_hiding(
+    method: Method,
+    options: MethodOptions,  # prepared
+    inputs: Sequence[SceneInput],  # of the cover, then of the secrets
+    scenes: Sequence[Scene],  # of these, at least with their test pictures
+    device: torch.device,
+    out: Path | None,
+) -> Plan:
+    """What hiding `scenes` comes to, after a few steps of training at the sizes to come. Writes nothing."""
+    outlook = method.outlook(inputs, options)
+    fits = [each.model is None for each in inputs]
+    trains = method.trains or any(fits)
+    probes = [
+        _Probe(scene, each.model, options.fit, outlook.sh_degree, device, trains)
+        for scene, each in zip(scenes, inputs, strict=True)
+    ]
+    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
+    stages = []
+    for index, (probe, each) in enumerate(zip(probes, inputs, strict=True)):
+        role = _role(index, len(inputs))
+        if not each.photos:
+            views = VIEWS if trains else VIEWS // TEST_EVERY
+            stages.append(
+                Stage(f"pictures of the {role}", 0, sizes[index], views * probe.picture(sizes[index]))
+            )
+        if each.model is None:
+            stages.append(_fitting(f"plain model of the {role}", options.fit, probe, sizes[index]))
+    if method.trains:
+        stages.append(_hiding(options.fit, probes, sizes, outlook))
+    writing = _KEY_SECONDS * len(inputs[1:]) + _CODING_SECONDS * outlook.gaussians
+    stages.append(Stage("encrypting, opening again", 0, outlook.gaussians, writing))
+    stages.append(
+        Stage("measuring", 0, outlook.gaussians, _measuring(method, probes, scenes, sizes, outlook))
+    )
+
+    state = outlook.gaussians * _floats(outlook.sh_degree) * 4
+    pictures = sum(
+        (VIEWS - VIEWS // TEST_EVERY) * _pixels(scene) * 3
+        for scene, each in zip(scenes, inputs, strict=True)
+        if not each.photos and trains
+    )
+    # Parameters, gradients and moments, twice more all that a checkpoint holds while it is written.
+    memory = _resident_bytes() + pictures + (state * (4 + 2 * _STATE_COPIES) if trains else 3 * state)
+    return Plan(
+        method=method.name,
+        stages=tuple(stages),
+        outlook=outlook,
+        file_bytes=_file_bytes(outlook.gaussians, outlook.sh_degree),
+        disk_bytes=disk_bytes(method, options, inputs),
+        free_bytes=None if out is None else free_bytes(out),
+        memory_bytes=memory,
+    )
+
+
+def disk_bytes(method: Method, options: MethodOptions, inputs: Sequence[SceneInput]) -> int:
+    """The most bytes that a hiding has on disk at once: results, plain models, checkpoints being replaced."""
+    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
+    degrees = [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
+    plain = [_file_bytes(*each) for each in zip(sizes, degrees, strict=True)]
+    fitted = [size for size, each in zip(plain, inputs, strict=True) if each.model is None]
+    if not method.trains:
+        return sum(plain) + plain[0] + _STATE_COPIES * (sum(fitted) + max(fitted, default=0)) + _OTHER_BYTES
+    published = min(_file_bytes(sum(sizes), options.fit.sh_degree), sum(plain) + max(plain))
+    checkpoints = _STATE_COPIES * (2 * published + sum(fitted))
+    return sum(plain) + published + checkpoints + _OTHER_BYTES
+
+
+def free_bytes(out: Path) -> int:
+    """Bytes that are free where `out` is or will be."""
+    folder = out.resolve()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
+
+
+def check_disk(out: Path, method: Method, options: MethodOptions, inputs: Sequence[SceneInput]) -> None:
+    """Raise OutputError unless there is room for all that a hiding writes."""
+    needed, free = disk_bytes(method, options, inputs), free_bytes(out)
+    if free < needed:
+        raise OutputError(
+            f"{out}: expected {needed / 1e6:,.0f} MB of free space for models and checkpoints, found "
+            f"{free / 1e6:,.0f} MB; make room, choose another place, or a smaller `max_gaussians`"
+        )
+
+
+class _Probe:
+    """Times of one scene's pictures and training steps, for any number of Gaussians."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: Gaussians | None,
+        config: FitConfig,
+        sh_degree: int,
+        device: torch.device,
+        trains: bool,
+    ) -> None:
+        self.scene, self.device, self.config = scene, device, config
+        if model is None:
+            self.start = min(config.max_gaussians, len(scene.points) if len(scene.points) >= 100 else 20_000)
+            models = [_made_up(scene, count, config) for count in {self.start, config.max_gaussians}]
+        else:
+            self.start = len(model)
+            models = [model.with_sh_degree(sh_degree) if trains else model]
+        # (Gaussians, seconds of a picture, seconds of a step) in ascending order
+        self.times = sorted(
+            (len(each), self._time_picture(each), self._time_step(each, trains)) for each in models
+        )
+
+    def picture(self, gaussians: float) -> float:
+        """Seconds of one picture."""
+        return self._at(gaussians, 1)
+
+    def step(self, gaussians: float) -> float:
+        """Seconds of one step of training with one picture."""
+        return self._at(gaussians, 2)
+
+    def _at(self, gaussians: float, column: int) -> float:
+        first, last = self.times[0], self.times[-1]
+        if last[0] == first[0]:
+            # Pixels and Gaussians cost about the same.
+            return float(last[column] * (0.5 + 0.5 * gaussians / last[0]))
+        share = (gaussians - first[0]) / (last[0] - first[0])
+        return float(max(0.5 * first[column], first[column] + share * (last[column] - first[column])))
+
+    def _views(self) -> list[View]:
+        views = self.scene.test
+        return [views[index * len(views) // (_PROBES + 1)] for index in range(_PROBES + 1)]
+
+    @torch.no_grad()
+    def _time_picture(self, model: Gaussians) -> float:
+        moved = model.to(self.device)
+        return _timed(lambda view: float(render(moved, view.camera).sum()), self._views())
+
+    def _time_step(self, model: Gaussians, trains: bool) -> float:
+        if not trains:
+            return 0.0
+        parameters = to_parameters(model, self.device)
+        optimizers = make_optimizers(parameters, self.config, self.scene.extent)
+
+        def step(view: View) -> None:
+            image, _ = render_with_meta(to_gaussians(parameters), view.camera)
+            target = Target.of(view.image.to(self.device))
+            photometric_loss(image, target, self.config.ssim_weight).backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            float(parameters["means"].detach().sum())
+
+        return _timed(step, self._views())
+
+
+def _timed(work: Callable[[View], object], views: Sequence[View]) -> float:
+    """Mean seconds of `work` on all views but the first."""
+    work(views[0])
+    start = time.perf_counter()
+    for view in views[1:]:
+        work(view)
+    return (time.perf_counter() - start) / len(views[1:])
+
+
+def _made_up(scene: Scene, count: int, config: FitConfig) -> Gaussians:
+    """A model of `count` Gaussians where the sparse points of `scene` are."""
+    generator = torch.Generator().manual_seed(0)
+    points, colors = initial_points(scene, count, generator)
+    times = -(-count // len(points))
+    spread = 0.002 * scene.extent * torch.randn(len(points) * times, 3, generator=generator)
+    copies = points.repeat(times, 1) + (spread if times > 1 else 0)
+    return initial_gaussians(copies, colors.repeat(times, 1), config.sh_degree, count, generator)
+
+
+def _fitting(name: str, config: FitConfig, probe: _Probe, most: int) -> Stage:
+    """A plain fit: as many Gaussians as points at first, growing to the cap while it densifies."""
+    grows, grown = config.grow_start, 0.5 * (config.grow_start + config.grow_stop)
+    first, last = probe.step(probe.start), probe.step(most)
+    each = grows * first + (grown - grows) * 0.5 * (first + last) + (1 - grown) * last
+    return Stage(name, config.iterations, most, config.iterations * each + _watching(config, [probe], [most]))
+
+
+def _hiding(config: FitConfig, probes: Sequence[_Probe], sizes: Sequence[int], outlook: Outlook) -> Stage:
+    """A joint training: a picture of every scene in each step."""
+    share = min(1.0, outlook.gaussians / sum(sizes))
+    own = [share * size for size in sizes]
+    each = sum(probe.step(size) for probe, size in zip(probes, own, strict=True))
+    seconds = outlook.steps * each + _watching(config, probes, own, outlook.steps)
+    return Stage("hiding", outlook.steps, outlook.gaussians, seconds)
+
+
+def _watching(
+    config: FitConfig, probes: Sequence[_Probe], sizes: Sequence[float], steps: int | None = None
+) -> float:
+    """Seconds of looking at held-out views during a training."""
+    if not config.evaluate_every:
+        return 0.0
+    times = (config.iterations if steps is None else steps) // config.evaluate_every
+    views = (min(_WATCHED, len(probe.scene.test)) for probe in probes)
+    return times * sum(
+        count * probe.picture(size) for count, probe, size in zip(views, probes, sizes, strict=True)
+    )
+
+
+def _measuring(
+    method: Method, probes: Sequence[_Probe], scenes: Sequence[Scene], sizes: Sequence[int], outlook: Outlook
+) -> float:
+    """Seconds for all pictures of the results: of each scene its own, the plain model's, and wrong keys'."""
+    share = min(1.0, outlook.gaussians / sum(sizes)) if method.trains else 1.0
+    every = [
+        len(scene.test) * probe.picture(share * size)
+        for probe, scene, size in zip(probes, scenes, sizes, strict=True)
+    ]
+    wrong = 32 if method.trains else 0  # keys, seen from the cameras of the cover and of the secret
+    decoding = sum(every[:1]) * len(every[1:]) + sum(every[1:])
+    return 6 * sum(every) + wrong * decoding
+
+
+def _role(index: int, inputs: int) -> str:
+    return "cover" if index == 0 else "secret" if inputs == 2 else f"secret {index}"
+
+
+def _floats(sh_degree: int) -> int:
+    """Numbers of a Gaussian that are trained."""
+    return 11 + 3 * (sh_degree + 1) ** 2
+
+
+def _file_bytes(gaussians: int, sh_degree: int) -> int:
+    """Of a PLY, which has normals too."""
+    return 4 * gaussians * (3 + _floats(sh_degree)) + 2048
+
+
+def _pixels(scene: Scene) -> int:
+    camera = scene.test[0].camera
+    return camera.width * camera.height
+
+
+def _resident_bytes() -> int:
+    """The most memory that this process has had."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

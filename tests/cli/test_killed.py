@@ -1,0 +1,202 @@
+"""Whatever ends a command, and whenever: repeated, it ends in the result of one that nothing disturbed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+PROGRAM = [sys.executable, "-c", "from keyss.cli.process import main; main()"]
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+SIZE = ("--preset", "quick", "--iterations", "150", "--max-gaussians", "100", "--device", "cpu")
+UNFINISHED = ("unfinished", "lock", "checkpoint")  # in names of what may not be left
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that is disturbed; OUT and RUN in its arguments stand for what it writes and works in."""
+
+    arguments: tuple[str, ...]
+    again: str  # option with which it is repeated
+    in_run: bool = False  # works in a copy of a finished run
+    results: tuple[str, ...] = field(default=())  # files that must be the same to the byte
+    numbers: tuple[str, ...] = field(default=())  # JSON that must be the same but for seconds
+
+
+COMMANDS: Mapping[str, Command] = {
+    "fit": Command(
+        ("fit", "a", "-o", "OUT", *SIZE), "--resume", results=("model.ply", "private/config.json")
+    ),
+    "hide": Command(
+        (
+            "hide",
+            "--cover",
+            "a",
+            "--secret",
+            "b",
+            "--key-file",
+            "key.txt",
+            "--min-psnr=0",
+            "-o",
+            "OUT",
+            *SIZE,
+        ),
+        "--resume",
+        results=("publish/stego.ply", "private/cover.ply", "private/secret-1.ply"),
+        numbers=("private/metrics.json",),
+    ),
+    "audit": Command(
+        (
+            "audit",
+            "RUN",
+            "--key-file",
+            "key.txt",
+            "--controls",
+            "2",
+            "--only",
+            "parameters",
+            "--device",
+            "cpu",
+        ),
+        "--resume",
+        in_run=True,
+        numbers=("private/audit/audit.json",),
+    ),
+    "reveal": Command(
+        ("reveal", "RUN/publish/stego.ply", "--key-file", "key.txt", "-o", "OUT", "--device", "cpu"),
+        "--overwrite",
+        in_run=True,
+        results=("",),
+    ),
+}
+
+
+def started(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*PROGRAM, *arguments], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+
+
+def without_times(text: str) -> object:
+    """A record without what differs from run to run: how long it took, and where it lies."""
+
+    def plain(value: object) -> object:
+        if isinstance(value, dict):
+            return {name: plain(each) for name, each in value.items() if name not in ("seconds", "path")}
+        return [plain(each) for each in value] if isinstance(value, list) else value
+
+    return plain(json.loads(text))
+
+
+def result_of(command: Command, out: Path, run: Path) -> list[object]:
+    base = run if command.in_run and command.numbers else out
+    files: list[object] = [
+        hashlib.sha256((base / name if name else base).read_bytes()).hexdigest() for name in command.results
+    ]
+    return files + [without_times((base / name).read_text()) for name in command.numbers]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes, a key and a finished run."""
+    from files.scene_files import write_blender, write_nerfstudio
+
+    folder = tmp_path_factory.mktemp("killed")
+    write_blender(folder / "a", count=3, channels=3)
+    write_nerfstudio(folder / "b", count=4)
+    (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
+    (folder / "key.txt").chmod(0o600)
+    hide = [part.replace("OUT", "finished") for part in COMMANDS["hide"].arguments]
+    assert subprocess.run([*PROGRAM, *hide], cwd=folder, capture_output=True, check=False).returncode == 0
+    return folder
+
+
+class Undisturbed:
+    """Of each command what it comes to, and how long it takes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.found = folder, dict[str, tuple[list[object], float]]()
+
+    def __call__(self, name: str) -> tuple[list[object], float]:
+        if name not in self.found:
+            out, run, arguments = prepared(self.folder, name, "undisturbed")
+            before = time.monotonic()
+            with started(arguments, self.folder) as process:
+                _, err = process.communicate()
+            assert process.returncode == 0, err
+            self.found[name] = result_of(COMMANDS[name], out, run), time.monotonic() - before
+        return self.found[name]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(world: Path) -> Undisturbed:
+    return Undisturbed(world)
+
+
+def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]]:
+    """Output, run folder and arguments of a command that has a place of its own."""
+    place = folder / f"{name}-{which}"
+    place.mkdir()
+    out, run = place / ("out.ply" if name == "reveal" else "out"), place / "run"
+    if COMMANDS[name].in_run:
+        shutil.copytree(folder / "finished", run)
+    parts = [part.replace("OUT", str(out)).replace("RUN", str(run)) for part in COMMANDS[name].arguments]
+    return out, run, parts
+
+
+def disturb(
+    world: Path, undisturbed: Callable[[str], tuple[list[object], float]], name: str, signum: int, seed: int
+) -> None:
+    expected, seconds = undisturbed(name)
+    rng = random.Random(seed)
+    out, run, arguments = prepared(world, name, str(seed))
+    mine = out.parent / "mine.txt"
+    mine.write_text("mine")
+    again = arguments
+    for _ in range(rng.choice((1, 1, 2))):  # some are disturbed once more
+        with started(again, world) as process:
+            try:
+                process.wait(rng.uniform(0, 1.1 * seconds))
+            except subprocess.TimeoutExpired:
+                process.send_signal(signum)
+            _, err = process.communicate(timeout=120)
+        assert "Traceback" not in err, err
+        assert process.returncode in (0, -signum, 128 + signum), err
+        again = [*arguments, COMMANDS[name].again]
+        if process.returncode == 0:
+            break
+    if process.returncode != 0:
+        with started(again, world) as process:
+            _, err = process.communicate(timeout=300)
+        # It may have been done just before the signal came.
+        assert process.returncode == 0 or "holds a finished run" in err, err
+        assert "Traceback" not in err
+    assert result_of(COMMANDS[name], out, run) == expected
+    assert mine.read_text() == "mine"
+    left = [path.name for path in out.parent.rglob("*") if any(word in path.name for word in UNFINISHED)]
+    assert left == []
+    shutil.rmtree(out.parent)
+
+
+@pytest.mark.parametrize(("name", "signum"), list(zip(COMMANDS, (*SIGNALS, signal.SIGKILL), strict=True)))
+def test_a_repeated_command_ends_as_if_nothing_had_disturbed_it(
+    world: Path, undisturbed: Undisturbed, name: str, signum: int
+) -> None:
+    disturb(world, undisturbed, name, signum, seed=1000 + signum)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(50))
+def test_fifty_commands_are_disturbed(world: Path, undisturbed: Undisturbed, seed: int) -> None:
+    name = list(COMMANDS)[seed % len(COMMANDS)]
+    disturb(world, undisturbed, name, SIGNALS[seed // len(COMMANDS) % len(SIGNALS)], seed)

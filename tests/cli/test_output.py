@@ -1,0 +1,132 @@
+"""Standard streams as they may be: closed, full, left by their reader, or without most characters."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import COMMANDS, PROGRAM, Said
+from keyss.cli import main
+from keyss.cli.characters import REPLACING
+from keyss.files.ply import read_ply
+
+NARROW = ["ascii", "cp1252", "latin-1", "cp437"]
+
+
+def shell(redirection: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    """`keyss ARGUMENTS REDIRECTION`, as a shell runs it."""
+    command = ["sh", "-c", f'"$@" {redirection}', "sh", *PROGRAM, *map(str, arguments)]
+    variables = {**os.environ, "COLUMNS": "100", **environment}
+    return subprocess.run(command, capture_output=True, env=variables, timeout=120, check=False)
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status"),
+    [
+        (">&-", 0),
+        ("2>&-", 0),
+        ("2>/dev/full", 0),
+        ("<&- >&- 2>&-", 0),
+        (">/dev/full", 5),
+        ("| left", 141),
+    ],
+)
+def test_results_are_whole_whatever_becomes_of_the_output(
+    world: Path, tmp_path: Path, redirection: str, status: int
+) -> None:
+    secret = tmp_path / "secret.ply"
+    stego, key = world / "hidden" / "publish" / "stego.ply", world / "key.txt"
+    arguments = ["reveal", stego, "--key-file", key, "-o", secret]
+    if redirection == "| left":
+        done = _with_a_reader_that_leaves(arguments)
+    else:
+        done = shell(redirection, *arguments)
+    assert done.returncode == status, done.stderr
+    assert b"Traceback" not in done.stderr
+    assert b"internal error" not in done.stderr
+    assert len(read_ply(secret)) > 0
+    assert [path.name for path in tmp_path.iterdir()] == ["secret.ply"]
+
+
+def _with_a_reader_that_leaves(arguments: list[object]) -> subprocess.CompletedProcess[bytes]:
+    pipe = subprocess.PIPE
+    process = subprocess.Popen([*PROGRAM, *map(str, arguments)], stdout=pipe, stderr=pipe)
+    assert process.stdout is not None
+    process.stdout.close()
+    _, err = process.communicate(timeout=120)
+    assert err == b""
+    return subprocess.CompletedProcess([], process.returncode, b"", err)
+
+
+@pytest.mark.parametrize("command", ["keygen", "--help", "--version"])
+def test_a_reader_that_leaves_is_no_error(command: str) -> None:
+    assert _with_a_reader_that_leaves([command]).returncode == 141
+
+
+@pytest.mark.parametrize(("redirection", "status"), [("2>/dev/full", 4), ("2>&-", 4), ("2>&- >&-", 4)])
+def test_an_error_has_its_status_where_nobody_can_be_told(redirection: str, status: int) -> None:
+    assert shell(redirection, "info", "nowhere").returncode == status
+
+
+def test_progress_that_cannot_be_shown_stops_nothing(world: Path, tmp_path: Path) -> None:
+    small = ("--iterations", 20, "--max-gaussians", 100, "--device", "cpu")
+    done = shell("2>/dev/full", "fit", world / "b", "-o", tmp_path / "out", *small)
+    assert done.returncode == 0
+    assert b"PSNR" in done.stdout
+
+
+@pytest.mark.parametrize("encoding", NARROW)
+def test_help_and_errors_in_any_encoding(encoding: str) -> None:
+    done = shell("", "--help", PYTHONIOENCODING=encoding)
+    assert (done.returncode, done.stderr) == (0, b"")
+    said = done.stdout.decode(encoding)
+    assert all(f" {name} " in said for name in COMMANDS)
+    assert "?" not in said
+    done = shell("", "info", "nowhere/ä鍵", PYTHONIOENCODING=encoding)
+    assert done.returncode == 4
+    assert done.stderr.decode(encoding).startswith("keyss: error: nowhere/")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_made_of_characters_with_a_likeness_in_ascii(
+    keyss: Callable[..., Said], command: str
+) -> None:
+    said = keyss(command, "--help").out
+    assert said.encode("ascii", REPLACING).count(b"?") == said.count("?")
+
+
+def test_what_cannot_be_shown_is_replaced() -> None:
+    assert "╭ • 7 ≤ 8…".encode("ascii", REPLACING) == b"+ * 7 <= 8..."
+    assert "ä鍵".encode("cp1252", REPLACING) == b"\xe4?"
+    assert os.fsdecode(b"\xff.ply").encode("utf-8", REPLACING) == b"\xff.ply"  # a file's name as it is
+
+
+def test_numbers_in_a_locale_without_characters(world: Path, tmp_path: Path) -> None:
+    """`fit` and `info`, progress included, where Python's own UTF-8 is switched off."""
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    small = ("--iterations", 20, "--max-gaussians", 100, "--device", "cpu")
+    done = shell("", "fit", world / "b", "-o", tmp_path / "ä鍵", *small, **plain)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith(b"fit b: 20 steps")
+    assert os.fsencode(tmp_path / "ä鍵" / "model.ply") in done.stdout  # a path comes out as it went in
+    done = shell("", "info", tmp_path / "ä鍵", "--json", **plain)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["config"]["scene"] == str(world / "b")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp437"])
+def test_json_is_json_in_any_encoding(
+    keyss: Callable[..., Said], world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
+) -> None:
+    shutil.copytree(world / "b", tmp_path / "ä鍵")
+    stream = io.TextIOWrapper(io.BytesIO(), encoding, REPLACING)
+    monkeypatch.setattr("sys.stdout", stream)
+    assert main(["info", str(tmp_path / "ä鍵"), "--json"]) == 0
+    assert json.loads(stream.buffer.getvalue().decode(encoding))["name"] == "ä鍵"  # type: ignore[attr-defined]

@@ -1,0 +1,367 @@
+"""`keyss reveal` and `keyss verify`: what they say they found, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from channels.low_bits.trained_like import trained_like
+from cli.said import PROGRAM, Said, assert_refused, listing
+from keyss.channels.base import Payload
+from keyss.channels.low_bits import LOW_BITS, cells, channel
+from keyss.channels.low_bits.bits import identities
+from keyss.channels.low_bits.channel import derivation_of, salts
+from keyss.channels.sidecar import encrypt_sidecar
+from keyss.core import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.files.ply import read_ply, write_ply
+from keyss.keys import DerivedKey, random_embeddings
+from keyss.methods.carry.carrying import _COUNT, encode_all
+from keyss.methods.learned.decoder import Decoder, DecoderShape
+from keyss.methods.learned.opacity_band import hidden_logits, opacity_remap
+from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
+
+KEY = "q7Rv2LxT9bWm4KzD"
+Run = Callable[..., Said]
+
+
+def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
+    """`cover` with `secret` in it, as if `claimed` Gaussians had been hidden and the others were lost."""
+    prepared = LOW_BITS.prepare(cover)
+    (records,) = encode_all(prepared, [secret])
+    records = replace(records, header=_COUNT.pack(claimed) + records.header[_COUNT.size :])
+    names = salts(identities(cover))
+    keys = [DerivedKey(KEY, derivation_of(names[0]))] * len(names)  # the first salt is enough for a reader
+    return prepared.embed_derived([(keys, records)])
+
+
+def learned(cover: Gaussians, key: str) -> tuple[Gaussians, bytes]:
+    """A model half of whose Gaussians are transparent in it and opaque with a key, and its sidecar."""
+    hidden = torch.arange(len(cover)) % 2 == 0
+    logits = torch.where(hidden, hidden_logits(cover.opacity_logits, 0), cover.opacity_logits.abs())
+    stego = replace(cover, opacity_logits=logits)
+    generator = torch.Generator().manual_seed(0)
+    decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))
+    decoder.prepare(stego, random_embeddings(1, generator)[0])
+    decoder.set_remap(*opacity_remap(0))
+    anchors = choose_anchors(stego, generator)
+    secret = HiddenSecret(decoder.requires_grad_(False), Similarity.identity(), anchors)
+    secret = replace(secret, count=secret.remains(secret.reveal(stego)).found)
+    return stego, encrypt_sidecar([(key, Payload("learned", pack_secret(secret)))])
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys `key` and `other`; models of which 500 of 500, 1,000 and 12,000 Gaussians are left; `learned`."""
+    folder = tmp_path_factory.mktemp("files")
+    for name, key in (("key", KEY), ("other", KEY[::-1])):
+        (folder / name).write_text(key)
+        (folder / name).chmod(0o600)
+    cover, secret = trained_like(1500), trained_like(500, 1)
+    write_ply(folder / "plain.ply", cover)
+    for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):
+        write_ply(folder / f"{name}.ply", carried(cover, secret, claimed))
+    (folder / "learned").mkdir()
+    stego, sidecar = learned(trained_like(400, 2), KEY)
+    write_ply(folder / "learned" / "stego.ply", stego)
+    (folder / "learned" / "decoder.sealed").write_bytes(sidecar)
+    return folder
+
+
+@pytest.fixture
+def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
+    """Reveals a model with the key of that name into `s.ply` of the test's folder."""
+
+    def run(model: Path | str, *more: object, key: str = "key") -> Said:
+        return keyss("reveal", files / model, "--key-file", files / key, "-o", tmp_path / "s.ply", *more)
+
+    return run
+
+
+class TestCounts:
+    def test_a_whole_secret(self, reveal: Run, tmp_path: Path) -> None:
+        assert reveal("whole.ply") == Said(0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n", "")
+
+    def test_a_warning_with_its_cause_where_much_is_missing(self, reveal: Run, tmp_path: Path) -> None:
+        said = reveal("half.ply")
+        assert (said.status, said.out) == (0, f"{tmp_path}/s.ply: 500 of 1,000 Gaussians\n")
+        assert said.err.startswith("keyss: warning: 500 of 1,000 Gaussians of the secret were found")
+        assert "pruning by opacity" in said.err
+        assert len(said.err.splitlines()) == 1
+
+    def test_too_little_is_refused_and_taken_by_force(self, reveal: Run, tmp_path: Path) -> None:
+        assert_refused(reveal("few.ply"), 4, "500 of 12,000 Gaussians")
+        assert listing(tmp_path) == {}
+        assert "--force" in reveal("few.ply").err
+        said = reveal("few.ply", "--force")
+        assert (said.status, len(read_ply(tmp_path / "s.ply"))) == (0, 500)
+        assert "keyss: warning: 500 of 12,000" in said.err
+
+    def test_a_learned_secret_is_gone_after_pruning_by_opacity(
+        self, reveal: Run, files: Path, tmp_path: Path
+    ) -> None:
+        whole = reveal("learned/stego.ply")
+        assert whole == Said(0, f"{tmp_path}/s.ply: 200 of 200 Gaussians\n", "")
+        stego = read_ply(files / "learned" / "stego.ply")
+        (tmp_path / "pruned").mkdir()
+        write_ply(tmp_path / "pruned" / "stego.ply", stego[stego.opacities > 0.005])
+        shutil.copy(files / "learned" / "decoder.sealed", tmp_path / "pruned")
+        said = reveal(tmp_path / "pruned" / "stego.ply", "--overwrite")
+        assert_refused(said, 4, "0 of 200 Gaussians")
+
+
+class TestOpensNothing:
+    """A plain model, a wrong key and a model whose low bits are gone: same words, same work."""
+
+    @pytest.fixture
+    def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+        """Counts derived keys, and blocks of AES."""
+        done = {"keys": 0, "blocks": 0}
+        encrypt, derive = cells._encrypt, channel.DerivedKey
+
+        def counted(key: bytes, data: np.ndarray) -> np.ndarray:
+            done["blocks"] += data.size // 16
+            return encrypt(key, data)
+
+        def derived(*arguments: object) -> DerivedKey:
+            done["keys"] += 1
+            return derive(*arguments)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(cells, "_encrypt", counted)
+        monkeypatch.setattr(channel, "DerivedKey", derived)
+        return done
+
+    def test_in_the_same_words_after_the_same_work(
+        self, reveal: Run, files: Path, tmp_path: Path, work: dict[str, int]
+    ) -> None:
+        erased = read_ply(files / "whole.ply")
+        rounded = erased.map(lambda values: (values * 2**10).round() / 2**10)
+        write_ply(tmp_path / "rounded.ply", rounded)
+        attempts = [("plain.ply", "key"), ("whole.ply", "other"), (tmp_path / "rounded.ply", "key")]
+        said, made = [], []
+        for model, key in attempts:
+            work.update(keys=0, blocks=0)
+            said.append(reveal(model, key=key))
+            made.append(dict(work))
+        assert said[0] == said[1] == said[2]
+        assert made[0] == made[1] == made[2]
+        assert made[0]["keys"] == channel.SALTS_TRIED
+        assert_refused(said[0], 3, "opens nothing here")
+        for word in ("another key", "decoder.sealed", "converted or quantised", "moved", "trained on"):
+            assert word in said[0].err
+
+    def test_with_a_sidecar_too(self, reveal: Run, files: Path) -> None:
+        without = reveal("plain.ply")
+        assert reveal("learned/stego.ply", key="other") == without
+        given = files / "learned" / "decoder.sealed"
+        assert reveal("plain.ply", "--decoder", given, key="other") == without
+
+    def test_with_a_decoy_both_places_are_looked_at_by_every_key(
+        self, reveal: Run, work: dict[str, int]
+    ) -> None:
+        made = []
+        for key in ("key", "other"):
+            work.update(keys=0, blocks=0)
+            said = reveal("learned/stego.ply", "--decoy", "--overwrite", key=key)
+            assert (said.status, said.err) == (0, "")
+            made.append(dict(work))
+        assert made[0] == made[1]
+        assert made[0]["keys"] == 1
+
+
+class TestSidecars:
+    @pytest.fixture
+    def beside(self, files: Path, tmp_path: Path) -> Path:
+        """A model that carries its secret, beside a sidecar of another one under the same key."""
+        (tmp_path / "run").mkdir()
+        shutil.copy(files / "whole.ply", tmp_path / "run" / "stego.ply")
+        shutil.copy(files / "learned" / "decoder.sealed", tmp_path / "run")
+        return tmp_path / "run" / "stego.ply"
+
+    @pytest.mark.parametrize("kind", ["another model", "another key", "damaged"])
+    def test_a_stale_one_beside_the_file_is_passed_over(
+        self, reveal: Run, beside: Path, tmp_path: Path, kind: str
+    ) -> None:
+        words = "made for another model"
+        if kind == "another key":
+            beside.with_name("decoder.sealed").write_bytes(learned(trained_like(400, 2), "another key")[1])
+            words = "this key does not open it"
+        elif kind == "damaged":
+            beside.with_name("decoder.sealed").write_bytes(b"KEYSSEAL")
+            words = "not a sidecar"
+        said = reveal(beside)
+        assert (said.status, said.out) == (0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n")
+        assert said.err.startswith("keyss: warning: ")
+        assert words in said.err
+        assert "what lies in the model itself was opened" in said.err
+
+    def test_one_that_is_given_has_to_open(self, reveal: Run, beside: Path, tmp_path: Path) -> None:
+        given = beside.with_name("decoder.sealed")
+        assert_refused(reveal(beside, "--decoder", given), 4, "another model")
+        assert_refused(reveal(beside, "--decoder", given, key="other"), 3, "opens nothing")
+        assert not (tmp_path / "s.ply").exists()
+
+    def test_of_another_model_and_nothing_in_this_one(self, reveal: Run, files: Path, beside: Path) -> None:
+        shutil.copy(files / "plain.ply", beside)
+        assert_refused(reveal(beside), 4, "another model")
+
+    def test_one_that_asks_for_much_memory_is_refused_before_it_gets_any(
+        self, reveal: Run, files: Path, tmp_path: Path
+    ) -> None:
+        data = bytearray((files / "learned" / "decoder.sealed").read_bytes())
+        data[26:30] = (1024 * 1024).to_bytes(4, "little")
+        (tmp_path / "greedy.sealed").write_bytes(data)
+        said = reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed")
+        assert_refused(said, 4, "memory_kib")
+        data[25:30] = bytes([16]) + (128 * 1024).to_bytes(4, "little")
+        (tmp_path / "greedy.sealed").write_bytes(data)
+        assert_refused(reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed"), 4, "passes times KiB")
+
+
+class TestOutputs:
+    @pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink", "sidecar"])
+    def test_an_input_is_never_overwritten(self, keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
+        (tmp_path / "sub").mkdir()
+        model = tmp_path / "stego.ply"
+        shutil.copy(files / "whole.ply", model)
+        decoder = tmp_path / "sidecar.ply"
+        shutil.copy(files / "learned" / "decoder.sealed", decoder)
+        out = {
+            "same": model,
+            "dots": tmp_path / "sub" / ".." / "stego.ply",
+            "symlink": tmp_path / "link.ply",
+            "hardlink": tmp_path / "hard.ply",
+            "sidecar": decoder,
+        }[how]
+        if how == "symlink":
+            out.symlink_to(model)
+        elif how == "hardlink":
+            os.link(model, out)
+        before = listing(tmp_path)
+        more = ["--decoder", decoder] if how == "sidecar" else []
+        said = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite", *more)
+        assert_refused(said, 2, "is the input")
+        assert listing(tmp_path) == before
+
+    @pytest.mark.parametrize("name", ["x.spz", "x.splat", "x.txt", "x.compressed.ply", "x"])
+    def test_other_formats_are_refused_before_any_work(
+        self, keyss: Run, files: Path, tmp_path: Path, name: str
+    ) -> None:
+        arguments = ("reveal", tmp_path / "nothing.ply", "--key-file", files / "key", "-o", tmp_path / name)
+        assert_refused(keyss(*arguments), 2, "expected a name that ends in .ply")
+        assert listing(tmp_path) == {}
+
+
+class TestStreams:
+    def program(self, *arguments: object, data: bytes = b"", **more: str) -> tuple[int, bytes, str]:
+        done = subprocess.run(
+            [*PROGRAM, *map(str, arguments)],
+            input=data,
+            capture_output=True,
+            check=False,
+            env={**os.environ, **more},
+            timeout=120,
+        )
+        return done.returncode, done.stdout, done.stderr.decode()
+
+    def test_a_secret_through_pipes(self, files: Path, tmp_path: Path) -> None:
+        data = (files / "whole.ply").read_bytes()
+        status, out, err = self.program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
+        assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
+        (tmp_path / "s.ply").write_bytes(out)
+        assert len(read_ply(tmp_path / "s.ply")) == 500
+        status, out, err = self.program("info", "-", "--json", data=out)
+        assert (status, json.loads(out)["gaussians"]) == (0, 500)
+
+    def test_what_cannot_be_read(self, keyss: Run, files: Path, tmp_path: Path) -> None:
+        data = (files / "whole.ply").read_bytes()[:-9]
+        status, out, err = self.program("verify", "-", data=data)
+        assert (status, out) == (4, b"")
+        assert "standard input: not a whole .ply file" in err
+        said = keyss("reveal", "-", "-o", tmp_path / "s.ply")
+        assert_refused(said, 2, "--key-file")  # no prompt: standard input is in use
+
+    def test_no_model_is_written_to_a_terminal(
+        self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        import sys
+
+        monkeypatch.setattr(type(sys.stdout), "isatty", lambda self: True)
+        said = keyss("reveal", files / "whole.ply", "--key-file", files / "key", "-o", "-")
+        assert_refused(said, 2, "terminal")
+
+
+class TestVerify:
+    def test_a_sound_model_whatever_is_in_it(self, keyss: Run, files: Path) -> None:
+        facts = []
+        for name in ("plain.ply", "whole.ply"):
+            said = keyss("verify", files / name, "--json")
+            assert (said.status, said.err) == (0, "")
+            facts.append(json.loads(said.out) | {"path": ""})
+        assert facts[0] == facts[1]
+        assert facts[0]["secret"] is None
+        assert facts[0]["model"]["gaussians"] == 1500
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            (lambda m: m.means[3].fill_(1e10), "as far out"),
+            (lambda m: m.log_scales[3].fill_(30), "as large"),
+            (lambda m: m.quats[3].zero_(), "quaternion of length 0"),
+            (lambda m: m.sh[3].fill_(1e6), "harmonics beyond"),
+            (lambda m: m.opacity_logits.fill_(-12), "too transparent"),
+            (
+                lambda m: [values[:300].copy_(values[300:600]) for values in vars(m).values()],
+                "equal to others",
+            ),
+        ],
+    )
+    def test_a_model_that_is_not_sound(
+        self, keyss: Run, files: Path, tmp_path: Path, change: Callable[[Gaussians], object], words: str
+    ) -> None:
+        model = read_ply(files / "plain.ply")
+        change(model)
+        write_ply(tmp_path / "m.ply", model)
+        said = keyss("verify", tmp_path / "m.ply")
+        assert said.status == 4
+        assert words in said.err
+        assert "model.gaussians" in said.out
+
+    def test_a_secret_that_is_whole(self, keyss: Run, files: Path) -> None:
+        said = keyss("verify", files / "whole.ply", "--key-file", files / "key", "--json")
+        assert (said.status, said.err) == (0, "")
+        secret = json.loads(said.out)["secret"]
+        assert (secret["where"], secret["found"], secret["hidden"]) == ("low bits", 500, 500)
+        said = keyss("verify", files / "learned" / "stego.ply", "--key-file", files / "key")
+        assert said.status == 0
+        assert "sidecar" in said.out
+
+    def test_a_secret_that_is_not(self, keyss: Run, files: Path) -> None:
+        for name in ("half", "few"):
+            said = keyss("verify", files / f"{name}.ply", "--key-file", files / "key")
+            assert said.status == 4
+            assert "pruning by opacity" in said.err
+        said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
+        assert_refused(said, 3, "opens nothing")
+        assert_refused(keyss("verify", files / "plain.ply", "--decoder", files / "key"), 2, "key")
+
+
+def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:
+    hide = ("hide", "--method", "carry", "--width", 24, "--key-file", files / "key", "-o", tmp_path / "run")
+    small = tmp_path / "small.ply"
+    write_ply(small, trained_like(100, 3))
+    assert keyss(*hide, "--cover", files / "plain.ply", "--secret", small).status == 0
+    before, stego = listing(tmp_path), tmp_path / "run" / "publish" / "stego.ply"
+    assert_refused(keyss(*hide, "--overwrite", "--cover", stego, "--secret", small), 2, "is the input")
+    render = ("render", stego, "--cameras", files / "plain.ply", "-o", tmp_path / "run", "--overwrite")
+    assert_refused(keyss(*render), 2, "is the input")
+    assert listing(tmp_path) == before

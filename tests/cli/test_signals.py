@@ -1,0 +1,187 @@
+"""Ctrl-C and other signals, at any moment: one line, the status of a shell, and nothing lost."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import PROGRAM, Said, assert_refused, listing
+
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
+
+
+def _started(arguments: list[object]) -> subprocess.Popen[str]:
+    """A process that has got as far as to provide for signals: what comes before is Python's own start."""
+    command = [*PROGRAM, *map(str, arguments)]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True)
+    status = Path(f"/proc/{process.pid}/status")
+    if not status.exists():
+        time.sleep(0.5)
+    while status.exists() and process.poll() is None:
+        caught = next(line for line in status.read_text().splitlines() if line.startswith("SigCgt"))
+        if int(caught.split()[1], 16) >> (signal.SIGHUP - 1) & 1:  # the last that is provided for
+            break
+        time.sleep(0.001)
+    return process
+
+
+def _assert_ended(process: subprocess.Popen[str], signum: signal.Signals, when: str) -> None:
+    """As the signal asks for, or as if it had not come where it came too late."""
+    _, err = process.communicate(timeout=120)
+    assert process.returncode in (0, 128 + signum), (when, err)
+    lines = [line for line in err.splitlines() if line.startswith("keyss: ")]
+    if process.returncode:
+        assert len(lines) == 1, (when, err)
+        assert lines[0].startswith(f"keyss: {WORDS[signum]}"), (when, err)
+    assert "Traceback" not in err, when
+    assert "ignored" not in err, when
+
+
+def _commands(world: Path, folder: Path) -> dict[str, list[object]]:
+    stego, key = next((world / "hidden").rglob("stego.ply")), world / "key.txt"
+    return {
+        "help": ["--help"],
+        "info": ["info", stego],
+        "reveal": ["reveal", stego, "--key-file", key, "-o", folder / "secret.ply"],
+        "fit": ["fit", world / "b", "-o", folder / "out", "--iterations", 9999, "--device", "cpu"],
+    }
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("command", "seconds"), [("help", 0.05), ("info", 0.3), ("reveal", 0.9), ("fit", 1.5)]
+)
+def test_a_signal_ends_any_command_with_one_line(
+    world: Path, tmp_path: Path, command: str, seconds: float, signum: signal.Signals
+) -> None:
+    process = _started(_commands(world, tmp_path)[command])
+    time.sleep(seconds)
+    process.send_signal(signum)
+    _assert_ended(process, signum, f"{command} after {seconds} s")
+    assert not [name for name in listing(tmp_path) if name.endswith(".unfinished")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["help", "info", "reveal", "fit"])
+def test_signals_at_random_moments(world: Path, tmp_path: Path, command: str) -> None:
+    moments = random.Random(command)
+    for number in range(24):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        process = _started(_commands(world, folder)[command])
+        seconds, signum = moments.uniform(0, 0.4 if command == "help" else 3), moments.choice(list(WORDS))
+        time.sleep(seconds)
+        process.send_signal(signum)
+        _assert_ended(process, signum, f"{command}, {signum.name} after {seconds:.3f} s")
+        assert not [name for name in listing(folder) if name.endswith(".unfinished")]
+
+
+LOADING = """
+import os, signal, sys, types
+class Loading:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Loading())
+from keyss.cli.process import main
+main()
+"""
+
+
+@pytest.mark.parametrize("module", ["keyss.cli.entry", "tyro", "torch._C", "torch.nn", "numba.core.types"])
+def test_ctrl_c_in_the_middle_of_an_import(world: Path, module: str) -> None:
+    """Where it comes up as an exception, torch is loaded half, and crashes when it is loaded again."""
+    stego = next((world / "hidden").rglob("stego.ply"))
+    command = [sys.executable, "-c", LOADING.format(module=module), "info", str(stego)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "keyss: interrupted\n")
+
+
+IN_A_COMMAND = """
+import os, signal, sys, time
+from keyss.cli import entry
+def run(arguments, options):
+    {body}
+entry._run = run
+from keyss.cli.process import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        # What is to be cleaned up is, and a second signal does not wait for it.
+        ("try: time.sleep(60)\n    finally: print('cleaned', flush=True)", "cleaned\n"),
+        ("try: time.sleep(60)\n    finally: os.kill(os.getpid(), signal.SIGTERM); time.sleep(60)", ""),
+        # An interrupt that something made an error of, or that was dropped, is one all the same.
+        ("try: time.sleep(60)\n    except BaseException: raise ValueError('boom')", ""),
+        ("try: time.sleep(60)\n    except BaseException: pass", ""),
+        ("class Dropping:\n        def __del__(self): time.sleep(60)\n    Dropping(); time.sleep(60)", ""),
+    ],
+)
+def test_ctrl_c_inside_a_command(body: str, said: str) -> None:
+    alarm = "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT)); signal.alarm(1)"
+    program = IN_A_COMMAND.format(body=f"{alarm}\n    {body}")
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, said, "keyss: interrupted\n")
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    """As `nohup` and scripts have it that run a command in the background."""
+    program = IN_A_COMMAND.format(body="[os.kill(os.getpid(), s) for s in (2, 1)]; sys.exit(0)")
+    ignoring = (
+        f"import os, signal; signal.signal(2, signal.SIG_IGN); signal.signal(1, signal.SIG_IGN)\n{program}"
+    )
+    command = [sys.executable, "-c", ignoring]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_signal_after_all_is_done_changes_nothing() -> None:
+    late = "import atexit; atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))"
+    program = IN_A_COMMAND.format(body=f"{late}; sys.exit(0)")
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_training_and_resume_ends_in_the_same_files(
+    keyss: Callable[..., Said], world: Path, tmp_path: Path, signum: signal.Signals
+) -> None:
+    def arguments(out: Path) -> list[object]:
+        return ["fit", world / "b", "-o", out, "--iterations", 400, "--max-gaussians", 100, "--device", "cpu"]
+
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    command = [*PROGRAM, *map(str, arguments(parts))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        line = process.stderr.readline()
+        while line and not line.startswith("fit b: 400 steps"):
+            line = process.stderr.readline()
+        process.send_signal(signum)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + signum, err
+    assert out == ""
+    assert "Traceback" not in err
+    assert err.splitlines()[-1].startswith(f"keyss: {WORDS[signum]} at iteration ")
+    assert err.splitlines()[-1].endswith("continue with the same command and --resume")
+    assert not list(parts.rglob("model.ply"))
+
+    assert_refused(keyss(*arguments(parts)), 5, "--resume")
+    said = keyss(*arguments(parts), "--resume")
+    assert said.status == 0, said.err
+    assert "continuing at" in said.err
+    assert keyss(*arguments(whole)).status == 0
+    assert (parts / "model.ply").read_bytes() == (whole / "model.ply").read_bytes()
+    assert set(listing(parts)) == set(listing(whole))

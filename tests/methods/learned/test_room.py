@@ -1,0 +1,108 @@
+"""Whether the low bits of what will be trained can be used is known before it is trained."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+import keyss
+from channels.low_bits.trained_like import trained_like
+from keyss import Gaussians, LearnedOptions, Secret
+from keyss.channels.low_bits.bits import usable_carriers
+from keyss.core import InputError, UsageError
+from keyss.measure.hiding import mean_psnr
+from keyss.methods import registry
+from keyss.methods.base import SceneInput
+from keyss.methods.learned import method as learned
+from keyss.methods.learned.method import with_low_bits
+from keyss.rendering.orbit import scene_of_model
+from tiny_scenes import random_gaussians
+
+KEY = "a key of many characters: 93hXmQ2"
+
+
+def _steps(values: torch.Tensor) -> torch.Tensor:
+    return (values * 64).round() / 64
+
+
+def _prepare(options: LearnedOptions, *models: Gaussians) -> LearnedOptions:
+    found: LearnedOptions = registry.get("learned").prepare(
+        [SceneInput(each, False) for each in models], options
+    )
+    return found
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_quantised_models_have_random_low_bits_before_the_first_step(degree: int) -> None:
+    """What no view shows is never trained, and keeps them as they are."""
+    model = trained_like(2000, sh_degree=degree).map(_steps)
+    assert usable_carriers(model).mean() < 0.1
+    wanted = max(1, degree)
+    start = with_low_bits(model, wanted, os.urandom(32))
+    assert start.sh_degree == wanted
+    assert usable_carriers(start).mean() > 0.8
+    assert torch.equal(start.means, model.means)
+
+
+def test_new_harmonics_cannot_be_seen() -> None:
+    model = random_gaussians(300, sh_degree=0)
+    scene = scene_of_model(model, "m", size=48)
+    assert mean_psnr(with_low_bits(model, 3, bytes(32)), scene.test, scene.background) > 55
+
+
+def test_a_cover_without_harmonics_is_refused_with_ways_that_are_accepted() -> None:
+    cover, secret = trained_like(4000, sh_degree=0), trained_like(2000, 1, 2)
+    with pytest.raises(UsageError, match=r"degree 0 .*`sh_degree=1` .*0\.4 MB .*0\.3.*`sidecar=True`"):
+        _prepare(LearnedOptions(), cover, secret)
+    assert _prepare(LearnedOptions(sh_degree=1), cover, secret).fit.sh_degree == 1
+    assert _prepare(LearnedOptions(sidecar=True), cover, secret).fit.sh_degree == 0
+
+
+def test_what_training_will_not_make_random_is_refused() -> None:
+    """Round Gaussians of one colour: equal numbers, in which anything would be seen."""
+    model = trained_like(4000)
+    grey = Gaussians(
+        model.means,
+        model.quats,
+        model.log_scales[:, :1].repeat(1, 3),
+        model.opacity_logits,
+        model.sh[:, :, :1].repeat(1, 1, 3),
+    )
+    with pytest.raises(InputError, match=r"random low bits.*`sidecar=True`"):
+        _prepare(LearnedOptions(), grey, grey)
+    _prepare(LearnedOptions(), trained_like(8000), grey)
+
+
+def test_payloads_go_to_a_sidecar_rather_than_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of models that are fitted here it is not known before how many carriers they have."""
+
+    class Unusable:
+        prepare: Callable[[Gaussians], None]
+
+        def __init__(self) -> None:
+            def refuse(model: Gaussians) -> None:
+                raise InputError("no low bits")
+
+            self.prepare = refuse
+
+    models = [trained_like(2000), trained_like(1500, 1)]
+    monkeypatch.setattr(learned, "LOW_BITS", Unusable())
+    options = LearnedOptions(iterations=2)
+    result = keyss.hide(models[0], [Secret(models[1], KEY)], method=options, width=24, min_psnr=0)
+    assert result.sidecar is not None
+    assert result.metrics.details["sidecar_because"] == "no low bits"
+    revealed = keyss.reveal(result.stego, KEY, decoder=result.sidecar)
+    assert np.isfinite(revealed.means.numpy()).all()
+
+
+def test_fewer_harmonics_than_a_secret_has_are_said() -> None:
+    cover, secret = random_gaussians(2000, sh_degree=1), random_gaussians(900, seed=1, sh_degree=3)
+    options = LearnedOptions(iterations=2, sidecar=True)
+    result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
+    assert result.stego.sh_degree == 1
+    (psnr,) = result.metrics.details["psnr_of_fewer_harmonics"]
+    assert 10 < psnr < 60

@@ -1,0 +1,89 @@
+"""What is said of a run before it begins, held to what the run then is."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+
+import keyss
+from channels.low_bits.trained_like import trained_like
+from keyss import CarryOptions, FitConfig, LearnedOptions, Secret, api
+from keyss.core.errors import OutputError
+from keyss.files.ply import write_ply
+from tiny_scenes import tiny_scene
+
+KEY = "a key of many characters: 93hXmQ2"
+FIT = FitConfig(iterations=60, max_gaussians=400, evaluate_every=0)
+Usage = namedtuple("Usage", "total used free")
+
+
+def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
+    secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
+    options = LearnedOptions(fit=FIT, iterations=90, sidecar=True)
+    plan = api.plan(tiny_scene(0), secrets, method=options, out=tmp_path / "run")
+    fits = [stage for stage in plan.stages if stage.name.startswith("plain model")]
+    assert [stage.name.removeprefix("plain model of the ") for stage in fits] == [
+        "cover",
+        "secret 1",
+        "secret 2",
+    ]
+    assert [stage.steps for stage in plan.stages if stage.steps] == [60, 60, 60, 90]
+    assert (plan.outlook.gaussians, plan.outlook.sh_degree) == (400, 3)
+    assert plan.outlook.capacity < plan.outlook.asked == 800
+    assert plan.free_bytes is not None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> None:
+    """Wide bounds: others use the machine, too. Real scenes, in docs/results.md, come within a factor of two."""
+    if given:
+        cover, secret = trained_like(20_000), Secret(trained_like(9000, 1), KEY)
+        method: CarryOptions | LearnedOptions = CarryOptions()
+    else:
+        cover, secret = tiny_scene(0), Secret(tiny_scene(1), KEY)  # type: ignore[assignment]
+        method = LearnedOptions(fit=FIT.__class__(iterations=300, max_gaussians=400), sidecar=True)
+    api.plan(cover, [secret], method=method)  # compiles kernels
+    plan = api.plan(cover, [secret], method=method)
+    start = time.perf_counter()
+    result = keyss.hide(cover, [secret], method=method, out=tmp_path / "run", min_psnr=0)
+    seconds = time.perf_counter() - start
+    assert seconds / 6 < plan.seconds < 6 * seconds
+    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    assert len(result.stego) <= plan.outlook.gaussians
+    assert (tmp_path / "run/publish/stego.ply").stat().st_size <= plan.file_bytes
+    assert sum(path.stat().st_size for path in files) <= plan.disk_bytes
+    assert 1e8 < plan.memory_bytes < 2e10
+
+
+def test_capacity_is_what_fits(tmp_path: Path) -> None:
+    cover, secret = trained_like(2500), trained_like(6000, 2)
+    plan = api.plan(cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24)
+    result = keyss.hide(
+        cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, min_psnr=0
+    )
+    assert (plan.outlook.asked, plan.outlook.capacity) == (6000, *result.metrics.secret_gaussians)
+    assert [stage.steps for stage in plan.stages] == [0] * len(plan.stages)
+
+
+def test_a_disk_without_room_is_refused_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Path] = []
+
+    def usage(path: Path) -> Usage:
+        asked.append(Path(path))
+        return Usage(10**9, 10**9, 4 << 20)
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    write_ply(tmp_path / "cover.ply", trained_like(2500))
+    secrets = [Secret(trained_like(900, 1), KEY)]
+    for verb in (api.hide, api.plan):
+        with pytest.raises(OutputError, match=r"free space.*found 4 MB"):
+            verb(tmp_path / "cover.ply", secrets, method="carry", out=tmp_path / "a" / "run")
+    assert set(asked) == {tmp_path.resolve()}
+    assert [path.name for path in tmp_path.iterdir()] == ["cover.ply"]
