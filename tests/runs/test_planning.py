@@ -40,7 +40,7 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("given", [True, False])
 def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> None:
-    """Wide bounds: others use the machine, too. Real scenes, in docs/results.md, come within a factor of two."""
+    """Wide bounds: others use the machine, too."""
     if given:
         cover, secret = trained_like(20_000), Secret(trained_like(9000, 1), KEY)
         method: CarryOptions | LearnedOptions = CarryOptions()

@@ -16,7 +16,7 @@ from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
 from keyss.measure.images import ImageComparison
 from keyss.measure.robustness.survival import mean_over_draws
-from keyss.report import figures, numbers
+from keyss.report import numbers
 from keyss.report.untrusted import AuditPictures, check_bounds, clean, flat
 from keyss.report.verdicts import auc_text, detector_rocs, headline, missing_readers, verdicts, worst_leak
 from keyss.runs.audit_record import Audit, ImagesResult, read_audit
@@ -109,6 +109,8 @@ def _environment() -> Environment:
     )
     formats = [*filter(callable, vars(numbers).values()), auc_text, flat, prose]
     environment.filters |= {each.__name__: each for each in formats}
+    from keyss.report import figures  # matplotlib takes a second, and few who hide write a report
+
     environment.globals["figures"] = figures
     return environment
 
