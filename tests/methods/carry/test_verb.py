@@ -71,7 +71,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert metrics["secrets"][0]["psnr"] > 55
     assert metrics["secrets"][0]["psnr"] > metrics["chance_level"][0] + 20
     assert metrics["wrong_key"] is None
-    stego = tmp_path / "out/stego.ply"
+    stego = tmp_path / "out/publish/stego.ply"
     assert run("reveal", stego, "--key-file", "key", "-o", tmp_path / "secret.ply")[0] == 0
     assert len(read_ply(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
@@ -80,7 +80,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     status, _, err = run("evaluate", tmp_path / "out", "--key-file", "key", "--wrong-keys", 3)
     assert (status, "no decoder" in err) == (2, True)
     assert run("reveal", stego, "--key-file", "key", "--frame", "cover", "-o", tmp_path / "n.ply")[0] == 2
-    assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").glob("*.json"))
+    assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").rglob("*.json"))
 
 
 @pytest.mark.parametrize("flag", ["--prune-to-fit", "--thin"])
@@ -97,6 +97,32 @@ def test_too_large_secrets_are_refused_or_pruned(
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [4414]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
+    assert metrics["details"]["share_kept_by_pruning"] == [round(4414 / 6000, 4)]
+    assert 10 < metrics["details"]["pruned_secret_psnr_against_the_whole"][0] < 60
+
+
+def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    write_ply(tmp_path / "tiny.ply", trained_like(100))
+    hide = ("hide", "--method", "carry", "--cover", tmp_path / "tiny.ply", "--key-file", "key")
+    for flags in ((), ("--thin",)):
+        status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", *flags)
+        assert status == 2
+        assert "--method learned --sidecar" in err
+        assert "--prune-to-fit" not in err
+        assert not (tmp_path / "out").exists()
+
+
+def test_one_key_for_two_secrets_is_refused_before_any_work(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    hide = ("hide", "--method", "carry", "--cover", "cover.ply", "-o", tmp_path / "out")
+    secrets = ("--secret", "secret.ply", "--key-file", "key", "--secret", "secret.ply", "--key-file", "key")
+    status, out, err = run(*hide, *secrets)
+    assert (status, out) == (2, "")
+    assert "secrets 1 and 2 have the same key" in err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -140,7 +166,7 @@ def test_dithering_says_what_it_costs(
     assert "gives it new low bits" in err
     status, out, _ = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", "--dither")
     assert status == 0
-    assert "dither psnr: " in out
+    assert "dithered cover psnr against the one before: " in out
 
 
 def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) -> None:
