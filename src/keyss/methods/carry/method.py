@@ -67,7 +67,9 @@ class CarryMethod:
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
-            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
+            raise InputError(
+                f"{error}; {_ways(cover, options, [] if options.prune_to_fit else requests)}"
+            ) from error
         if len(secrets) < len(others):
             return replace(options, prune_to_fit=True)
         _counts(prepared, secrets, options)
