@@ -120,7 +120,7 @@ class CarryMethod:
         details["bits_per_gaussian"] = [each.bits for each in opened]
         if any(clamped := [out_of_range(model) for model in models]):
             details["gaussians_with_clamped_numbers"] = clamped
-        if options.prune_to_fit:
+        if any(kept is not model for model, kept in zip(whole, models, strict=True)):
             pairs = list(zip(whole, models, strict=True))
             details["share_kept_by_pruning"] = [round(len(kept) / len(model), 4) for model, kept in pairs]
             details["pruned_secret_psnr_against_the_whole"] = [
