@@ -192,8 +192,7 @@ def hide(
             overwrite=overwrite,
             resume=resume,
         )
-    arguments = ["cover_model", *["model"] * len(secrets)]
-    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
+    inputs = _inputs(sources, models)
     options = chosen.prepare(inputs, options)
     if folder:
         check_disk(folder.path, chosen, options, inputs)
@@ -251,8 +250,7 @@ def plan(
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
     models = [cover_model, *(secret.model for secret in secrets)]
-    arguments = ["cover_model", *["model"] * len(secrets)]
-    inputs = [_input(*each) for each in zip(sources, models, arguments, strict=True)]
+    inputs = _inputs(sources, models)
     options = chosen.prepare(inputs, options)
     if out is not None:
         check_disk(Path(out), chosen, options, inputs)
@@ -445,17 +443,20 @@ def _method(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Met
     return method, options
 
 
-def _input(
-    source: PathLike | Scene | Gaussians, model: PathLike | Gaussians | None, argument: str
-) -> SceneInput:
-    """A scene and the plain model that is given with it as `argument`, or that it is. Raises UsageError."""
-    photos = isinstance(source, Scene) or not is_model(source)
-    if not photos:
-        if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
-            what = "a model in memory" if isinstance(source, Gaussians) else source
-            raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
-        model = source  # type: ignore[assignment]
-    return SceneInput(None if model is None else as_model(model), photos)
+def _inputs(
+    sources: Sequence[PathLike | Scene | Gaussians], models: Sequence[PathLike | Gaussians | None]
+) -> list[SceneInput]:
+    """Scenes and the plain models that are given with them, or that they are. Raises UsageError."""
+    inputs = []
+    for index, (source, model) in enumerate(zip(sources, models, strict=True)):
+        photos = isinstance(source, Scene) or not is_model(source)
+        if not photos:
+            if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
+                argument = "model" if index else "cover_model"
+                raise UsageError(f"{source} is a model itself and needs no other: leave out `{argument}`")
+            model = source  # type: ignore[assignment]
+        inputs.append(SceneInput(None if model is None else as_model(model), photos))
+    return inputs
 
 
 def _check_keys(keys: Sequence[str]) -> None:

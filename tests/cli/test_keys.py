@@ -172,5 +172,5 @@ def test_keys_with_white_space_at_an_end_get_a_hint_without_the_key(
     ):
         raise WrongKeyError("nothing")
     assert key not in said + str(caught.value)
-    with pytest.raises(WrongKeyError, match="^nothing$"), hinting_at_white_space([key]):
+    with pytest.raises(WrongKeyError, match=r"^nothing$"), hinting_at_white_space([key]):
         raise WrongKeyError("nothing")

@@ -162,7 +162,7 @@ def test_from_the_command_line(
     config = json.loads((tmp_path / "run" / "private" / "config.json").read_text())
     assert (config["method"], config["options"]["most"]) == ("whole", 60)
     assert main(["evaluate", run]) == 0
-    assert main(["reveal", f"{run}/stego.ply", "-o", str(tmp_path / "revealed.ply")]) == 0
+    assert main(["reveal", f"{run}/publish/stego.ply", "-o", str(tmp_path / "revealed.ply")]) == 0
     assert main(["info", run]) == 0
     assert "whole" in capsys.readouterr().out
 

@@ -100,7 +100,8 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
                     codes = [whole >> shift & (1 << bits) - 1 for shift in shifts]
                     outlier = whole >> 8 * size - 1
                     places = [
-                        centre + spread * np.sinh((2 * code / ((1 << bits) - 1) - 1) * (far if outlier else reach))
+                        centre
+                        + spread * np.sinh((2 * code / ((1 << bits) - 1) - 1) * (far if outlier else reach))
                         for code, (centre, spread, reach, far) in zip(codes, lines, strict=True)
                     ]
                     means.add(tuple(float(np.float32(place)) for place in places))

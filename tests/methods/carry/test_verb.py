@@ -71,7 +71,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert metrics["secrets"][0]["psnr"] > 55
     assert metrics["secrets"][0]["psnr"] > metrics["chance_level"][0] + 20
     assert metrics["wrong_key"] is None
-    stego = tmp_path / "out/stego.ply"
+    stego = tmp_path / "out/publish/stego.ply"
     assert run("reveal", stego, "--key-file", "key", "-o", tmp_path / "secret.ply")[0] == 0
     assert len(read_ply(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
@@ -80,7 +80,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     status, _, err = run("evaluate", tmp_path / "out", "--key-file", "key", "--wrong-keys", 3)
     assert (status, "no decoder" in err) == (2, True)
     assert run("reveal", stego, "--key-file", "key", "--frame", "cover", "-o", tmp_path / "n.ply")[0] == 2
-    assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").glob("*.json"))
+    assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").rglob("*.json"))
 
 
 @pytest.mark.parametrize("flag", ["--prune-to-fit", "--thin"])
@@ -140,7 +140,7 @@ def test_dithering_says_what_it_costs(
     assert "gives it new low bits" in err
     status, out, _ = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", "--dither")
     assert status == 0
-    assert "dither psnr: " in out
+    assert "dithered cover psnr against the one before: " in out
 
 
 def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) ->
     (secret,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
     assert plain is not None
     assert secret.psnr == pytest.approx(plain.psnr, abs=0.05)
-    revealed = keyss.reveal(tmp_path / "run/stego.ply", KEY)
+    revealed = keyss.reveal(tmp_path / "run/publish/stego.ply", KEY)
     assert (len(revealed),) == result.metrics.secret_gaussians
     with pytest.raises(UsageError, match="scenes in memory"):
         keyss.evaluate(tmp_path / "run", [KEY])

@@ -31,11 +31,11 @@ from keyss.methods.dither import cost, dither
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
+_SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
 _DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
 _DITHER_AND_PRUNE = (
     f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
 )
-_SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
 
 
 class CarryMethod:
@@ -67,9 +67,7 @@ class CarryMethod:
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
-            raise InputError(
-                f"{error}; {_ways(cover, options, [] if options.prune_to_fit else requests)}"
-            ) from error
+            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
         if len(secrets) < len(others):
             return replace(options, prune_to_fit=True)
         _counts(prepared, secrets, options)
