@@ -27,7 +27,7 @@ from keyss.methods.carry.carrying import (
 )
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.carry.quantise import out_of_range
-from keyss.methods.dither import cost, dither
+from keyss.methods.dither import cost, dither, sampled
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
@@ -150,6 +150,7 @@ def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
 def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
     """The cover as it is, if that will do."""
     try:
+        LOW_BITS.prepare(sampled(cover))
         return LOW_BITS.prepare(cover)
     except InputError:
         if not options.dither:
@@ -162,10 +163,13 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
     if options.dither:
         return _LEARNED
     try:
-        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))
+        sample = LOW_BITS.prepare(sampled(dither(cover, os.urandom(32))))
     except InputError:
         return _LEARNED
-    fits = sum(each.count for each in requests) <= (prepared.record_capacity(requests) if requests else 0)
+    carriers = int(0.97 * len(cover) * sample.carriers / len(sample.cover))  # at least
+    fits = not requests or sum(each.count for each in requests) <= record_capacity(
+        requests, carriers, cover.sh_degree
+    )
     return _DITHER if fits else _DITHER_AND_PRUNE
 
 
