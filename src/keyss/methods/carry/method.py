@@ -64,7 +64,6 @@ class CarryMethod:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something
                     plan_records(requests, options.fit.max_gaussians, degree)
             return replace(options, dither=True, prune_to_fit=True)
-        too_large = requests if not options.prune_to_fit else []
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
