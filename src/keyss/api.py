@@ -453,7 +453,8 @@ def _inputs(
         if not photos:
             if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
                 argument = "model" if index else "cover_model"
-                raise UsageError(f"{source} is a model itself and needs no other: leave out `{argument}`")
+                what = "a source in memory" if isinstance(source, Gaussians) else source
+                raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
             model = source  # type: ignore[assignment]
         inputs.append(SceneInput(None if model is None else as_model(model), photos))
     return inputs

@@ -79,6 +79,7 @@ class TestArguments:
             "background": (1.0, 0.5, 0.0),
             "skip_missing": False,
             "cover_model": Path("m.ply"),
+            "min_psnr": 20.0,
             "device": "cpu",
             "out": Path("out"),
             "overwrite": False,
@@ -134,7 +135,10 @@ class TestArguments:
         ("extra", "words"),
         [
             (("--iterations", 7), "--iterations: nothing is trained"),
-            (("--preset", "quick", "--max-gaussians", 9), "--preset and --max-gaussians: nothing is trained"),
+            (
+                ("--preset", "quick", "--max-gaussians", 80),
+                "--preset and --max-gaussians: nothing is trained",
+            ),
         ],
     )
     def test_what_has_no_effect_is_refused(

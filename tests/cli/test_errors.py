@@ -148,7 +148,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
             "--key-file",
             f / "key.txt",
             "-o",
-            f / STEGO,
+            f / "hidden/private/cover.ply",
         ],
     ),
     "folder of the file missing": (

@@ -135,7 +135,7 @@ def test_writes_into_an_empty_folder_and_no_other(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="exists"):
         write(tmp_path / "file")
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="cannot create"):
         write(tmp_path / "file" / "below")
 
 

@@ -62,3 +62,14 @@ def test_models_move_with_their_cameras() -> None:
     here, there = (scene_of_model(each, "m", size=SIZE) for each in (model, frame.apply_gaussians(model)))
     difference = here.train[0].image.float() - there.train[0].image.float()
     assert difference.abs().mean() < 1
+
+
+@pytest.mark.parametrize(("place", "log_scale"), [(0.0, 10.0), (1e10, 10.0), (1e30, 80.0)])
+def test_one_huge_gaussian_is_not_all_that_cameras_look_at(place: float, log_scale: float) -> None:
+    model = random_gaussians(500)
+    middle, radius = middle_and_radius(model)
+    changed = model.map(torch.clone)
+    changed.means[7], changed.log_scales[7], changed.opacity_logits[7] = place, log_scale, 9.0
+    found, reach = middle_and_radius(changed)
+    torch.testing.assert_close(found, middle, atol=0.1 * radius, rtol=0)
+    assert reach == pytest.approx(radius, rel=0.1)

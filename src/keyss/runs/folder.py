@@ -72,7 +72,8 @@ class RunFolder:
         resume: bool = False,
     ) -> None:
         self.path, self.stage, self.onto = Path(path), stage, frozenset(onto)
-        self.arguments: dict[str, Any] = msgspec.to_builtins(dict(arguments or {}))
+        # As they will be read again: tuples become lists.
+        self.arguments: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(dict(arguments or {})))
         if overwrite and resume:
             raise UsageError("`overwrite=True` starts anew and `resume=True` continues: give one of them")
         self._was_there = self.path.exists()

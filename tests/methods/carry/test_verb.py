@@ -97,6 +97,32 @@ def test_too_large_secrets_are_refused_or_pruned(
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [4414]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
+    assert metrics["details"]["share_kept_by_pruning"] == [round(4414 / 6000, 4)]
+    assert 10 < metrics["details"]["pruned_secret_psnr_against_the_whole"][0] < 60
+
+
+def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    write_ply(tmp_path / "tiny.ply", trained_like(100))
+    hide = ("hide", "--method", "carry", "--cover", tmp_path / "tiny.ply", "--key-file", "key")
+    for flags in ((), ("--thin",)):
+        status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", *flags)
+        assert status == 2
+        assert "--method learned --sidecar" in err
+        assert "--prune-to-fit" not in err
+        assert not (tmp_path / "out").exists()
+
+
+def test_one_key_for_two_secrets_is_refused_before_any_work(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    hide = ("hide", "--method", "carry", "--cover", "cover.ply", "-o", tmp_path / "out")
+    secrets = ("--secret", "secret.ply", "--key-file", "key", "--secret", "secret.ply", "--key-file", "key")
+    status, out, err = run(*hide, *secrets)
+    assert (status, out) == (2, "")
+    assert "secrets 1 and 2 have the same key" in err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

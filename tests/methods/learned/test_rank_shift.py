@@ -129,3 +129,23 @@ def test_quaternions_get_lengths_of_the_cover_and_keep_their_directions() -> Non
     torch.testing.assert_close(turned, torch.ones(2000))
     for name in ("means", "log_scales", "opacity_logits", "sh"):
         assert torch.equal(getattr(changed, name), getattr(stego, name))
+
+
+@pytest.mark.parametrize(("name", "value"), [("means", 1e15), ("log_scales", -1000.0), ("sh", 1e6)])
+@pytest.mark.parametrize("row", [5, 1005])  # of the cover, of the secret
+def test_an_outlier_spoils_neither_the_others_nor_what_is_published(
+    name: str, value: float, row: int
+) -> None:
+    stego = _stego()
+    getattr(stego, name)[row] = value
+    rank_shift = RankShift.of(stego, b"k" * 32, BAND)
+    published = rank_shift.encrypt(stego)
+    decrypted = rank_shift.decrypt(published)
+    others = torch.arange(2000) != row
+    for each in ("means", "log_scales", "sh"):
+        error = (getattr(decrypted, each) - getattr(stego, each)).abs()[others]
+        assert float(error.max()) < (1e-3 if each != "log_scales" else 2e-2), each
+    usual, hidden = _stego(), torch.arange(1000, 2000)
+    for each in ("means", "log_scales"):
+        reach = getattr(usual, each)[:1000].abs().max()
+        assert float(getattr(published, each)[hidden].abs().max()) < 1.5 * reach, each

@@ -64,11 +64,12 @@ class CarryMethod:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something
                     plan_records(requests, options.fit.max_gaussians, degree)
             return replace(options, dither=True, prune_to_fit=True)
-        too_large = [] if options.prune_to_fit else requests
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
-            raise InputError(f"{error}; {_ways(cover, options, too_large)}") from error
+            raise InputError(
+                f"{error}; {_ways(cover, options, [] if options.prune_to_fit else requests)}"
+            ) from error
         if len(secrets) < len(others):
             return replace(options, prune_to_fit=True)
         _counts(prepared, secrets, options)
