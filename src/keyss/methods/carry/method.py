@@ -164,13 +164,10 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
     if options.dither:
         return _LEARNED
     try:
-        sample = LOW_BITS.prepare(sampled(dither(cover, os.urandom(32))))
+        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))  # all: a sample shows few duplicates
     except InputError:
         return _LEARNED
-    carriers = int(0.75 * len(cover) * sample.carriers / len(sample.cover))  # a sample shows few duplicates
-    fits = not requests or sum(each.count for each in requests) <= record_capacity(
-        requests, carriers, cover.sh_degree
-    )
+    fits = not requests or sum(each.count for each in requests) <= prepared.record_capacity(requests)
     return _DITHER if fits else _DITHER_AND_PRUNE
 
 
