@@ -466,7 +466,7 @@ def _check_keys(keys: Sequence[str]) -> None:
 
 
 def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
-    """The stego model and the secrets as a reader gets them: from the files, which are written to `folder`."""
+    """The stego model and the secrets as a reader gets them, from the files that are to be published."""
     model, sidecar = stego.gaussians, stego.sidecar
     if folder:
         there = folder.write(writers({STEGO: model} | ({SIDECAR: sidecar} if sidecar else {})))

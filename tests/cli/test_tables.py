@@ -61,6 +61,10 @@ class TestNumbers:
             ["chance level of the secret 2", "8.00"],
         ]
 
+    def test_what_was_written_was_opened_again(self) -> None:
+        said = " ".join(cell for row in self.table(METRICS) for cell in row)
+        assert "against the plain models: cover 32.0, secret 31.0 dB" in said
+
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)
         assert ["Test views: photos that were not trained on. PSNR, baseline and loss in dB."] in rows
