@@ -44,6 +44,7 @@ class TestNumbers:
             secrets=METRICS.secrets * 2,
             baseline=BaselineQuality(None, (None, None), (None, None, None)),
             photos=(True, True, True),
+            against_plain=METRICS.against_plain + METRICS.against_plain[1:],
             secret_gaussians=(5, 6),
             chance_level=(9.0, 8.0),
             wrong_key=WrongKeys(
