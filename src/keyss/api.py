@@ -206,16 +206,9 @@ def hide(
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
         own, *others = map(Source, scenes, plain)
         stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
-        published, sidecar = stego.gaussians, stego.sidecar
-        if folder:
-            there = folder.write(writers({STEGO: published} | ({SIDECAR: sidecar} if sidecar else {})))
-            published = read_model(there / STEGO)
-            sidecar = read_sidecar(there / SIDECAR) if sidecar else None
-        shown = [published.to(target)]
-        shown += [open_file(published, key, sidecar).reveal(published).to(target) for key in keys]
         against_plain = tuple(
-            render_fidelity(model, original.to(target), scene)
-            for model, original, scene in zip(shown, plain, scenes, strict=True)
+            render_fidelity(model.to(target), original.to(target), scene)
+            for model, original, scene in zip(_as_read(stego, keys, folder), plain, scenes, strict=True)
         )
         _check_quality(against_plain, min_psnr)
         photos = tuple(each.photos for each in inputs)
@@ -470,6 +463,15 @@ def _check_keys(keys: Sequence[str]) -> None:
                 f"secrets {i} and {j} have the same key, which can open one of them only: give each its own "
                 "(`keyss keygen` makes one)"
             )
+
+
+def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
+    """The stego model and the secrets as a reader gets them, from the files that are to be published."""
+    model, sidecar = stego.gaussians, stego.sidecar
+    if folder:
+        there = folder.write(writers({STEGO: model} | ({SIDECAR: sidecar} if sidecar else {})))
+        model, sidecar = read_model(there / STEGO), read_sidecar(there / SIDECAR) if sidecar else None
+    return [model, *(open_file(model, key, sidecar).reveal(model) for key in keys)]
 
 
 def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:

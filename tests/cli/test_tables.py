@@ -44,6 +44,7 @@ class TestNumbers:
             secrets=METRICS.secrets * 2,
             baseline=BaselineQuality(None, (None, None), (None, None, None)),
             photos=(True, True, True),
+            against_plain=METRICS.against_plain + METRICS.against_plain[1:],
             secret_gaussians=(5, 6),
             chance_level=(9.0, 8.0),
             wrong_key=WrongKeys(
@@ -60,6 +61,10 @@ class TestNumbers:
             ["chance level of the secret 1", "9.00"],
             ["chance level of the secret 2", "8.00"],
         ]
+
+    def test_what_was_written_was_opened_again(self) -> None:
+        said = " ".join(cell for row in self.table(METRICS) for cell in row)
+        assert "against the plain models: cover 32.0, secret 31.0 dB" in said
 
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)

@@ -104,6 +104,8 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool
         lines.append(
             "Chance level: the stego model itself against the secret. No wrong key should get above."
         )
+    reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
+    lines.append(f"Opened again from what was written, against the plain models: {', '.join(reached)} dB.")
     return lines
 
 

@@ -25,6 +25,7 @@ _FEW = 0.8  # share of different values below which a property was quantised; in
 _SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
 _VIEWS, _SIZE = 4, 256
+_SAMPLE = 20_000  # Gaussians
 _FAINT = 1e-3  # standard deviation of harmonics that a model does not have
 
 Floats = npt.NDArray[np.float32]
@@ -46,6 +47,11 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
                 columns[:, column] = _dithered(columns[:, column], noise)
         changed[name] = values
     return Gaussians(means=model.means, **changed)
+
+
+def sampled(model: Gaussians) -> Gaussians:
+    """Every n-th Gaussian of a large model: what low bits are like is seen in these, too, and at once."""
+    return model[:: max(1, len(model) // _SAMPLE)]
 
 
 def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:

@@ -27,7 +27,7 @@ from keyss.methods.carry.carrying import (
 )
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.carry.quantise import out_of_range
-from keyss.methods.dither import cost, dither
+from keyss.methods.dither import cost, dither, sampled
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
@@ -64,7 +64,6 @@ class CarryMethod:
                 with advising(UsageError, _PRUNE):  # at best all of them can carry something
                     plan_records(requests, options.fit.max_gaussians, degree)
             return replace(options, dither=True, prune_to_fit=True)
-        too_large = requests if not options.prune_to_fit else []
         try:
             prepared = _prepared(cover, options)
         except InputError as error:
@@ -152,6 +151,7 @@ def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
 def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
     """The cover as it is, if that will do."""
     try:
+        LOW_BITS.prepare(sampled(cover))
         return LOW_BITS.prepare(cover)
     except InputError:
         if not options.dither:
@@ -164,10 +164,10 @@ def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequ
     if options.dither:
         return _LEARNED
     try:
-        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))
+        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))  # all: a sample shows few duplicates
     except InputError:
         return _LEARNED
-    fits = sum(each.count for each in requests) <= (prepared.record_capacity(requests) if requests else 0)
+    fits = not requests or sum(each.count for each in requests) <= prepared.record_capacity(requests)
     return _DITHER if fits else _DITHER_AND_PRUNE
 
 

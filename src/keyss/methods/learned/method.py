@@ -32,7 +32,7 @@ from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES, expand
 from keyss.methods.base import Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego, advising
-from keyss.methods.dither import cost, dither, raised
+from keyss.methods.dither import cost, dither, raised, sampled
 from keyss.methods.learned.attacks import known_remaps
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.decoder import Decoder
@@ -223,16 +223,16 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
         with advising(UsageError, f"a larger `max_gaussians` makes room, {_SIDECAR}"):
             check_payload_fits(payload, cap, secrets, degree)
         return
-    started = [with_low_bits(model, degree, os.urandom(32)) for model in known]
-    usable = np.concatenate([usable_carriers(model) for model in started])
-    share = float(usable.mean())
+    counts = [len(model) for model in known]
+    started = [with_low_bits(sampled(model), degree, os.urandom(32)) for model in known]
+    share = float(np.average([usable_carriers(model).mean() for model in started], weights=counts))
     if share < LEAST_USABLE_AT_START:
         raise InputError(
             f"only {share:.0%} of the Gaussians could have random low bits, the others hold equal values; "
             f"{_SIDECAR}"
         )
     with advising(UsageError, _SIDECAR):
-        check_payload_fits(payload, min(cap, len(usable)), secrets, degree, usable=share)
+        check_payload_fits(payload, min(cap, sum(counts)), secrets, degree, usable=share)
 
 
 def _growth(models: Sequence[Gaussians]) -> str:
