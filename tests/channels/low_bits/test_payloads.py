@@ -50,6 +50,11 @@ def test_round_trip(stego: Gaussians) -> None:
     assert extract(stego, KEY) == PAYLOAD
 
 
+def test_a_model_of_equal_gaussians_holds_nothing(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain[torch.zeros(200, dtype=torch.int64)], KEY)
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 def test_round_trip_of_lower_degrees(degree: int) -> None:
     model = trained_like(4000, sh_degree=degree)

@@ -198,7 +198,7 @@ class LowBitsReader:
 
 def salts(names: Bytes) -> list[bytes]:
     """Of identities [N, 16] those that may serve as salt, in ascending order."""
-    prefixes = names[:, :8].copy().view(">u8")[:, 0]
+    prefixes = names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)  # `isin` takes native numbers only
     first = names[np.isin(prefixes, np.unique(prefixes)[:SALTS])]
     return sorted({row.tobytes() for row in first})[:SALTS]
 
