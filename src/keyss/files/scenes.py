@@ -59,7 +59,7 @@ def load_scene(
     """
     if width is not None and width < 1:
         raise UsageError(f"expected a width of at least 1 pixel, got {width}")
-    behind = None if background is None else _checked_background(background)
+    behind = None if background is None else checked_background(background)
     folder = Path(path)
     layout = _read_layout(folder, skip_missing)
     for part, purpose in ((layout.train, "to train on"), (layout.test, "to test on")):
@@ -143,7 +143,8 @@ def _view(
     return View(camera, torch.from_numpy(np.ascontiguousarray(pixels)))
 
 
-def _checked_background(background: Tensor | Sequence[float]) -> Tensor:
+def checked_background(background: Tensor | Sequence[float]) -> Tensor:
+    """A colour [3]. Raises UsageError for one out of range."""
     values = [float(value) for value in background]
     if len(values) != 3 or not all(math.isfinite(v) and 0 <= v <= 1 for v in values):
         raise UsageError(f"expected a background of three numbers in [0, 1], got {values}")

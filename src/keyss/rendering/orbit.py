@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.files.models import is_model_path
+from keyss.files.scenes import checked_background
 from keyss.rendering import render
+from keyss.rendering.arguments import MAX_SIDE
 
 VIEWS = 96
 IMAGE_SIZE = 400  # pixels of a square picture
@@ -34,16 +38,22 @@ def scene_of_model(
     name: str,
     *,
     size: int | None = None,
-    background: Tensor | None = None,
+    background: Tensor | Sequence[float] | None = None,
     train_pictures: bool = True,
 ) -> Scene:
     """Pictures of `model`, size x size, from the cameras of `orbit`; every eighth is kept for testing.
 
     Without `train_pictures`, where nothing is trained, only those are rendered; the others are [0, 0, 3].
+    Raises UsageError for a `size` or `background` out of range.
     """
-    background = torch.zeros(3) if background is None else background
+    size = IMAGE_SIZE if size is None else size
+    if not 1 <= size <= MAX_SIDE:
+        raise UsageError(
+            f"expected a width of 1 to {MAX_SIDE:,} pixels for pictures of a model, got {size:,}"
+        )
+    background = torch.zeros(3) if background is None else checked_background(background)
     views = []
-    for index, camera in enumerate(orbit(model, size or IMAGE_SIZE)):
+    for index, camera in enumerate(orbit(model, size)):
         picture = torch.zeros(0, 0, 3, dtype=torch.uint8)
         if train_pictures or index % TEST_EVERY == 0:
             image = render(model, camera, background.to(model.device))

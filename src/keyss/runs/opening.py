@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
-
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -143,9 +141,8 @@ def as_scene(
                 raise InputError(f"{source}: expected a scene, found a run; its model is {inside}") from error
             raise
     name = "model" if isinstance(source, Gaussians) else Path(source).stem
-    colour = None if background is None else torch.as_tensor(background, dtype=torch.float32)
     return scene_of_model(
-        as_model(source), name, size=width, background=colour, train_pictures=train_pictures
+        as_model(source), name, size=width, background=background, train_pictures=train_pictures
     )
 
 
