@@ -44,7 +44,7 @@ class Said:
 
 def listing(folder: Path) -> dict[str, int]:
     """Every file and folder below, hidden ones too, with its time of change."""
-    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))}
+    return {str(path.relative_to(folder)): path.lstat().st_mtime_ns for path in sorted(folder.rglob("*"))}
 
 
 def assert_refused(said: Said, status: int, words: str) -> None:

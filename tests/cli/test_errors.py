@@ -79,6 +79,19 @@ def _hide(folder: Path, **changes: object) -> list[object]:
     return ["hide", "--sidecar", *(part for option in options.items() for part in option), *SMALL]
 
 
+def _model_in_model(folder: Path, *extra: object, **changes: object) -> list[object]:
+    """`hide` of a model in a model."""
+    files = {"cover": _plain(folder, "cover"), "secret": _plain(folder, "secret-1"), "out": folder / "out"}
+    files |= {"key_file": folder / "key.txt"} | changes
+    options = [part for name, value in files.items() for part in (f"--{name.replace('_', '-')}", value)]
+    return ["hide", "--sidecar", *options, *extra]
+
+
+def _loop(folder: Path) -> Path:
+    (folder / "loop.ply").symlink_to("loop.ply")
+    return folder
+
+
 def _empty_key(folder: Path) -> list[object]:
     (folder / "empty.txt").write_text("\n")
     return _hide(folder, key_file=folder / "empty.txt")
@@ -165,6 +178,19 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         2,
         "leave out --cover-model",
         lambda f: _hide(f, cover=_plain(f, "cover"), cover_model=_plain(f, "secret-1")),
+    ),
+    "pictures of nothing of a model": (2, "width", lambda f: _model_in_model(f, "--width=0")),
+    "enormous pictures of a model": (2, "width", lambda f: _model_in_model(f, "--width", 10**10)),
+    "background of a model out of range": (
+        2,
+        "background",
+        lambda f: _model_in_model(f, "--background", 0, "nan", 0),
+    ),
+    "a link to itself": (4, "loop.ply", lambda f: _model_in_model(f, secret=_loop(f) / "loop.ply")),
+    "results in a link to itself": (
+        5,
+        "loop.ply",
+        lambda f: _model_in_model(f, out=_loop(f) / "loop.ply" / "x"),
     ),
     "a model of a secret model": (
         2,

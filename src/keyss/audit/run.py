@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import time
 from collections.abc import Sequence
 from importlib.metadata import version as version_of
-from pathlib import Path
 
 import msgspec
 
@@ -65,7 +65,7 @@ def audit(
     started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
     target = resolve_device(device)
-    asked = {"original": original and str(Path(original).resolve()), "controls": controls, "only": only}
+    asked = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
     folder = RunFolder(
         opened.folder,
         "audit",

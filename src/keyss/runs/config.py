@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
 
 def path_of(source: PathLike | Scene | Gaussians) -> str | None:
     """Where a scene can be found again, None for one in memory."""
-    return None if isinstance(source, Scene | Gaussians) else str(Path(source).resolve())
+    return None if isinstance(source, Scene | Gaussians) else os.path.realpath(source)
 
 
 def colour_of(background: Background) -> tuple[float, float, float] | None:

@@ -6,6 +6,7 @@ machine and while it does what else it does, extrapolated: rough, mostly within 
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import sys
@@ -136,7 +137,7 @@ def disk_bytes(method: Method, options: MethodOptions, inputs: Sequence[SceneInp
 
 def free_bytes(out: Path) -> int:
     """Bytes that are free where `out` is or will be."""
-    folder = out.resolve()
+    folder = Path(os.path.realpath(out))
     while not folder.exists():
         folder = folder.parent
     return shutil.disk_usage(folder).free
