@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from unittest import mock
 
@@ -111,8 +112,8 @@ class Monkey:
         self.history: list[str] = []
         self.statuses: dict[int, int] = {}
         self.foreign: dict[str, State] = {}  # what the monkey wrote and no call may touch
-        self.left: set[str] = set()  # temporary files of calls that were killed
         self.hashes: dict[tuple[int, ...], str] = {}
+        self.keys: dict[str, list[str]] = {}  # key files of the hidings that are there
         self.notes = 0
 
     def play(self, calls: int, keep_going: bool = False) -> None:
@@ -179,7 +180,9 @@ class Monkey:
             call.environment = self.pick([*KEYS, "", " ", "\udcff", "x" * 5000])
         if self.random.random() < 0.3:
             with contextlib.suppress(OSError):
-                call.stdin = Path(self.pick(self.models())).read_bytes() if self.random.random() < 0.8 else b"x"
+                call.stdin = (
+                    Path(self.pick(self.models())).read_bytes() if self.random.random() < 0.8 else b"x"
+                )
         return call
 
     def pick(self, options: Sequence[str]) -> str:
@@ -203,7 +206,9 @@ class Monkey:
 
     def models(self) -> list[str]:
         made = [str(path) for path in Path().glob("out-*/publish/stego.ply")]
-        made += [str(path) for path in Path().glob("out-*/**/*.ply")] + list(map(str, Path().glob("made-*.ply")))
+        made += [str(path) for path in Path().glob("out-*/**/*.ply")] + list(
+            map(str, Path().glob("made-*.ply"))
+        )
         return ["in/cover.ply", "in/secret.ply", *made]
 
     def anything(self) -> list[str]:
@@ -213,24 +218,27 @@ class Monkey:
         return [str(path) for path in sorted(Path().glob("out-*"))]
 
     def folder_out(self) -> list[str]:
-        return [f"out-{number}" for number in range(6)]
+        return [f"out-{number}" for number in range(8)]
 
     def odd_out(self) -> list[str]:
         return [*ODD_OUTS, *(f"{run}/{each}" for run in self.runs() for each in ("private", "publish", "x"))]
 
     def device(self) -> list[str]:
-        return ["--device", "cpu"] if self.random.random() < 0.97 else ["--device", self.pick(["cuda", "gpu"])]
+        return (
+            ["--device", "cpu"] if self.random.random() < 0.97 else ["--device", self.pick(["cuda", "gpu"])]
+        )
 
     def again(self) -> list[str]:
-        return [*self.maybe(0.4, "--overwrite"), *self.maybe(0.2, "--resume")]
+        flags = [[], ["--overwrite"], ["--resume"], ["--overwrite", "--resume"]]
+        return self.random.choices(flags, [12, 12, 3, 1])[0]
 
     def hide(self) -> Call:
         method = self.pick(["learned", "carry"])
         scenes = self.random.random() < 0.35
         good = ["in/a", "in/b", "in/c"] if scenes else ["in/cover.ply", "in/large.ply", "in/secret.ply"]
-        cover = self.mostly(["in/a"] if scenes else ["in/large.ply", "in/cover.ply"], self.anything(), 0.8)
+        cover = self.mostly(["in/a"] if scenes else ["in/large.ply", "in/cover.ply"], self.anything(), 0.87)
         count = 2 if self.random.random() < 0.15 else 1
-        secrets = [self.mostly(good[1:], self.anything(), 0.8) for _ in range(count)]
+        secrets = [self.mostly(good[1:], self.anything(), 0.87) for _ in range(count)]
         keys = [self.random.randrange(len(KEYS)) for _ in range(count)]
         files = [f"in/key-{key}.txt" for key in keys]
         out = self.mostly(self.folder_out(), self.odd_out(), 0.9)
@@ -264,9 +272,12 @@ class Monkey:
         extra = self.maybe(0.2, "--skip-missing")
         return Call(["fit", scene, "-o", out, *SMALL, *self.again(), *extra, *absurd], out, into_folder=True)
 
-    def key_file(self, share: float = 0.8) -> list[str]:
+    def key_file(self, run: str, share: float, every: bool = False) -> list[str]:
+        """Mostly the key of a run, or all of its keys."""
         count = self.random.choices([0, 1, 2], [1, 20, 1])[0]
-        good = [f"in/key-{number}.txt" for number in range(len(KEYS))]
+        good = self.keys.get(run, []) or [f"in/key-{number}.txt" for number in range(len(KEYS))]
+        if every and run in self.keys and self.random.random() < share:
+            return [word for file in good for word in ("--key-file", file)]
         return [each for _ in range(count) for each in ("--key-file", self.mostly(good, KEY_FILES, share))]
 
     def stego(self) -> str:
@@ -282,15 +293,23 @@ class Monkey:
         others = [stego, "x.spz", "x.txt", "nowhere/x.ply", "-", "", ".", "x.compressed.ply", *self.runs()]
         others += [] if overwrite else INPUTS
         out = self.mostly([f"made-{number}.ply" for number in range(4)], others, 0.8)
-        arguments = ["reveal", stego, *self.key_file(0.95), "-o", out, *self.device()]
+        arguments = [
+            "reveal",
+            stego,
+            *self.key_file(stego.partition("/")[0], 0.95),
+            "-o",
+            out,
+            *self.device(),
+        ]
         arguments += ["--overwrite"] * overwrite + self.maybe(0.1, "--decoy") + self.maybe(0.15, "--force")
         arguments += self.maybe(0.15, "--decoder", self.mostly(self.sidecars(), self.anything(), 0.6))
         arguments += self.maybe(0.1, "--frame", self.pick(["secret", "cover", "none"]))
         return Call(arguments, out)
 
     def verify(self) -> Call:
-        key = self.key_file(0.9) if self.random.random() < 0.7 else []
-        arguments = ["verify", self.stego(), *key, *self.maybe(0.3, "--json"), *self.device()]
+        stego = self.stego()
+        key = self.key_file(stego.partition("/")[0], 0.9) if self.random.random() < 0.7 else []
+        arguments = ["verify", stego, *key, *self.maybe(0.3, "--json"), *self.device()]
         arguments += self.maybe(0.15, "--decoder", self.mostly(self.sidecars(), self.anything(), 0.6))
         return Call(arguments)
 
@@ -298,19 +317,38 @@ class Monkey:
         cameras = self.mostly(["in/a", "in/b", "in/c"], self.anything(), 0.8)
         out = self.mostly([*self.folder_out(), "out-images"], self.odd_out(), 0.8)
         arguments = ["render", self.mostly(self.models(), self.anything(), 0.8), "--cameras", cameras]
-        arguments += ["-o", out, *self.device(), *self.maybe(0.4, "--overwrite"), *self.maybe(0.3, "--width", "9")]
+        arguments += [
+            "-o",
+            out,
+            *self.device(),
+            *self.maybe(0.4, "--overwrite"),
+            *self.maybe(0.3, "--width", "9"),
+        ]
         arguments += self.maybe(0.2, "--split", self.pick(["all", "train", "none"]))
         return Call([*arguments, *self.absurd(0.2, "--width", "--background")], out, into_folder=True)
 
     def evaluate(self) -> Call:
-        run = self.mostly(self.runs(), self.anything(), 0.85)
+        run = self.mostly(sorted(self.keys), [*self.runs(), *self.anything()], 0.8)
         wrong = self.maybe(0.5, "--wrong-keys", self.pick(["2", "1", "0", "-1", "x"]))
-        arguments = ["evaluate", run, *self.key_file(0.95), *wrong, *self.device(), *self.absurd(0.1, "--seed")]
+        arguments = [
+            "evaluate",
+            run,
+            *self.key_file(run, 0.93, every=True),
+            *wrong,
+            *self.device(),
+            *self.absurd(0.1, "--seed"),
+        ]
         return Call(arguments, run=run)
 
     def audit(self) -> Call:
-        run = self.mostly(self.runs(), self.anything(), 0.9)
-        arguments = ["audit", run, *self.key_file(0.97), "--controls", self.mostly(["2"], ["0", "1", "-1", "x"])]
+        run = self.mostly(sorted(self.keys), [*self.runs(), *self.anything()], 0.85)
+        arguments = [
+            "audit",
+            run,
+            *self.key_file(run, 0.95, every=True),
+            "--controls",
+            self.mostly(["2"], ["0", "1", "-1", "x"]),
+        ]
         parts = ["parameters"] if self.random.random() < 0.9 else [self.pick(["images", "leaks", "none"])]
         arguments += [word for part in parts for word in ("--only", part)] + self.device() + self.again()
         arguments += self.maybe(0.1, "--original", self.pick(self.anything())) + self.absurd(0.1, "--seed")
@@ -330,7 +368,13 @@ class Monkey:
         return Call(arguments, csv)
 
     def info(self) -> Call:
-        return Call(["info", self.pick([*self.anything(), *self.runs(), *self.sidecars()]), *self.maybe(0.4, "--json")])
+        return Call(
+            [
+                "info",
+                self.pick([*self.anything(), *self.runs(), *self.sidecars()]),
+                *self.maybe(0.4, "--json"),
+            ]
+        )
 
     def keygen(self) -> Call:
         out = self.pick(["made-key-0.txt", "made-key-1.txt", "nowhere/k", ".", "", "in/key-0.txt"])
@@ -342,7 +386,19 @@ class Monkey:
         return Call(["demo", "-o", self.pick(["in", "in/cover.ply", "in/a"]), *self.maybe(0.2, "--seed=-1")])
 
     def nonsense(self) -> Call:
-        words = ["hide", "fit", "info", "reveal", "--nonsense", "-o", "--method", "carry", "\x00x", "--help", "-"]
+        words = [
+            "hide",
+            "fit",
+            "info",
+            "reveal",
+            "--nonsense",
+            "-o",
+            "--method",
+            "carry",
+            "\x00x",
+            "--help",
+            "-",
+        ]
         words += ["--thin", "--sidecar", "--key-file", "--cover"]
         return Call([self.pick(words[:4]), *(self.pick(words) for _ in range(self.random.randrange(4)))])
 
@@ -352,7 +408,7 @@ class Monkey:
         self.tidy()
         if self.random.random() < 0.35 and self.runs():
             self.leave_a_note(self.pick(self.runs()))
-        if self.random.random() < 0.12 and self.runs():
+        if self.random.random() < 0.08 and self.runs():
             files = [
                 path
                 for path in sorted(Path().glob("out-*/**/*"))
@@ -360,7 +416,7 @@ class Monkey:
             ]
             if files:
                 self.harm(self.random.choice(files))
-        if self.random.random() < 0.08 and self.runs():
+        if self.random.random() < 0.06 and self.runs():
             self.remove(self.pick(self.runs()))
 
     def leave_a_note(self, run: str) -> None:
@@ -402,14 +458,12 @@ class Monkey:
 
     def remove(self, run: str) -> None:
         self.history.append(f"# remove {run}")
+        self.keys.pop(run, None)
         if Path(run).is_symlink() or not Path(run).is_dir():
             Path(run).unlink()
         else:
             shutil.rmtree(run)
-        self.foreign = {
-            name: state for name, state in self.foreign.items() if not name.startswith(f"{run}/")
-        }
-        self.left = {name for name in self.left if not name.startswith(f"{run}/")}
+        self.foreign = {name: state for name, state in self.foreign.items() if not name.startswith(f"{run}/")}
 
     # What must hold
 
@@ -431,7 +485,7 @@ class Monkey:
             must(len(lines) == 1, f"expected one line of error, got {err!r}")
         elif status == 0:
             must(not lines, f"an error with exit status 0: {err!r}")
-        elif usage:
+        elif usage and status > 0:
             must(bool(err), "nothing said")
         after = self.snapshot()
         trained = " steps\n" in err
@@ -530,7 +584,10 @@ class Monkey:
             if status != 0:
                 kept = status == 7 or signalled or resumable
                 kept |= call.verb == "audit" and (working or inner.startswith("private/controls"))
-                must(kept and (working or call.verb == "audit" or (signalled and overwrite)), f"status {status} changed {what}")
+                must(
+                    kept and (working or call.verb == "audit" or (signalled and overwrite)),
+                    f"status {status} changed {what}",
+                )
             elif call.has("--dry-run"):
                 raise Violation(f"a dry run changed {what}")
             elif name in before and before[name].kind == "file" and not overwrite:
@@ -539,21 +596,22 @@ class Monkey:
                     "audit": ("private/report.html",),
                     "report": ("private/report.html",),
                 }.get(call.verb, ())
-                must(working or inner in measured or (resume and working), f"changed without --overwrite: {what}")
+                must(
+                    working or inner in measured or (resume and working),
+                    f"changed without --overwrite: {what}",
+                )
             if name in after and not signalled:
                 self.check_mode(call, name, after[name])
-        if status == -signal.SIGKILL:
-            self.left |= set(self.temporary(after))
-        for name in self.temporary(after):
-            must(name in self.left, f"left behind: {name}")
-        self.left &= after.keys()
+        for name in () if status == -signal.SIGKILL else self.temporary(after):
+            must(name in before, f"left behind: {name}")
 
     def temporary(self, files: dict[str, State]) -> list[str]:
         """What nothing that ended by itself leaves."""
         names = [
             name
             for name in files
-            if re.search(r"\.unfinished$|(^|/)private/(unfinished|lock)(/|$)", name) and name not in self.foreign
+            if re.search(r"\.unfinished$|(^|/)private/(unfinished|lock)(/|$)", name)
+            and name not in self.foreign
         ]
         ours = [name for name in names if not any(mine.startswith(f"{name}/") for mine in self.foreign)]
         for name in files:
@@ -590,20 +648,27 @@ class Monkey:
             must(len(there) == count and all((out / name).is_file() for name in there), f"{count} images")
         elif call.verb in ("evaluate", "audit", "report"):
             run = Path(call.run or ".")
-            made = {"evaluate": "metrics.json", "audit": "audit/audit.json", "report": "report.html"}[call.verb]
+            made = {"evaluate": "metrics.json", "audit": "audit/audit.json", "report": "report.html"}[
+                call.verb
+            ]
             must((run / "private" / made).stat().st_size > 0, f"no {made}")
         elif call.verb == "keygen" and call.out is not None:
             must(bool(Path(call.out).read_text().strip()), "no key")
 
     def check_hiding(self, call: Call, out: Path) -> None:
         """The published file opens with its keys, and shows what was hidden."""
+        words = call.arguments
+        files = [path for flag, path in pairwise(words) if flag == "--key-file"]
+        if files and call.out in self.folder_out():
+            self.keys[str(call.out)] = files
         mine = {Path(name).name for name in self.foreign if inside(name, str(out / "publish"))}
         sidecar = {"decoder.sealed"} if call.has("--sidecar") else set()
-        must({path.name for path in (out / "publish").iterdir()} - mine == {"stego.ply"} | sidecar, "publish/")
+        must(
+            {path.name for path in (out / "publish").iterdir()} - mine == {"stego.ply"} | sidecar, "publish/"
+        )
         limit = re.search(r"--min-psnr[= ](\S+)", " ".join(call.arguments))
         least = 20.0 if limit is None else float(limit[1])
-        keys = [key_in(path) for flag, path in zip(call.arguments, call.arguments[1:], strict=False) if flag == "--key-file"]
-        keys = keys or [call.environment or ""]
+        keys = [key_in(path) for path in files] or [call.environment or ""]
         run = open_run(out, keys)
         for key in keys:
             found = api.verify(out / "publish" / "stego.ply", key, device="cpu")
@@ -615,7 +680,9 @@ class Monkey:
             fidelity = render_fidelity(opened.reveal(run.stego), plain, scene)
             must(fidelity.psnr >= least, f"exit status 0 and {fidelity.psnr} dB, at least {least} expected")
             dark = min(fidelity.nothing + 3, 40)
-            must(least <= 0 or fidelity.psnr >= dark, f"{fidelity.psnr} dB, empty pictures {fidelity.nothing}")
+            must(
+                least <= 0 or fidelity.psnr >= dark, f"{fidelity.psnr} dB, empty pictures {fidelity.nothing}"
+            )
 
     def snapshot(self) -> dict[str, State]:
         return {str(path): self.state(path) for path in sorted(Path().rglob("*"))}
@@ -675,7 +742,16 @@ def key_in(path: str) -> str:
 
 # Inputs, all of them the monkey's own.
 
-SCENES = ["in/a", "in/b", "in/c", "in/one-missing", "in/broken-json", "in/no-points", "in/empty", "in/not-images"]
+SCENES = [
+    "in/a",
+    "in/b",
+    "in/c",
+    "in/one-missing",
+    "in/broken-json",
+    "in/no-points",
+    "in/empty",
+    "in/not-images",
+]
 MODELS = [
     *("in/cover.ply", "in/large.ply", "in/secret.ply", "in/sh0.ply", "in/half.ply", "in/one.ply"),
     *("in/huge.ply", "in/outlier.ply", "in/nan.ply", "in/inf.ply", "in/transparent.ply", "in/zero-quats.ply"),
@@ -746,7 +822,9 @@ def make_inputs(folder: Path) -> None:
             flipped[rng.randrange(at, len(data))] ^= 1 << rng.randrange(8)
         (here / f"{name}.ply").write_bytes(flipped)
     (here / "model.spz").write_bytes(b"\x1f\x8b" + bytes(50))
-    (here / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\nx\n")
+    (here / "text.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\nx\n"
+    )
     (here / "ascii.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
     (here / "zero-bytes.ply").write_bytes(b"")
     (here / "folder.ply").mkdir()

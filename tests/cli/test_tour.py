@@ -1,0 +1,110 @@
+"""A whole tour, from keys to a report, of somebody whose files are readable by everybody: what keyss adds is not."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from cli.said import SMALL, Said
+from files.scene_files import write_blender, write_nerfstudio
+from keyss.demo import run as demo_run
+from keyss.files.ply import write_ply
+from tiny_scenes import random_gaussians
+
+
+@pytest.fixture
+def umask() -> Iterator[None]:
+    """The usual one: new files are readable by everybody."""
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: None) -> Path:
+    """Scenes `a` and `b`, and models in `own/`; the working folder."""
+    write_blender(tmp_path / "a", count=3, channels=3)
+    write_nerfstudio(tmp_path / "b", count=4)
+    (tmp_path / "own").mkdir()
+    write_ply(tmp_path / "own" / "cover.ply", random_gaussians(400, seed=1))
+    write_ply(tmp_path / "own" / "secret.ply", random_gaussians(100, seed=2))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def tour(keyss: Callable[..., Said]) -> None:
+    """Every verb, into the working folder."""
+
+    def done(line: str) -> Said:
+        said = keyss(*line.split())
+        assert said.status == 0, f"{line}: {said.err}"
+        return said
+
+    small = " ".join(SMALL)
+    done("keygen -o key.txt")
+    done(f"fit a -o plain {small}")
+    done(f"hide --sidecar --cover a --secret b --key-file key.txt --min-psnr=0 -o learned {small}")
+    models = "--cover own/cover.ply --secret own/secret.ply --width 16 --device cpu"
+    done(f"hide --method carry {models} --key-file key.txt -o carried")
+    for run in ("learned", "carried"):
+        done(f"reveal {run}/publish/stego.ply --key-file key.txt -o {run}.ply")
+        done(f"verify {run}/publish/stego.ply --key-file key.txt")
+        done(f"evaluate {run} --key-file key.txt")
+        done(f"info {run}/publish/stego.ply")
+    done("render learned.ply --cameras b -o images --split all")
+    done("steganalyze images --csv scores.csv")
+    done("audit learned --key-file key.txt --only parameters --controls 2 --device cpu")
+    done("report learned")
+    done("info learned --json")
+
+
+def readable_by_others(folder: Path) -> set[str]:
+    return {
+        str(path.relative_to(folder))
+        for path in folder.rglob("*")
+        if path.is_file() and path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+    }
+
+
+def published(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.glob("**/publish/*")}
+
+
+PUBLISHED = {"learned/publish/stego.ply", "learned/publish/decoder.sealed", "carried/publish/stego.ply"}
+
+
+def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[..., Said], mine: Path) -> None:
+    tour(keyss)
+    for own in ("a", "b"):
+        assert readable_by_others(mine / own)  # the umask is one under which that means something
+        shutil.rmtree(mine / own)
+    assert published(mine) == PUBLISHED
+    shutil.rmtree(mine / "own")  # written by keyss's own writer
+    assert readable_by_others(mine) == PUBLISHED
+    private = {path.parent.name: path for path in mine.glob("**/private")}
+    assert private.keys() == {"plain", "learned", "carried"}
+    for path in private.values():
+        assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    for name in ("audit/audit.json", "report.html", "metrics.json", "config.json", "secret-1.ply"):
+        assert (mine / "learned" / "private" / name).is_file()
+    expected = {"key.txt", "plain", "learned", "carried", "learned.ply", "carried.ply", "images", "scores.csv"}
+    assert {path.name for path in mine.iterdir()} == expected
+
+
+def test_nor_does_the_demo_show_more(
+    keyss: Callable[..., Said], tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A demo of a few steps on small photos."""
+    fit = demo_run.OPTIONS.with_fit(iterations=20, max_gaussians=1500)
+    small = {"options": fit, "views": 8, "width": 32, "height": 24}
+    monkeypatch.setattr(demo_run.run_demo, "__kwdefaults__", demo_run.run_demo.__kwdefaults__ | small)
+    said = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
+    assert said.status == 0, said.err
+    assert published(tmp_path) == {"demo/publish/stego.ply"}
+    assert readable_by_others(tmp_path) == {"demo/publish/stego.ply"}
+    assert stat.S_IMODE((tmp_path / "demo" / "private").stat().st_mode) == 0o700
