@@ -46,6 +46,7 @@ COMMANDS: Mapping[str, Command] = {
             "b",
             "--key-file",
             "key.txt",
+            "--sidecar",
             "--min-psnr=0",
             "-o",
             "OUT",

@@ -23,7 +23,7 @@ class TestTheWholePath:
         said = keyss("reveal", world / "hidden" / "publish" / "stego.ply", "--key-file", key, "-o", secret)
         left = len(read_ply(secret))  # without the cover's, which nothing draws
         assert 0 < left < 100
-        assert said == Said(0, f"{secret}: {left} Gaussians\n", "")
+        assert said == Said(0, f"{secret}: {left} of {left} Gaussians\n", "")
         said = keyss("render", secret, "--cameras", world / "b", "-o", images, "--split", "all")
         assert said.status == 0
         assert said.out == f"{images}: 4 images\n"

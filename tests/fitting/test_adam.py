@@ -140,3 +140,18 @@ def test_on_a_gpu_it_is_the_same() -> None:
         for d in (torch.device("cpu"), device)
     )
     assert (here - there.cpu()).abs().max() < 1e-6
+
+
+def test_numbers_that_end_near_zero_have_uniform_low_bits() -> None:
+    """A step that is rounded before it is subtracted leaves the grid of the larger number that it came from."""
+    generator = torch.Generator().manual_seed(3)
+    parameter = torch.nn.Parameter(1e-3 * torch.randn(400_000, generator=generator))
+    optimizer = RowAdam([{"params": [parameter], "lr_scale": torch.tensor(1.0)}], lr=1e-3, eps=EPS)
+    for _ in range(20):
+        parameter.grad = parameter.detach() + 1e-3 * torch.randn(400_000, generator=generator)
+        optimizer.step()
+    small = parameter.detach()[parameter.detach().abs() < 2.0**-15].numpy().view("uint32")
+    assert len(small) > 4000
+    for bit in range(4):
+        ones = float((small >> bit & 1).mean())
+        assert abs(ones - 0.5) < 5 * 0.5 / len(small) ** 0.5, (bit, ones, len(small))

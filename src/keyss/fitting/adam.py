@@ -16,7 +16,7 @@ from torch import Tensor
 # The kernel may use nothing else of other files: it would outlive their change, see `rendering.cpu.jit`.
 from keyss.rendering.cpu import parallel
 from keyss.rendering.cpu.jit import kernel
-from keyss.rendering.cpu.simd8 import fetch_add
+from keyss.rendering.cpu.simd8 import fetch_add, fused_multiply_add
 
 NUMBERS_PER_JOB = 8192
 # What torch's Adam can do and the kernel cannot.
@@ -30,8 +30,8 @@ def _adam(
     """Adam's step, in place, on `parameter`, `mean` and `square`; these and `gradient` are flat: [N * W].
 
     With constants (mean_share, square_share, root, eps): mean += mean_share (gradient - mean), square +=
-    square_share (gradient^2 - square), and parameter -= rates mean / (root sqrt(square) + eps), with `rates`
-    [W] for the numbers of a row.
+    square_share (gradient^2 - square), and parameter -= rates (mean / (root sqrt(square) + eps)), with
+    `rates` [W] for the numbers of a row.
     """
     mean_share, square_share, root, eps = constants
     width = len(rates)
@@ -50,7 +50,10 @@ def _adam(
         for i in range(len(p)):
             m[i] += mean_share * (g[i] - m[i])
             v[i] += square_share * (g[i] * g[i] - v[i])
-            p[i] -= steps[i] * m[i] / (np.sqrt(v[i]) * root + eps)
+            # Rounded once, as CUDA's Adam does it: were the step rounded before it is subtracted, numbers that
+            # end near zero would keep trailing zeros, and models from here would be known by them.
+            quotient = m[i] / (np.sqrt(v[i]) * root + eps)
+            p[i] = fused_multiply_add(-steps[i], quotient, p[i])
 
 
 class RowAdam(torch.optim.Adam):

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
-from scipy.stats import rankdata
 
 from keyss.core.errors import UsageError
 from keyss.measure.stegexpose import DETECTORS, Scores, score_image
@@ -56,6 +55,8 @@ def roc(negatives: Sequence[Score], positives: Sequence[Score]) -> Roc:
 
     if not negatives or not positives:
         raise UsageError(f"expected scores of both classes, got {len(negatives)} and {len(positives)}")
+    from scipy.stats import rankdata  # takes a third of a second to load
+
     ranks = rankdata([-math.inf if _is_missing(each) else each for each in (*negatives, *positives)])
     plain, stego = ranks[: len(negatives)], ranks[len(negatives) :]
     fpr, tpr, _ = roc_curve(np.repeat([0, 1], [len(plain), len(stego)]), ranks)
@@ -74,6 +75,8 @@ def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
 
     By ranks, as in Sun and Xu (2014). The variance is 0 where a class has a single score.
     """
+    from scipy.stats import rankdata
+
     n, p = len(negatives), len(positives)
     ranks = rankdata(np.concatenate([negatives, positives]))
     below = (ranks[n:] - rankdata(positives)) / n  # the share of negatives below each positive

@@ -38,7 +38,7 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
     """
     changed = {}
     for name in ("log_scales", "quats", "opacity_logits", "sh"):
-        values = getattr(model, name).detach().cpu().clone()
+        values = getattr(model, name).detach().cpu().clone(memory_format=torch.contiguous_format)
         columns = values.view(len(values), -1).numpy()
         for column in range(3 if name == "sh" else 0, columns.shape[1]):
             if not _is_natural(columns[:, column]):

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from keyss.channels.low_bits import reed_solomon
 from keyss.channels.low_bits.bits import bytes_per_gaussian
@@ -152,4 +152,4 @@ def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree:
 def _most_data(n: int, blocks: int) -> int:
     """The largest k with which all blocks survive removal with probability 1 - FAILURE; 0 if none."""
     data = np.arange(1, n + 1)
-    return int(data[binom.sf(n - data, n, REMOVAL) * blocks < FAILURE].max(initial=0))
+    return int(data[bdtrc(n - data, n, REMOVAL) * blocks < FAILURE].max(initial=0))

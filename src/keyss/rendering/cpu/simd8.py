@@ -181,6 +181,16 @@ def load_interleaved(typingctx, array, index):
 
 
 @intrinsic
+def fused_multiply_add(typingctx, a, b, c):
+    """a b + c of float32 numbers, rounded once; where the processor cannot, the C library does it."""
+
+    def codegen(context, builder, signature, arguments):
+        return builder.fma(*arguments)
+
+    return types.float32(types.float32, types.float32, types.float32), codegen
+
+
+@intrinsic
 def splat(typingctx, scalar):
     """The vector with `scalar` in every lane."""
 
