@@ -50,6 +50,7 @@ SECONDS = 120  # for one call
 MOST_BYTES = 300 << 20  # of the folder; beyond it the monkey clears runs away
 KEYS = ("q7Rv2LxT9bWm4KzD", "fedcba9876543210", "Zm3nB8vC1xK5jH7g")
 SMALL = ("--iterations", "5", "--max-gaussians", "100", "--width", "16", "--device", "cpu")
+NOTES = ("keyss: warning: ", "keyss: skipped ", "keyss: compiling ")  # on standard error, not errors
 WORKING = ("checkpoint", "unfinished", "lock")  # in `private/`, while something runs
 # Costs as they are not meant to be, in this process and in those that are killed.
 CHEAP = {"time_cost": 1, "memory_cost": 8, "parallelism": 1}
@@ -480,7 +481,7 @@ class Monkey:
         must("Traceback" not in said and "internal error" not in said, err[-2000:])
         must(not re.search(r"\b[A-Z]\w*Warning: ", err), err[-2000:])
         lines = [line for line in err.splitlines() if line.startswith("keyss: ")]
-        lines = [line for line in lines if not line.startswith(("keyss: warning: ", "keyss: skipped "))]
+        lines = [line for line in lines if not line.startswith(NOTES)]
         if status > 0 and not usage:
             must(len(lines) == 1, f"expected one line of error, got {err!r}")
         elif status == 0:
@@ -621,7 +622,7 @@ class Monkey:
         return ours
 
     def check_mode(self, call: Call, name: str, state: State) -> None:
-        if Path(name).parts[-2:-1] == ("publish",) and call.verb == "hide":
+        if state.kind == "file" and call.verb == "hide" and Path(name).parent.name == "publish":
             must(state.mode == 0o644, f"{name} has mode {state.mode:o}")
         elif state.kind == "file":
             must(state.mode == 0o600, f"{name} has mode {state.mode:o}")

@@ -1,4 +1,4 @@
-"""A whole tour, from keys to a report, of somebody whose files are readable by everybody: what keyss adds is not."""
+"""From keys to a report, with the usual umask: only what is to be published is readable by others."""
 
 from __future__ import annotations
 
@@ -92,7 +92,16 @@ def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[...,
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
     for name in ("audit/audit.json", "report.html", "metrics.json", "config.json", "secret-1.ply"):
         assert (mine / "learned" / "private" / name).is_file()
-    expected = {"key.txt", "plain", "learned", "carried", "learned.ply", "carried.ply", "images", "scores.csv"}
+    expected = {
+        "key.txt",
+        "plain",
+        "learned",
+        "carried",
+        "learned.ply",
+        "carried.ply",
+        "images",
+        "scores.csv",
+    }
     assert {path.name for path in mine.iterdir()} == expected
 
 
