@@ -23,6 +23,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import png_bytes
 from keyss.files.models import check_model_output, read_model, write_model
+from keyss.files.streams import is_standard
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
@@ -38,7 +39,7 @@ from keyss.rendering.orbit import is_model
 from keyss.report.page import write_report as write_report
 from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
 from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names, writers
-from keyss.runs.folder import RunFolder, write_again
+from keyss.runs.folder import RunFolder, check_not_published, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
 from keyss.runs.planning import Plan, check_disk, plan_hiding
@@ -311,6 +312,8 @@ def reveal_counted(
     beside = None if isinstance(stego, Gaussians) else sidecar_beside(Path(stego))
     inputs = [Path(each) for each in (stego, decoder, beside) if isinstance(each, str | Path)]
     path = None if out is None else check_model_output(out, overwrite, inputs)
+    if path is not None and not is_standard(path):
+        check_not_published(path)
     found = reveal_model(
         as_model(stego),
         key,

@@ -111,6 +111,10 @@ def _reveal(folder: Path, *extra: object, key: Path | None = None) -> list[objec
     return ["reveal", stego, "--key-file", key, "-o", folder / "secret.ply", *extra]
 
 
+def _reveal_to(folder: Path, out: str) -> list[object]:
+    return ["reveal", folder / STEGO, "--key-file", folder / "key.txt", "-o", folder / out]
+
+
 def _spaced_key(folder: Path) -> Path:
     path = folder / "spaced.txt"
     path.write_text((folder / "key.txt").read_text().strip() + " \n")
@@ -164,6 +168,12 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
             f / "hidden/private/cover.ply",
         ],
     ),
+    "a secret among what is published": (
+        5,
+        "given away",
+        lambda f: _reveal_to(f, "hidden/publish/secret.ply"),
+    ),
+    "a run in what is published": (5, "given away", lambda f: _hide(f, out=f / "hidden/publish/out")),
     "folder of the file missing": (
         5,
         "nowhere",

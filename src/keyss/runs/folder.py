@@ -76,6 +76,7 @@ class RunFolder:
         self.arguments: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(dict(arguments or {})))
         if overwrite and resume:
             raise UsageError("`overwrite=True` starts anew and `resume=True` continues: give one of them")
+        check_not_published(self.path)
         self._was_there = self.path.exists()
         self._continues = False
         if self.path.is_symlink() or self._was_there:
@@ -238,6 +239,16 @@ class RunFolder:
 
     def _save(self, manifest: Manifest) -> None:
         write_record(self.path / MANIFEST, manifest)
+
+
+def check_not_published(path: Path | str) -> None:
+    """Raise OutputError for a place in a run's `publish/`, which is given away."""
+    real = Path(os.path.realpath(path))
+    for folder in (real, *real.parents):
+        if folder.name == PUBLISH and (folder.parent / MANIFEST).exists():
+            raise OutputError(
+                f"{path} would be given away with all that is in {folder}: choose another place"
+            )
 
 
 def clear(folder: Path) -> None:
