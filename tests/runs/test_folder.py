@@ -181,6 +181,14 @@ def test_an_interrupted_run_is_continued_with_the_same_arguments_only(tmp_path: 
     assert tree(tmp_path) == {"publish/stego.ply": b"whole"}
 
 
+def test_a_run_that_was_killed_before_it_saved_anything_is_just_begun_again(tmp_path: Path) -> None:
+    interrupt(tmp_path, {"width": 1})
+    (tmp_path / "private" / "checkpoint" / "fit").unlink()  # as a kill before the first checkpoint leaves it
+    make(tmp_path)
+    assert tree(tmp_path)["publish/stego.ply"] == b"1"
+    assert read_manifest(tmp_path).running is None
+
+
 def test_starting_anew_drops_checkpoints_and_keeps_results_until_there_are_new_ones(tmp_path: Path) -> None:
     make(tmp_path)
     interrupt(tmp_path, {"width": 1}, overwrite=True)

@@ -98,7 +98,7 @@ class RunFolder:
             if resume:
                 self._check_same(running)
                 self._continues = True
-            elif not overwrite:
+            elif not overwrite and (in_use or self._has_checkpoints()):
                 raise OutputError(
                     f"{self.path} holds an interrupted run ({running.stage}): `resume=True` with the same "
                     "arguments continues it, `overwrite=True` drops it"
@@ -221,8 +221,7 @@ class RunFolder:
         """Leave what can be resumed, or the folder as it was."""
         shutil.rmtree(self.path / _STAGING, ignore_errors=True)
         there = read_manifest(self.path)
-        checkpoints = self.path / _CHECKPOINTS
-        if checkpoints.is_dir() and any(checkpoints.iterdir()):
+        if self._has_checkpoints():
             return
         _drop_unfinished(self.path, there)
         there = replace(there, running=None)
@@ -230,6 +229,10 @@ class RunFolder:
             self._save(there)
         else:
             (self.path / MANIFEST).unlink(missing_ok=True)
+
+    def _has_checkpoints(self) -> bool:
+        folder = self.path / _CHECKPOINTS
+        return folder.is_dir() and any(folder.iterdir())
 
     def _save(self, manifest: Manifest) -> None:
         write_record(self.path / MANIFEST, manifest)
