@@ -103,6 +103,7 @@ def test_foreign_files_are_called_what_they_are(keyss: Keyss, world: Path, tmp_p
         assert_refused(said, 4, f"found {kind}")
         assert str(path) in said.err
         assert advice in said.err
+    assert "expected a scene folder or a 3DGS model (.ply)" in said.err
     assert listing(tmp_path) == before
 
 

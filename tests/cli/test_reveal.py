@@ -310,6 +310,7 @@ class TestVerify:
         assert facts[0] == facts[1]
         assert facts[0]["secret"] is None
         assert facts[0]["model"]["gaussians"] == 1500
+        assert "secret                  not looked for" in keyss("verify", files / "whole.ply").out
 
     @pytest.mark.parametrize(
         ("change", "words"),

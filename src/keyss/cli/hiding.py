@@ -339,6 +339,7 @@ def verify(
     if json_:
         print(record_bytes(found).decode(), end="")
     else:
-        print_facts(to_builtins(found))
+        facts = to_builtins(found)
+        print_facts(facts if found.secret else facts | {"secret": "not looked for, as no key was given"})
     if found.problems:
         raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.files.foreign import what_it_is
 from keyss.files.models import read_model
 from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
@@ -134,6 +136,9 @@ def as_scene(
     if isinstance(source, Scene):
         return source
     if not isinstance(source, Gaussians) and not is_model(source):
+        if os.path.exists(source) and not os.path.isdir(source):
+            found = what_it_is(Path(source))
+            raise InputError(f"{source}: expected a scene folder or a 3DGS model (.ply), found {found}")
         try:
             return load_scene(source, width=width, background=background, skip_missing=skip_missing)
         except InputError as error:
