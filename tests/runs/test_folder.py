@@ -134,11 +134,24 @@ def test_somebody_elses_file_is_never_replaced(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"publish/stego.ply": b"mine"}
 
 
+@pytest.mark.parametrize("name", ["checkpoint", "unfinished"])
+def test_somebody_elses_folder_is_not_taken_for_an_unfinished_run(tmp_path: Path, name: str) -> None:
+    make(tmp_path)
+    (tmp_path / "private" / name).mkdir()
+    (tmp_path / "private" / name / "notes.txt").write_bytes(b"mine")
+    before = tree(tmp_path), read_manifest(tmp_path)
+    with pytest.raises(OutputError, match="in the way"):
+        make(tmp_path, overwrite=True)
+    with pytest.raises(OutputError, match="in the way"):
+        clear(tmp_path)
+    assert (tree(tmp_path), read_manifest(tmp_path)) == before
+
+
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     with pytest.raises(OutputError, match="exists: choose another folder"):
         RunFolder(tmp_path, "hide")
-    with pytest.raises(OutputError, match="no interrupted one"):
+    with pytest.raises(OutputError, match="no interrupted run"):
         RunFolder(tmp_path, "hide", resume=True)
     with pytest.raises(OutputError, match="is not a folder"):
         RunFolder(tmp_path / "notes.txt", "hide")

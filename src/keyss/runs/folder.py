@@ -104,8 +104,8 @@ class RunFolder:
                     "arguments continues it, `overwrite=True` drops it"
                 )
         elif in_use and resume:
-            finished = f"holds a finished run ({self.stage})" if self.stage in there.files else "is in use"
-            raise OutputError(f"{self.path} {finished}, and no interrupted one that could be resumed")
+            found = f"a finished run ({self.stage})" if self.stage in there.files else "something else"
+            raise OutputError(f"{self.path} holds {found}, and no interrupted run that could be resumed")
         elif in_use and not overwrite:
             raise OutputError(
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
@@ -147,7 +147,7 @@ class RunFolder:
             with lock(self.path / _LOCK):
                 before = read_manifest(self.path)  # again: now nobody else changes it
                 if not self._continues:
-                    self._drop_unfinished()
+                    _drop_unfinished(self.path, before)
                 shutil.rmtree(self.path / _STAGING, ignore_errors=True)
                 self._save(replace(before, running=Running(stage=self.stage, arguments=self.arguments)))
                 self._names: list[str] = []
@@ -213,8 +213,9 @@ class RunFolder:
             _remove(self.path, self._names)
             self._save(replace(there, files=kept))
             raise
+        # Last: what lies there is known as our own for as long as the manifest says that something runs.
+        _drop_unfinished(self.path, there)
         self._save(replace(there, running=None))
-        self._drop_unfinished()
 
     def _give_up(self) -> None:
         """Leave what can be resumed, or the folder as it was."""
@@ -223,19 +224,12 @@ class RunFolder:
         checkpoints = self.path / _CHECKPOINTS
         if checkpoints.is_dir() and any(checkpoints.iterdir()):
             return
-        self._drop_unfinished()
+        _drop_unfinished(self.path, there)
         there = replace(there, running=None)
         if there.files:
             self._save(there)
         else:
             (self.path / MANIFEST).unlink(missing_ok=True)
-
-    def _drop_unfinished(self) -> None:
-        """Remove the traces of an earlier run. Raises OutputError for what was there before keyss."""
-        for name in (_CHECKPOINTS, _STAGING):
-            if (self.path / name).exists() and not (self.path / MANIFEST).exists():
-                raise OutputError(f"{self.path / name} is in the way, and keyss did not write it: move it")
-            shutil.rmtree(self.path / name, ignore_errors=True)
 
     def _save(self, manifest: Manifest) -> None:
         write_record(self.path / MANIFEST, manifest)
@@ -257,9 +251,9 @@ def clear(folder: Path) -> None:
         return
     with _typed(folder):
         with lock(folder / _LOCK):
-            _remove(folder, [name for names in read_manifest(folder).files.values() for name in names])
-            for name in (_CHECKPOINTS, _STAGING):
-                shutil.rmtree(folder / name, ignore_errors=True)
+            there = read_manifest(folder)
+            _drop_unfinished(folder, there)
+            _remove(folder, [name for names in there.files.values() for name in names])
             (folder / MANIFEST).unlink(missing_ok=True)
         _remove_empty(folder / PRIVATE)
         _remove_empty(folder)
@@ -290,6 +284,17 @@ def read_manifest(folder: Path) -> Manifest:
         if not parts or ".." in parts or parts[0] == "/" or "\0" in name or name == MANIFEST:
             raise OutputError(f"{path}: {name!r} is not a file in this folder")
     return manifest
+
+
+def _drop_unfinished(folder: Path, there: Manifest) -> None:
+    """Remove the traces of a run that `there` knows to be unfinished.
+
+    Raises OutputError for folders of these names where it knows of none: they are somebody else's.
+    """
+    for name in (_CHECKPOINTS, _STAGING):
+        if there.running is None and os.path.lexists(folder / name):
+            raise OutputError(f"{folder / name} is in the way, and keyss did not write it: move it")
+        shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def _write_entered(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
