@@ -174,6 +174,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         lambda f: _reveal_to(f, "hidden/publish/secret.ply"),
     ),
     "a run in what is published": (5, "given away", lambda f: _hide(f, out=f / "hidden/publish/out")),
+    "a file without a name": (4, "folder", lambda f: ["reveal", "", *_reveal(f)[2:]]),
     "folder of the file missing": (
         5,
         "nowhere",

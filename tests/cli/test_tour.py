@@ -87,7 +87,7 @@ def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[...,
     shutil.rmtree(mine / "own")  # written by keyss's own writer
     assert readable_by_others(mine) == PUBLISHED
     private = {path.parent.name: path for path in mine.glob("**/private")}
-    assert private.keys() == {"plain", "learned", "carried"}
+    assert private.keys() == {"plain", "learned", "carried", "images"}
     for path in private.values():
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
     for name in ("audit/audit.json", "report.html", "metrics.json", "config.json", "secret-1.ply"):

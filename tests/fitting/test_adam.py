@@ -143,7 +143,8 @@ def test_on_a_gpu_it_is_the_same() -> None:
 
 
 def test_numbers_that_end_near_zero_have_uniform_low_bits() -> None:
-    """A step that is rounded before it is subtracted leaves the grid of the larger number that it came from."""
+    """A step that is rounded before it is subtracted leaves the grid of the larger number that it came
+    from."""
     generator = torch.Generator().manual_seed(3)
     parameter = torch.nn.Parameter(1e-3 * torch.randn(400_000, generator=generator))
     optimizer = RowAdam([{"params": [parameter], "lr_scale": torch.tensor(1.0)}], lr=1e-3, eps=EPS)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
+from scipy.stats import mannwhitneyu, spearmanr
 
 import keyss
 from keyss.core import Gaussians, Scene
+from keyss.core.gaussians import DRAWN_OPACITY
 from keyss.methods.learned.attacks import known_remaps
 from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _psnr, _scenes
@@ -67,3 +71,20 @@ def test_carrying_adds_no_transparent_gaussians() -> None:
     cover, secret = random_gaussians(1500, seed=0), random_gaussians(200, seed=2)
     carried = keyss.hide(cover, [keyss.Secret(secret, "a key")], method="carry").stego
     assert (_without_a_key(carried).opacities < 1 / 255).all()
+
+
+@pytest.mark.parametrize("sidecar", [False, True])
+def test_the_order_of_the_rows_says_nothing(pair: tuple[list[Scene], list[Gaussians]], sidecar: bool) -> None:
+    """Neither which Gaussians are the secret's, nor their order in its plain model."""
+    scenes, models = pair
+    config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=2, max_gaussians=2000))
+    stego = hide_scenes(scenes, ["a key"], config, plains=models, sidecar=sidecar).stego
+    transparent = (stego.opacities < DRAWN_OPACITY).numpy()
+    assert 100 < transparent.sum() < 300
+    rows = np.arange(len(stego))
+    assert mannwhitneyu(rows[transparent], rows[~transparent]).pvalue > 1e-3
+    # Training hardly changes harmonics in two steps: each hidden Gaussian knows its own in the plain model.
+    hidden = stego.sh[torch.from_numpy(transparent)].flatten(1)
+    own = torch.cdist(hidden, models[1].sh.flatten(1)).argmin(1).numpy()
+    assert len(set(own)) > 50
+    assert spearmanr(np.arange(len(own)), own).pvalue > 1e-3

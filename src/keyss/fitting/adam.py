@@ -50,7 +50,7 @@ def _adam(
         for i in range(len(p)):
             m[i] += mean_share * (g[i] - m[i])
             v[i] += square_share * (g[i] * g[i] - v[i])
-            # Rounded once, as CUDA's Adam does it: were the step rounded before it is subtracted, numbers that
+            # Rounded once, as in CUDA's Adam. Were the step rounded before it is subtracted, numbers that
             # end near zero would keep trailing zeros, and models from here would be known by them.
             quotient = m[i] / (np.sqrt(v[i]) * root + eps)
             p[i] = fused_multiply_add(-steps[i], quotient, p[i])

@@ -117,7 +117,7 @@ def sidecar_beside(stego: Path) -> Path | None:
     """The sidecar beside a model's file, if there is one."""
     if is_standard(stego):
         return None
-    path = stego.with_name(Path(SIDECAR).name)
+    path = stego.parent / Path(SIDECAR).name
     return path if path.exists() else None
 
 

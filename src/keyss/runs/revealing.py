@@ -77,7 +77,7 @@ def reveal_model(
 def _open_beside(
     stego: Gaussians, key: str, beside: Path, *, decoy: bool, force: bool
 ) -> tuple[Opened, str | None]:
-    """What the key opens in the sidecar, or else in the low bits; and why the sidecar was passed over.
+    """What the key decrypts in the sidecar, or else in the low bits; and why the sidecar was passed over.
 
     With `decoy` both are looked at whatever the first one gives, so that every key makes the same work.
     """

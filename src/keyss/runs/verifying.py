@@ -35,7 +35,7 @@ class ModelCheck:
 
 @dataclass(frozen=True)
 class SecretCheck:
-    """What a key opens in a model, or in its sidecar."""
+    """The secret of a key, in a model or in its sidecar."""
 
     where: str  # "low bits" or "sidecar"
     found: int  # Gaussians

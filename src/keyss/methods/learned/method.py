@@ -30,7 +30,7 @@ from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.keys.derivation import SALT_BYTES, expand
+from keyss.keys.derivation import SALT_BYTES, expand, stream
 from keyss.methods.base import Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.dither import cost, dither, raised, sampled
 from keyss.methods.learned.attacks import known_remaps
@@ -140,31 +140,10 @@ class LearnedMethod:
             evaluate_every=options.fit.evaluate_every,
             reporter=context.reporter,
         )
-        stego = run.gaussians().to("cpu")
-        decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
-        if run.warm:
-            stego = stego[run.drawn().cpu()]
-        rank_shifts: list[RankShift | None] = [None] * len(keys)
-        # A sidecar is for files that will be rounded, and no keyed rank shift survives rounding.
-        if run.warm and not options.sidecar:
-            for index, (key, decoder) in enumerate(zip(derived, decoders, strict=True)):
-                if options.decoder == "remap":  # a network would see the difference
-                    stego = match_quaternion_lengths(stego, decoder.band.outer)
-                shift = RankShift.of(stego, key.expand("rank-shift", KEY_BYTES), decoder.band.outer)
-                stego, rank_shifts[index] = shift.encrypt(stego), shift
-        anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.seed))
-        transparent = stego[stego.opacities < DRAWN_OPACITY]
-        faint = None
-        if options.sidecar and len(transparent):
-            columns = [transparent.means, transparent.opacity_logits[:, None], transparent.sh[:, 0]]
-            faint = torch.cat(columns, dim=1)
-        packed = []
-        for decoder, frame, rank_shift in zip(decoders, frames[1:], rank_shifts, strict=True):
-            secret = HiddenSecret(decoder, frame, anchors, rank_shift, faint)
-            drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
-            packed.append(pack_secret(replace(secret, count=int(drawn.sum()))))
+        discarded = _discarded(run, derived)
+        stego, packed = _as_published(run, derived, frames[1:], options, discarded)
         payloads = [(key, Payload(NAME, data)) for key, data in zip(keys, packed, strict=True)]
-        sidecar, discarded = None, _discarded(run, derived)
+        sidecar = None
         details: dict[str, Any] = {}
         if any(source.model.sh_degree > options.fit.sh_degree for source in sources):
             details["psnr_of_fewer_harmonics"] = [
@@ -191,6 +170,46 @@ class LearnedMethod:
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """The opacity remaps of a warm start are in the source; nothing else is known without a key."""
         return known_remaps(stego, secrets)
+
+
+def _as_published(
+    run: JointRun,
+    keys: Sequence[DerivedKey],
+    frames: Sequence[Similarity],  # of the secrets
+    options: LearnedOptions,
+    discarded: bytes,
+) -> tuple[Gaussians, list[bytes]]:
+    """The trained model without what training left in it, its secrets encrypted; and their payloads.
+
+    Training has the cover's Gaussians first and the secrets' after them, in the order of their plain models:
+    published are all of them in a random order.
+    """
+    stego = run.gaussians().to("cpu")
+    decoders = [decoder.to("cpu").requires_grad_(False) for decoder in run.decoders]
+    if run.warm:
+        stego = stego[run.drawn().cpu()]
+    numbers = np.frombuffer(stream(discarded, "order", 8 * len(stego)), "<u8")
+    stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
+    rank_shifts: list[RankShift | None] = [None] * len(keys)
+    # A sidecar is for files that will be rounded, and no keyed rank shift survives rounding.
+    if run.warm and not options.sidecar:
+        for index, (key, decoder) in enumerate(zip(keys, decoders, strict=True)):
+            if options.decoder == "remap":  # a network would see the difference
+                stego = match_quaternion_lengths(stego, decoder.band.outer)
+            shift = RankShift.of(stego, key.expand("rank-shift", KEY_BYTES), decoder.band.outer)
+            stego, rank_shifts[index] = shift.encrypt(stego), shift
+    anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.seed))
+    transparent = stego[stego.opacities < DRAWN_OPACITY]
+    faint = None
+    if options.sidecar and len(transparent):
+        columns = [transparent.means, transparent.opacity_logits[:, None], transparent.sh[:, 0]]
+        faint = torch.cat(columns, dim=1)
+    packed = []
+    for decoder, frame, rank_shift in zip(decoders, frames, rank_shifts, strict=True):
+        secret = HiddenSecret(decoder, frame, anchors, rank_shift, faint)
+        drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
+        packed.append(pack_secret(replace(secret, count=int(drawn.sum()))))
+    return stego, packed
 
 
 def encoder_of(options: LearnedOptions) -> Callable[[str], Tensor] | None:

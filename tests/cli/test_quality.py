@@ -1,0 +1,88 @@
+"""What comes out too bad is not published, and nothing that was trained is lost by that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from channels.low_bits.trained_like import trained_like
+from cli.said import SMALL, Said, assert_refused
+from keyss.files.models import read_model, write_model
+
+
+def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_training(
+    keyss: Callable[..., Said], world: Path, tmp_path: Path
+) -> None:
+    scenes = ["--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt"]
+    hide = ["hide", *scenes, "--sidecar", "-o", tmp_path / "run", *SMALL]
+    said = keyss(*hide, "--min-psnr", 90)
+    assert said.status == 7
+    assert "below 90 dB: nothing was published; --min-psnr sets the limit" in said.err
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
+    said = keyss(*hide, "--min-psnr", 0, "--resume")
+    assert said.status == 0
+    assert "hide: 20 steps, continuing at 20" in said.err
+    assert (tmp_path / "run" / "publish" / "stego.ply").exists()
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> Path:
+    """A cover and a secret as files."""
+    write_model(tmp_path / "cover.ply", trained_like(3000))
+    write_model(tmp_path / "secret.ply", trained_like(1500, 1))
+    (tmp_path / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
+    (tmp_path / "key.txt").chmod(0o600)
+    return tmp_path
+
+
+def _carry(folder: Path, *more: object) -> list[object]:
+    files = [
+        "--cover",
+        folder / "cover.ply",
+        "--secret",
+        folder / "secret.ply",
+        "--key-file",
+        folder / "key.txt",
+    ]
+    return ["hide", "--method", "carry", *files, "--width", 48, "-o", folder / "run", *more]
+
+
+def test_decibels_are_printed_for_models_without_photos(keyss: Callable[..., Said], models: Path) -> None:
+    said = keyss(*_carry(models))
+    assert said.status == 0, said.err
+    line = next(line for line in said.out.splitlines() if line.startswith("Opened again"))
+    assert "cover" in line
+    assert float(line.split("secret ")[1].split()[0]) > 38  # 39.8 was measured, in records of half a cell
+
+
+def test_a_secret_that_comes_back_empty_is_not_published(
+    keyss: Callable[..., Said], models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where empty pictures would be near enough: the limit is far below what they reach."""
+    from keyss.methods.carry.carrying import CarriedSecret
+
+    reveal = CarriedSecret.reveal
+
+    def empty(self: CarriedSecret, *arguments: object, **options: object) -> object:
+        found = reveal(self, *arguments, **options)  # type: ignore[arg-type]
+        return replace(found, opacity_logits=torch.full_like(found.opacity_logits, -20))
+
+    monkeypatch.setattr(CarriedSecret, "reveal", empty)
+    assert_refused(keyss(*_carry(models, "--min-psnr", 1)), 7, "empty pictures")
+    assert not (models / "run").exists()
+
+
+@pytest.mark.parametrize("x", [1e10, 1e30])
+def test_one_outlier_does_no_harm(keyss: Callable[..., Said], models: Path, x: float) -> None:
+    secret = read_model(models / "secret.ply")
+    secret.means[7, 0] = x
+    write_model(models / "secret.ply", secret)
+    said = keyss(*_carry(models))
+    assert said.status == 0, said.err
+    assert (
+        float(said.out.split("against the plain models:")[1].split("secret ")[1].split()[0]) > 38
+    )  # as without
