@@ -19,7 +19,7 @@ from torch import Tensor
 
 from keyss.audit.run import audit as audit
 from keyss.core.errors import KeyssWarning, QualityError, UsageError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import png_bytes
 from keyss.files.models import check_model_output, read_model, write_model
@@ -452,7 +452,11 @@ def _inputs(
                 what = "a source in memory" if isinstance(source, Gaussians) else source
                 raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
             model = source  # type: ignore[assignment]
-        inputs.append(SceneInput(None if model is None else as_model(model), photos))
+        found = None if model is None else as_model(model)
+        if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
+            what = "the secret" if index else "the cover"
+            raise UsageError(f"nothing of {what}'s model can be seen: all of its Gaussians are transparent")
+        inputs.append(SceneInput(found, photos))
     return inputs
 
 

@@ -603,7 +603,7 @@ class Monkey:
                 )
             if name in after and not signalled:
                 self.check_mode(call, name, after[name])
-        for name in () if status == -signal.SIGKILL else self.temporary(after):
+        for name in () if signalled else self.temporary(after):
             must(name in before, f"left behind: {name}")
 
     def temporary(self, files: dict[str, State]) -> list[str]:

@@ -86,3 +86,12 @@ def test_one_outlier_does_no_harm(keyss: Callable[..., Said], models: Path, x: f
     assert (
         float(said.out.split("against the plain models:")[1].split("secret ")[1].split()[0]) > 38
     )  # as without
+
+
+@pytest.mark.parametrize(("which", "who"), [("cover.ply", "the cover"), ("secret.ply", "the secret")])
+def test_what_cannot_be_seen_is_not_hidden(
+    keyss: Callable[..., Said], models: Path, which: str, who: str
+) -> None:
+    model = read_model(models / which)
+    write_model(models / which, replace(model, opacity_logits=torch.full_like(model.opacity_logits, -9)))
+    assert_refused(keyss(*_carry(models)), 2, f"nothing of {who}'s model can be seen")
