@@ -79,6 +79,10 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     assert len(checkpoints) >= 3
     assert not any(_spelt(path.read_bytes()) for path in checkpoints)
 
+    (folder / "other.txt").write_text("another-key-for-7Qx2\n")
+    other = ["--key-file", str(folder / "other.txt")]
+    assert main(["hide", *scenes, *other, *size, "--resume"]) == 5
+    assert "other arguments (keys: not the same)" in capsys.readouterr().err
     assert main(["hide", *scenes, *key, *size, "--resume"]) == 0
     stego = str(run / "publish" / "stego.ply")
     assert main(["reveal", stego, *key, "-o", str(folder / "secret.ply")]) == 0

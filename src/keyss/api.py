@@ -5,6 +5,7 @@ Each takes paths or what they hold, and writes files only where `out` is given.
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -29,6 +30,7 @@ from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, measure_hiding, render_fidelity
 from keyss.measure.images import renders_of
 from keyss.methods import registry
@@ -43,7 +45,7 @@ from keyss.runs.folder import RunFolder, check_not_published, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
 from keyss.runs.planning import Plan, check_disk, plan_hiding
-from keyss.runs.records import write_record
+from keyss.runs.records import record_bytes, write_record
 from keyss.runs.revealing import RevealResult, reveal_model
 from keyss.runs.verifying import Verification, check_model, check_secret
 
@@ -183,6 +185,7 @@ def hide(
     folder = None
     if out is not None:
         told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
+        told["keys"] = _key_checks(keys, settings)
         folder = RunFolder(
             out,
             "hide",
@@ -470,6 +473,13 @@ def _check_keys(keys: Sequence[str]) -> None:
                 f"secrets {i} and {j} have the same key, which can open one of them only: give each its own "
                 "(`keyss keygen` makes one)"
             )
+
+
+def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
+    """By what a resumed run knows its keys: to guess one from it takes as long as from what is published."""
+    salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
+    derivation = KeyDerivation(salt=salt)
+    return [DerivedKey(key, derivation).verifier().hex() for key in keys]
 
 
 def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:

@@ -27,6 +27,8 @@ PUBLISH, PRIVATE = "publish", "private"
 MANIFEST = f"{PRIVATE}/manifest.json"
 _LOCK, _CHECKPOINTS, _STAGING = (f"{PRIVATE}/{name}" for name in ("lock", "checkpoint", "unfinished"))
 
+_LONGEST_SHOWN = 60  # characters of an argument in a message
+
 
 @dataclass(frozen=True, kw_only=True)
 class Running:
@@ -349,7 +351,8 @@ def _differences(old: Any, new: Any) -> str:
     if isinstance(old, dict) and isinstance(new, dict):
         names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
         return ", ".join(f"{name} {_differences(old.get(name), new.get(name))}" for name in names)
-    return f"{_shown(old)} then, {_shown(new)} now"
+    shown = _shown(old), _shown(new)
+    return "not the same" if max(map(len, shown)) > _LONGEST_SHOWN else f"{shown[0]} then, {shown[1]} now"
 
 
 def _shown(value: Any) -> str:

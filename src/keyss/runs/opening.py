@@ -26,7 +26,7 @@ from keyss.runs.records import read_record
 MOST_SIDECAR_BYTES = 1 << 30
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
-    "(converted or quantised, moved, scaled, edited or trained on); its sidecar "
+    "(converted or quantised, moved, scaled, pruned, edited or trained on); its sidecar "
     f"({Path(SIDECAR).name}) may be missing or another one; or nothing is hidden here"
 )
 

@@ -330,7 +330,7 @@ def test_too_large_a_secret_is_refused_with_the_number_that_fits(cover: Gaussian
     fits = 2 * (prepared.carriers - header)
     too_large, small = trained_like(8000, 5), trained_like(500, 6)
     assert prepared.record_capacity([record_request(8000, 3)]) == fits
-    with pytest.raises(UsageError, match=rf"8,000 records are too many.*{fits:,} records would fit"):
+    with pytest.raises(UsageError, match=rf"8,000 Gaussians are too many.*{fits:,} would fit"):
         encode_all(prepared, [too_large])
     assert subsampled_counts(prepared, [too_large]) == [fits]
     assert encode_all(prepared, [too_large[:fits]])[0].plan.cells_per_carrier == 2

@@ -91,7 +91,7 @@ def test_too_large_secrets_are_refused_or_pruned(
     hide = (*hide, "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out")
     assert status == 2
-    assert "4,414 records would fit; --prune-to-fit" in err
+    assert "4,414 would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
     assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())

@@ -78,9 +78,9 @@ def plan_records(requests: Sequence[RecordRequest], carriers: int, sh_degree: in
             if _fit(plans, requests, carriers, sh_degree):
                 return plans
     raise UsageError(
-        f"{sum(request.count for request in requests):,} records are too many for this cover: "
+        f"{sum(request.count for request in requests):,} Gaussians are too many for this cover: "
         f"{carriers:,} of its Gaussians can carry something, and "
-        f"{record_capacity(requests, carriers, sh_degree):,} records would fit"
+        f"{record_capacity(requests, carriers, sh_degree):,} would fit"
     )
 
 
