@@ -17,7 +17,7 @@ from keyss.cli import main
 from keyss.cli.characters import REPLACING
 from keyss.files.ply import read_ply
 
-NARROW = ["ascii", "cp1252", "latin-1", "cp437"]
+NARROW = ["ascii", "cp1252", *(pytest.param(name, marks=pytest.mark.slow) for name in ("latin-1", "cp437"))]
 
 
 def shell(redirection: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[bytes]:

@@ -96,7 +96,12 @@ main()
 """
 
 
-@pytest.mark.parametrize("module", ["keyss.cli.entry", "tyro", "torch._C", "torch.nn", "numba.core.types"])
+_ALSO = ("keyss.cli.entry", "tyro", "torch.nn", "numba.core.types")
+
+
+@pytest.mark.parametrize(
+    "module", ["torch._C", *(pytest.param(name, marks=pytest.mark.slow) for name in _ALSO)]
+)
 def test_ctrl_c_in_the_middle_of_an_import(world: Path, module: str) -> None:
     """Where it comes up as an exception, torch is loaded half, and crashes when it is loaded again."""
     stego = next((world / "hidden").rglob("stego.ply"))
