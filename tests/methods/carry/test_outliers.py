@@ -97,7 +97,8 @@ def test_no_share_of_hostile_values_spoils_the_bulk(
             (getattr(each, name) - getattr(model, name))[usual].double().square().mean().sqrt()
             for each in (alone, found)
         )
-        assert float(now) <= 3 * float(own) + 1e-6, name
+        # Values up to 4 times the 95 % quantile are no outliers, and may stretch the line so much.
+        assert float(now) <= 4 * float(own) + 1e-6, name
 
 
 def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:
