@@ -111,3 +111,13 @@ def test_sh_degree_rises_within_a_run_of_any_length() -> None:
 def test_settings_out_of_range_are_refused_by_name(changes: dict[str, int]) -> None:
     with pytest.raises(UsageError, match=next(iter(changes))):
         FitConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_nothing_is_left_below_the_limit_of_pruning() -> None:
+    config = replace(CONFIG, iterations=60, grow_start=0.1, grow_stop=0.2, prune_opacity=0.08)
+    fitted = fit_scene(tiny_scene(), config).gaussians
+    run = PlainRun(tiny_scene(), config, torch.device("cpu"))
+    torch.manual_seed(config.seed)
+    while run.iteration < config.iterations:
+        run.step()
+    assert float(run.gaussians().opacities.min()) < 0.08 <= float(fitted.opacities.min())

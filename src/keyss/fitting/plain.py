@@ -123,4 +123,14 @@ def fit_scene(
         evaluate_every=config.evaluate_every,
         reporter=reporter,
     )
-    return FitResult(run.gaussians().to("cpu"), replace(config), seconds)
+    return FitResult(_pruned(run.gaussians().to("cpu"), config.prune_opacity), replace(config), seconds)
+
+
+def _pruned(model: Gaussians, least: float) -> Gaussians:
+    """`model` without what fell below the limit of pruning after density control had stopped.
+
+    Files of the original trainer have nothing there either, and what hides something must not be known by
+    having nothing.
+    """
+    kept = model.opacities >= least
+    return model[kept] if kept.any() else model
