@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 
 from keyss.channels.low_bits import LOW_BITS
-from keyss.channels.low_bits.bits import usable_carriers
 from keyss.channels.low_bits.layout import record_capacity
 from keyss.channels.low_bits.spread import TYPICAL_SHARE, check_payload_fits
+from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
