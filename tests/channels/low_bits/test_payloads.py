@@ -296,7 +296,7 @@ def test_capacity_grows_with_the_model_and_its_plan_is_kept_to() -> None:
     assert sizes[-1] / 200_000 > 18
     assert payload_capacity(20_000, 2) == payload_capacity(20_000, 1) > 1.9 * payload_capacity(20_000, 3)
     for size in (4096, 131_072):
-        need = carriers_for(size, 1, 3)
+        need = carriers_for(size, 1, 75)
         assert payload_capacity(need) >= size > payload_capacity(need - 1)
         assert plan_spread(need, 2, 75, size) is not None
         assert plan_spread(need - 1, 2, 75, size) is None

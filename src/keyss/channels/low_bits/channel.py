@@ -13,8 +13,8 @@ every Gaussian's cell and keeping those whose tag fits.
 
 Which carrier gets what is drawn at random (see `layout`), and every usable one gets new low bits, noise if
 nothing else: cells of other secrets and of none look alike. All randomness comes from `entropy`, which nobody
-else may know: if it followed from the cover and one secret, the holder of that secret's key could compute what
-the file would be without the others. No key stream is used twice: data keys depend on entropy and on all
+else may know: if it followed from the cover and one secret, the holder of that secret's key could compute
+what the file would be without the others. No key stream is used twice: data keys depend on entropy and on all
 contents, and the key stream of a cell on the data in it (see `cells`).
 """
 
@@ -99,7 +99,7 @@ class LowBitsCover:
             raise ValueError("expected payloads or records in one model, got both")
         fresh, salts = self._salts(entropy)
         room, names = self._room, self._names[self._rows]
-        writer = Writer(names, room.width, self.cover.sh_degree, entropy, salts)
+        writer = Writer(names, room.width, entropy, salts)
         if payloads:
             writer.payloads(payloads, len(self.cover))
         else:

@@ -1,18 +1,18 @@
 """How far the low bits of small numbers can be predicted, measured on the model itself.
 
-An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that they
-came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than that
-step. Steps are about exponentially distributed, for Adam bounds them: with the scale 2^s of a group of fields,
-a number of binary exponent e has at least z zeros forced upon it with the probability
+An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that
+they came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than
+that step. Steps are about exponentially distributed, for Adam bounds them: with the scale 2^(s + 1) of a group
+of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
 
     F(z) = exp(-2^(e + z - 1 - s)), z >= 1
 
-Beside it the last bit alone is forced to zero with the probability min(1, t 2^-e), by rounding to even.
-Bits above those forced are uniform. Hence the number of trailing zeros tells all that there is to be told, and
-for an odd number there is nothing. Both were measured on models that were trained with either rounding.
+Beside it the last bit alone is forced to zero with the probability min(1, t 2^-e), by rounding to even. Bits
+above those forced are uniform. Hence the number of trailing zeros tells all that there is to be told, and for
+an odd number there is nothing. Both were measured on models that were trained with either rounding.
 
-From the counts of trailing zeros a confidence limit of s follows, and from it what can be known of bits that
-embedding replaces by somebody who knows the trainer, and sees the bit that is never replaced: the chi-square
+From the counts of trailing zeros a confidence limit of s follows. From it follows what somebody knows of the
+bits that embedding replaces who knows the trainer, and sees the bit that is never replaced: the chi-square
 distance of what they were from uniform bits. The least exponent that is used bounds it.
 """
 

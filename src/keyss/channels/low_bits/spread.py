@@ -114,22 +114,22 @@ def parts_alone(carriers: int, width: int, size: int) -> int:
     return 4 if plan_spread(carriers, 4, width, size) is not None else 2
 
 
-def payload_capacity(carriers: int, secrets: int = 1, sh_degree: int = 3) -> int:
-    """Bytes of encrypted payload for each of `secrets` in a model with so many carriers; may be 0."""
-    smallest = plan_spread(carriers, shares(secrets), bytes_per_gaussian(sh_degree), 1)
+def payload_capacity(carriers: int, secrets: int = 1, width: int = 75) -> int:
+    """Bytes of encrypted payload for each of `secrets` in so many carriers of `width` bytes; may be 0."""
+    smallest = plan_spread(carriers, shares(secrets), width, 1)
     if smallest is None:
         return 0
     return smallest.blocks * _most_data(smallest.n, smallest.blocks) * smallest.chunk
 
 
-def carriers_for(size: int, secrets: int, sh_degree: int) -> int:
-    """The least number of carriers in which `size` bytes for each of `secrets` fit. `sh_degree`: 1 to 3."""
-    if chunk_bytes(bytes_per_gaussian(sh_degree)) == 0:
-        raise ValueError(f"no number of carriers will do for SH degree {sh_degree}")
+def carriers_for(size: int, secrets: int, width: int) -> int:
+    """The least number of carriers in which `size` bytes for each of `secrets` fit."""
+    if chunk_bytes(width) == 0:
+        raise ValueError(f"no number of carriers of {width} bytes will do")
     enough = 1 << 10
-    while payload_capacity(enough, secrets, sh_degree) < size:
+    while payload_capacity(enough, secrets, width) < size:
         enough *= 2
-    return bisect_left(range(enough), size, key=lambda each: payload_capacity(each, secrets, sh_degree))
+    return bisect_left(range(enough), size, key=lambda each: payload_capacity(each, secrets, width))
 
 
 def check_payload_fits(
@@ -140,15 +140,19 @@ def check_payload_fits(
     `usable`: the share of its Gaussians whose low bits will be random.
     """
     size = encrypted_size(compressed)
-    if payload_capacity(int(gaussians * usable), secrets, sh_degree) < size:
-        raise UsageError(too_small(gaussians, usable, size, secrets, sh_degree))
+    width = bytes_per_gaussian(sh_degree)
+    if payload_capacity(int(gaussians * usable), secrets, width) < size:
+        raise UsageError(too_small(gaussians, usable, size, secrets, width))
 
 
-def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree: int) -> str:
+def too_small(gaussians: int, usable: float, size: int, secrets: int, width: int) -> str:
     """What to tell the owner of a model of which a share `usable` can be used."""
-    if chunk_bytes(bytes_per_gaussian(sh_degree)) == 0:
-        return "a model of SH degree 0 has no room for anything in its low bits"
-    need = carriers_for(size, secrets, sh_degree) / max(usable, 0.01)
+    if chunk_bytes(width) == 0:
+        return (
+            f"a model whose Gaussians hold {width} bytes has no room for anything in its low bits: there are "
+            "8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
+        )
+    need = carriers_for(size, secrets, width) / max(usable, 0.01)
     digits = max(0, len(str(int(need))) - 2)
     rounded = math.ceil(need / 10**digits) * 10**digits
     each = "" if secrets == 1 else f" for each of {secrets} secrets"

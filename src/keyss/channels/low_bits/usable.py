@@ -5,9 +5,10 @@ not all of them. A Gaussian is left alone, as a whole, so that none contradicts 
 
 - *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
   occur too often (after a few steps of training many are the same small multiple of the learning rate).
-- *Coincidences*: numbers that agree in all bits above the written ones would agree in nothing else afterwards.
-  These are near-equal components (grey colours, round Gaussians), Gaussians that share whole triples of
-  numbers (clones that training hardly moved apart), unit quaternions, and Gaussians that occur twice.
+- *Coincidences*: numbers that agree in all bits above the written ones would agree in nothing else
+  afterwards. These are near-equal components (grey colours, round Gaussians), Gaussians that share whole
+  triples of numbers (clones that training hardly moved apart), unit quaternions, and Gaussians that occur
+  twice.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
 
 Coincidences are found in what embedding leaves as it is. A Gaussian whose bits are random must hardly ever be

@@ -1,4 +1,4 @@
-"""Filling the carriers of a cover, which come in random order: headers, contents, and noise in all the rest."""
+"""Filling the carriers of a cover, in random order: headers, contents, and noise in all the rest."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Writer:
     `entropy`: 32 bytes that nobody else knows. `salts`: of the model, which keys are derived with.
     """
 
-    def __init__(self, names: Bytes, width: int, sh_degree: int, entropy: bytes, salts: list[bytes]) -> None:
-        self._degree, self._entropy = sh_degree, entropy
+    def __init__(self, names: Bytes, width: int, entropy: bytes, salts: list[bytes]) -> None:
+        self._entropy = entropy
         self._salts = bytes(each[0] for each in salts).ljust(SALTS, b"\0")
         self._room = Room(len(names), width)
         self.order = self._shuffled("order", len(names))  # [C] carriers; what follows is in this order
@@ -59,7 +59,7 @@ class Writer:
             if plan is None:
                 usable = carriers / gaussians
                 raise UsageError(
-                    spread.too_small(gaussians, usable, sizes[index], len(contents), self._degree)
+                    spread.too_small(gaussians, usable, sizes[index], len(contents), width)
                 )
             self._next, end = start, start + carriers // parts[index]
             data_key = self._data_key(index)
