@@ -42,7 +42,7 @@ class LearnedMethod:
     """See `keyss.methods.base.Method`."""
 
     name = NAME
-    summary = "train one model that shows both"
+    summary = "train cover and secrets together, then carry the secrets"
     trains = True
     most_secrets = 9
     options = LearnedOptions
