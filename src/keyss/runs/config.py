@@ -63,6 +63,8 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
         raise InputError(f"{path}: method {name!r} is not known; this program has {known}")
     generic: Any = RunConfig
     config: RunConfig[MethodOptions] = read_record(path, generic[registry.METHODS[name].options])
+    if config.options.fit.seed is None:
+        raise InputError(f"{path}: expected the seed of the run, got none")
     return config
 
 

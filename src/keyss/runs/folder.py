@@ -291,6 +291,15 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
+def recorded_seed(folder: Path, *names: str) -> int | None:
+    """The seed of the interrupted run in a folder, which is this argument of it; None where there is none."""
+    running = read_manifest(folder).running
+    found: Any = running and running.arguments
+    for name in names:
+        found = found.get(name) if isinstance(found, dict) else None
+    return found if isinstance(found, int) else None
+
+
 def _drop_unfinished(folder: Path, there: Manifest) -> None:
     """Remove the traces of a run that `there` knows to be unfinished.
 

@@ -259,7 +259,7 @@ def _neighbourhood(values: Floats, kind: _Kind) -> tuple[float, float]:
     """The ends of what is not far outside of the bulk of `values`.
 
     Quantiles tell how far the bulk reaches. Fewer than `_TAIL` of the values, whatever they are, cannot move
-    these beyond the others. So they can make a line that is divided evenly at most 2.5 times (the bulk and two
+    these beyond the others. So they make a line that is divided evenly at most 2.5 times (the bulk and two
     margins) as long as the others alone need, and each number as much less precise.
     """
     if kind.even:
