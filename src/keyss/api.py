@@ -39,7 +39,7 @@ from keyss.methods.plain_models import plain_models
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.report.page import write_report as write_report
-from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
+from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of, secret_ids
 from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names, writers
 from keyss.runs.folder import RunFolder, check_not_published, recorded_seed, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
@@ -224,7 +224,7 @@ def hide(
         photos = tuple(each.photos for each in inputs)
         metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
         if folder:
-            payloads = tuple(each.fingerprint() for each in stego.opened)
+            payloads = secret_ids(options.fit.known_seed, stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
