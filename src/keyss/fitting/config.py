@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from keyss.core.errors import UsageError
 
-MOST_SEED = 2**63 - 1
+MOST_SEED = 2**48 - 1  # every reader of JSON takes it as it is
 
 
 @dataclass(frozen=True, kw_only=True)
