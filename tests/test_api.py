@@ -26,7 +26,7 @@ from keyss.runs.files import STEGO
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = LearnedOptions(
-    fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
+    fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
 )
 SIDECAR = replace(CONFIG, sidecar=True)
 
@@ -290,10 +290,10 @@ def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: 
 
 
 def test_given_models_without_room_are_refused_before_any_work(folders: tuple[Path, Path]) -> None:
-    """However large the cap: a warm start adds no Gaussians to those that it is given."""
-    models = [random_gaussians(300, seed=seed) for seed in (0, 1)]
+    """However large the cap: a warm start adds no Gaussians to the cover that it is given."""
+    models = [random_gaussians(200, seed=seed) for seed in (0, 1)]
     secret = Secret(folders[1], "key", models[1])
-    with pytest.raises(UsageError, match=r"600 Gaussians is too small.*`sidecar=True`"):
+    with pytest.raises(UsageError, match=r"cover of 200 Gaussians is too small.*`sidecar=True`"):
         keyss.hide(folders[0], [secret], cover_model=models[0])
 
 
@@ -303,9 +303,10 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
     for index, count in enumerate((1500, 700)):
         keyss.write_model(tmp_path / f"{index}.ply", random_gaussians(count, seed=index))
     cover, secret = (tmp_path / f"{index}.ply" for index in (0, 1))
-    python = LearnedOptions(sidecar=True).with_fit(iterations=2)
+    python = LearnedOptions(sidecar=True).with_fit(iterations=2, seed=0)
     keyss.hide(cover, [Secret(secret, "the key")], method=python, width=24, out=tmp_path / "python")
     arguments = ["--cover", str(cover), "--secret", str(secret), "--width", "24", "--iterations", "2"]
+    arguments += ["--seed", "0"]
     assert main(["hide", "--sidecar", *arguments, "-o", str(tmp_path / "line")]) == 0
     for name in ("private/config.json", "publish/stego.ply", "publish/decoder.sealed"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
