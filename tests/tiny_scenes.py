@@ -37,12 +37,18 @@ def random_gaussians(count: int = 200, seed: int = 0, sh_degree: int = 3) -> Gau
     k = (sh_degree + 1) ** 2
     sh = 0.05 * torch.randn(count, k, 3, generator=generator)
     sh[:, 0] = (torch.rand(count, 3, generator=generator) - 0.5) / SH_C0
-    return Gaussians(
+    model = Gaussians(
         means=0.5 * torch.randn(count, 3, generator=generator),
         quats=torch.randn(count, 4, generator=generator),
         log_scales=math.log(0.12) + 0.3 * torch.randn(count, 3, generator=generator),
         opacity_logits=1 + torch.randn(count, generator=generator),
         sh=sh,
+    )
+    # Multiples of numbers of single precision have low bits that depend on each other; trained ones have not.
+    return model.map(
+        lambda values: (
+            values * (1 + 1e-6 * torch.randn(values.shape, generator=generator, dtype=torch.float64))
+        ).float()
     )
 
 

@@ -15,12 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.low_bits.usable import is_uniform
+from keyss.channels.low_bits.usable import chance_of_bits, is_uniform
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 from keyss.rendering import render
 from keyss.rendering.orbit import orbit
 
+_BITS, _CHANCE = 9, 1e-6  # low bits that depend on each other are not random
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
 _SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
@@ -68,8 +69,10 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     if count <= 0:
         return model
     seed = int.from_bytes(stream(entropy, "dither/raised", 8), "little") >> 1
-    noise = torch.randn(len(model), count // 3, 3, generator=torch.Generator().manual_seed(seed))
-    return replace(model, sh=torch.cat([model.sh, _FAINT * noise.to(model.sh)], dim=1))
+    generator = torch.Generator().manual_seed(seed)
+    # Scaled before they are rounded: a product of single precision keeps a trace of its factor.
+    noise = _FAINT * torch.randn(len(model), count // 3, 3, generator=generator, dtype=torch.float64)
+    return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
 
 
 def cost(before: Gaussians, after: Gaussians) -> float:
@@ -85,7 +88,10 @@ def cost(before: Gaussians, after: Gaussians) -> float:
 
 
 def _is_natural(values: Floats) -> bool:
-    return len(np.unique(values)) > _FEW * len(values) and is_uniform(values)
+    if len(np.unique(values)) <= _FEW * len(values) or not is_uniform(values):
+        return False
+    words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
+    return chance_of_bits(words, _BITS) > _CHANCE
 
 
 def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:

@@ -121,4 +121,4 @@ def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
     assert {each.category for each in caught} == {KeyssWarning}
     assert _least_chance(alone, beside) < 1e-10
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
-        _seen(_payloads([25_000, 25_000, 5000]))
+        _seen(_payloads([1000] * 5))

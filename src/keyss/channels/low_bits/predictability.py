@@ -2,8 +2,8 @@
 
 An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that
 they came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than
-that step. Steps are about exponentially distributed, for Adam bounds them: with the scale 2^(s + 1) of a group
-of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
+that step. Steps are about exponentially distributed, for Adam bounds them: with the scale 2^(s + 1) of a
+group of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
 
     F(z) = exp(-2^(e + z - 1 - s)), z >= 1
 
