@@ -58,9 +58,7 @@ class Writer:
             plan = spread.plan_spread(carriers, parts[index], width, sizes[index])
             if plan is None:
                 usable = carriers / gaussians
-                raise UsageError(
-                    spread.too_small(gaussians, usable, sizes[index], len(contents), width)
-                )
+                raise UsageError(spread.too_small(gaussians, usable, sizes[index], len(contents), width))
             self._next, end = start, start + carriers // parts[index]
             data_key = self._data_key(index)
             packed = PayloadParameters(content.method, self._salts, sizes[index], plan).pack()
