@@ -95,6 +95,16 @@ class Room:
         cells = [each for each in range(1, MOST_CELLS + 1) if self.record_bytes(each) >= least]
         return max(0, left) * max(cells, default=0)
 
+    def unnoticed_records(self, least_bytes: int, secrets: int) -> int:
+        """Records that each of so many secrets may have so that all lie as each would alone; 0 if none may.
+
+        `least_bytes`: of a record.
+        """
+        cells = [each for each in range(1, MOST_CELLS + 1) if self.record_bytes(each) >= least_bytes]
+        if not cells or secrets > UNNOTICED or self._set_aside > _MOST_SET_ASIDE * self.carriers:
+            return 0
+        return cells[-1] * (self.carriers - self._set_aside) // (1 << (secrets - 1).bit_length())
+
     def arrangement(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> Arrangement:
         """How records so planned are placed."""
         as_alone = [self._alone(request) for request in requests] == list(plans)
