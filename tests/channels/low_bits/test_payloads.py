@@ -24,7 +24,7 @@ from keyss.channels.low_bits.spread import carriers_for, check_payload_fits, pay
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey, generate_key
-from keyss.keys.derivation import ALPHABET
+from keyss.keys.generation import ALPHABET
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 
