@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.low_bits.bits import is_uniform
+from keyss.channels.low_bits.usable import is_uniform
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 from keyss.rendering import render
@@ -26,6 +26,7 @@ _SPARSE = 0.1  # share of different values above which a format is finer than th
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
 _VIEWS, _SIZE = 4, 256
 _SAMPLE = 20_000  # Gaussians
+_UNIT = 1e-5  # by which the length of a unit quaternion may differ from 1
 _FAINT = 1e-3  # standard deviation of harmonics that a model does not have
 
 Floats = npt.NDArray[np.float32]
@@ -34,9 +35,11 @@ Floats = npt.NDArray[np.float32]
 def dither(model: Gaussians, entropy: bytes) -> Gaussians:
     """`model` with new low bits where they are not random; positions and constant colours stay.
 
-    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay as they are.
+    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay as they are, and so do
+    quaternions of unit length, which is known exactly: see `keyss.channels.low_bits.bits`.
     """
     changed = {}
+    unit = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs() < _UNIT
     for name in ("log_scales", "quats", "opacity_logits", "sh"):
         values = getattr(model, name).detach().cpu().clone(memory_format=torch.contiguous_format)
         columns = values.view(len(values), -1).numpy()
@@ -45,6 +48,8 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
                 random = stream(entropy, f"dither/{name}/{column}", 8 * len(columns))
                 noise = np.frombuffer(random, "<u8").astype(np.float64) / 2.0**63 - 1
                 columns[:, column] = _dithered(columns[:, column], noise)
+        if name == "quats":
+            values[unit] = model.quats.detach().cpu()[unit]
         changed[name] = values
     return Gaussians(means=model.means, **changed)
 
