@@ -113,6 +113,7 @@ def _opens(one_slot: bytes) -> bool:
     [
         (8, b"\x02", "version 2"),
         (25, b"\x00", "time_cost"),
+        (25, b"\x05", "time_cost"),
         (26, (1 << 31).to_bytes(4, "little"), "memory_kib"),
         (26, (64).to_bytes(4, "little"), "memory_kib"),
         (30, b"\xff", "parallelism"),
