@@ -2,7 +2,7 @@
 
     python tests/vectors/make_vectors.py
 
-`carried.json` and `learned.json` are not written here: what old files revealed, new ones must reveal too.
+`carried.json` is not written here: what old files revealed, new ones must reveal too.
 """
 
 from __future__ import annotations
@@ -24,9 +24,12 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 
 from channels.low_bits.trained_like import trained_like  # noqa: E402
 from keyss.channels.base import Payload  # noqa: E402
+from keyss.channels.low_bits import LOW_BITS  # noqa: E402
 from keyss.channels.sidecar import encrypt_sidecar  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
+from keyss.methods.learned.payload import pack_secret  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
+from methods.learned.hiding import some_secret  # noqa: E402
 
 
 def cell() -> dict[str, object]:
@@ -82,6 +85,11 @@ def main() -> None:
     secret.means[0, 0] = 1e6  # an outlier
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
     write_ply(FOLDER / "carried.ply", stego)
+    cover = trained_like(1600)
+    learned = Payload("learned", pack_secret(some_secret(cover)))
+    stego = LOW_BITS.prepare(cover).embed([(key, learned)], entropy=bytes(32))
+    write_ply(FOLDER / "learned.ply", stego)
+    write_ply(FOLDER / "learned-secret.ply", some_secret(cover).reveal(cover))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey, generate_key
-from keyss.keys.derivation import ALPHABET
+from keyss.keys.generation import ALPHABET
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 
