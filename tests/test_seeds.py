@@ -48,9 +48,9 @@ def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: Meth
     assert not one & two
 
 
-@pytest.mark.parametrize("options", METHODS, ids=["learned", "carry"])
-def test_with_one_seed_they_have_all_in_common(options: MethodOptions) -> None:
-    one, two = (_rotations(_hidden(options.with_fit(seed=7))) for _ in range(2))
+def test_with_one_seed_they_have_all_in_common() -> None:
+    """Of the learned method it is every byte: see `test_the_same_run_gives_the_same_bytes`."""
+    one, two = (_rotations(_hidden(METHODS[1].with_fit(seed=7))) for _ in range(2))
     assert one == two
 
 

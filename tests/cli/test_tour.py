@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from channels.low_bits.trained_like import trained_like
 from cli.said import SMALL, Said
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import run as demo_run
 from keyss.files.ply import write_ply
-from tiny_scenes import random_gaussians
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: None) -> Path:
     write_blender(tmp_path / "a", count=3, channels=3)
     write_nerfstudio(tmp_path / "b", count=4)
     (tmp_path / "own").mkdir()
-    write_ply(tmp_path / "own" / "cover.ply", random_gaussians(400, seed=1))
-    write_ply(tmp_path / "own" / "secret.ply", random_gaussians(100, seed=2))
+    write_ply(tmp_path / "own" / "cover.ply", trained_like(400, 1))
+    write_ply(tmp_path / "own" / "secret.ply", trained_like(100, 2))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
