@@ -1,0 +1,164 @@
+"""How well statistics tell files that hide something from plain ones, learned from other scenes.
+
+A scene's own files are never learned from. Standard errors are bootstrapped over whole models, for parts of
+one are not independent; the largest of many areas under curves is held against the same with labels exchanged
+within pairs, which is what chance makes of so many tries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from keyss.measure.stealth.words import Floats, Ints
+
+_DRAWS = 1000  # of a bootstrap
+_EXCHANGES = 200
+MOST_NAMED = 40  # single detectors
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One detector: area under the ROC curve on scenes that it did not learn from."""
+
+    name: str
+    auc: float
+    error: float  # standard error
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Files, or one part of each; those of one `model` are the same, plain and with something in it."""
+
+    names: tuple[str, ...]  # of statistics
+    values: Floats  # [E, S], NaN where there was too little to count
+    hidden: Ints  # [E] 0 plain, 1 with something in it
+    scene: Ints  # [E]
+    model: Ints  # [E]
+
+    @staticmethod
+    def of(
+        rows: Sequence[Mapping[str, float]],
+        hidden: Sequence[int],
+        scenes: Sequence[str],
+        models: Sequence[str],
+    ) -> Examples:
+        names = tuple(dict.fromkeys(name for row in rows for name in row))
+        values = np.array([[row.get(name, np.nan) for name in names] for row in rows], float)
+        scene, model = (np.unique(each, return_inverse=True)[1] for each in (scenes, models))
+        return Examples(names, values, np.array(hidden), scene, model)
+
+
+def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detection], float]:
+    """Every statistic by itself, the worst first, and what chance makes of the largest area in one of 20 cases.
+
+    Its direction, and what is usual, come from the other scenes.
+    """
+    held_out = _HeldOut.of(examples)
+    areas = held_out.areas(examples.hidden)
+    random = np.random.default_rng(seed)
+    largest = []
+    for _ in range(_EXCHANGES):
+        flip = random.integers(0, 2, examples.model.max() + 1)[examples.model]
+        largest.append(held_out.areas(examples.hidden ^ flip).max())
+    scores = held_out.scores(examples.hidden)
+    found = [
+        Detection(examples.names[index], float(areas[index]), _error(scores[:, index], examples))
+        for index in np.argsort(-areas)[:MOST_NAMED]
+    ]
+    return found, float(np.quantile(largest, 0.95))
+
+
+def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
+    """Logistic regression and boosted trees over all statistics."""
+    from sklearn.ensemble import HistGradientBoostingClassifier
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import QuantileTransformer
+
+    found = []
+    for name in ("logistic", "trees"):
+        scores = np.zeros(len(examples.hidden))
+        for scene in np.unique(examples.scene):
+            held = examples.scene == scene
+            others = examples.values[~held]
+            usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
+            train, test = (
+                np.where(np.isnan(part), usual, part) for part in (others, examples.values[held])
+            )
+            if name == "logistic":
+                # By rank: a few statistics have tails of many standard deviations.
+                spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
+                machine = make_pipeline(spread, LogisticRegression(C=0.005, max_iter=2000))
+            else:
+                machine = HistGradientBoostingClassifier(
+                    max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=seed
+                )
+            scores[held] = machine.fit(train, examples.hidden[~held]).decision_function(test)
+        found.append(Detection(f"{name} over all", auc(scores, examples.hidden), _error(scores, examples)))
+    return found
+
+
+def auc(scores: Floats, hidden: Ints) -> float:
+    """Area under the ROC curve, ties counting half."""
+    ranks = _ranks(scores[:, None])[:, 0]
+    positives = int(hidden.sum())
+    negatives = len(hidden) - positives
+    return float((ranks[hidden == 1].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def _ranks(values: Floats) -> Floats:
+    from scipy.stats import rankdata
+
+    ranks: Floats = rankdata(values, axis=0)
+    return ranks
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """Each scene's statistics as whoever knows the other scenes sees them."""
+
+    centred: Floats  # [E, S] values less the median of the other scenes
+    folds: tuple[tuple[Ints, Ints, Floats], ...]  # of each scene: its examples, the others, ranks of these
+
+    @staticmethod
+    def of(examples: Examples) -> _HeldOut:
+        centred, folds = np.empty_like(examples.values), []
+        for scene in np.unique(examples.scene):
+            held = examples.scene == scene
+            others = examples.values[~held]
+            usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
+            centred[held] = np.nan_to_num(examples.values[held] - usual)
+            ranks = _ranks(np.nan_to_num(others - usual))
+            folds.append((np.flatnonzero(held), np.flatnonzero(~held), ranks))
+        return _HeldOut(centred, tuple(folds))
+
+    def scores(self, hidden: Ints) -> Floats:
+        """[E, S] with the sign that files with something in them have in the other scenes."""
+        signed = np.empty_like(self.centred)
+        for held, others, ranks in self.folds:
+            labels = hidden[others]
+            above = ranks[labels == 1].mean(axis=0) - ranks[labels == 0].mean(axis=0)
+            signed[held] = self.centred[held] * np.where(above >= 0, 1, -1)
+        return signed
+
+    def areas(self, hidden: Ints) -> Floats:
+        """[S] areas of all statistics."""
+        ranks = _ranks(self.scores(hidden))
+        positives = int(hidden.sum())
+        found: Floats = ranks[hidden == 1].sum(axis=0) - positives * (positives + 1) / 2
+        return found / (positives * (len(hidden) - positives))
+
+
+def _error(scores: Floats, examples: Examples, draws: int = _DRAWS) -> float:
+    """Standard error of an area: whole models are drawn again."""
+    random = np.random.default_rng(0)
+    rows = [np.flatnonzero(examples.model == model) for model in np.unique(examples.model)]
+    areas = []
+    for _ in range(draws):
+        drawn = np.concatenate([rows[index] for index in random.integers(len(rows), size=len(rows))])
+        if 0 < examples.hidden[drawn].sum() < len(drawn):
+            areas.append(auc(scores[drawn], examples.hidden[drawn]))
+    return float(np.std(areas))
