@@ -1,13 +1,13 @@
 """How well the attacks of `keyss.measure.stealth` tell files that hide something, on models that you have.
 
-    python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...    # plain models, three scenes or more
+    python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain models of three scenes or more
     python benchmarks/stealth.py ... --learned bonsai=stego.ply:secret.ply  # stego files, secrets' own models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # files made by something else
-    python benchmarks/stealth.py ... --rounded                              # as trainers leave them that round steps
+    python benchmarks/stealth.py ... --rounded   # models as trainers leave them that round steps
 
-From each plain model are made a carried one, which holds as much of a model of the next scene as fits, and one
-with a sealed payload. Statistics are taken of whole models and of parts of 2,000 to 5,000 Gaussians, random ones
-and pieces of space. Detectors learn from all scenes but one and are tried on that one.
+From each plain model are made a carried one, which holds as much of a model of the next scene as fits, and
+one with a sealed payload. Statistics are taken of whole models and of parts of 2,000 to 5,000 Gaussians,
+random ones and pieces of space. Detectors learn from all scenes but one and are tried on that one.
 """
 
 from __future__ import annotations
@@ -122,7 +122,8 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)], options.rounded))
     pairs = [_named(text) for text in options.pairs]
     return jobs + [
-        Job(len(plain) + index, scene, path, "", False, given) for index, (scene, path, given) in enumerate(pairs)
+        Job(len(plain) + index, scene, path, "", False, given)
+        for index, (scene, path, given) in enumerate(pairs)
     ]
 
 
@@ -134,7 +135,10 @@ def _make(job: Job) -> list[File]:
     """The plain model, and what something is hidden in; a model that takes nothing is left out."""
     cover = read_model(job.path)
     if job.given:
-        return [File("plain", job.scene, job.path, cover), File("given", job.scene, job.path, read_model(job.given))]
+        return [
+            File("plain", job.scene, job.path, cover),
+            File("given", job.scene, job.path, read_model(job.given)),
+        ]
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
@@ -180,7 +184,9 @@ def _predicted(
         predictor = BitPredictor.of_samples(others[:: -(-len(others) // MOST_TRAINED_ON)])
         own = [index for index, (file, _, _) in enumerate(pieces) if file.scene == scene]
         judge: Callable[[Gaussians], dict[str, float]] = partial(_judged, predictor)
-        for index, row in zip(own, pool.map(judge, [pieces[each][2] for each in own], chunksize=4), strict=True):
+        for index, row in zip(
+            own, pool.map(judge, [pieces[each][2] for each in own], chunksize=4), strict=True
+        ):
             found[index] = row
     return found
 
@@ -199,7 +205,7 @@ def _judged(predictor: BitPredictor, piece: Gaussians) -> dict[str, float]:
 def _detections(
     files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]], rows: Sequence[dict[str, float]]
 ) -> dict[str, dict[str, Any]]:
-    """By kind and piece: single statistics, the worst first, what chance makes of the worst, and classifiers."""
+    """By kind and piece: the worst statistics, what chance makes of the worst, and classifiers."""
     found = {}
     for kind in dict.fromkeys(file.kind for file in files if file.kind != "plain"):
         for piece in ("whole", "random", "space"):
@@ -208,7 +214,9 @@ def _detections(
                 (file, row)
                 for (file, name, _), row in zip(pieces, rows, strict=True)
                 if name == piece
-                and (file.kind == kind or (file.kind == "plain" and (kind == "learned" or file.pair in paired)))
+                and (
+                    file.kind == kind or (file.kind == "plain" and (kind == "learned" or file.pair in paired))
+                )
             ]
             if len({file.scene for file, _ in own}) < 3 or len({file.kind for file, _ in own}) < 2:
                 continue
@@ -244,6 +252,7 @@ def _confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> dict[str
         found[f"{kind}, {len(own)} files, {len(paths)} candidates"] = {
             name: confirmed(np.array([each[name] for each in scores]).reshape(len(own), len(paths)), true)
             for name in scores[0]
+            if all(name in each for each in scores)
         }
     return found
 
@@ -261,7 +270,10 @@ def _table(
     scenes = {file.scene for file in files}
     plain = sum(file.kind == "plain" for file in files)
     lines = [f"{plain} plain models of {len(scenes)} scenes, {seconds} s", ""]
-    lines += ["| files | detector | AUC | standard error | largest by chance |", "| --- | --- | --- | --- | --- |"]
+    lines += [
+        "| files | detector | AUC | standard error | largest by chance |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for name, each in found.items():
         rows: list[Detection] = [*each["learned"], *each["single"][:SHOWN]]
         for row in rows:

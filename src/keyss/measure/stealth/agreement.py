@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
-from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth
+from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
 from keyss.measure.stealth.words import Bits, Floats, Ints, Words, ulps
 
 _LOW = 13  # bits that may have been replaced
@@ -35,8 +35,8 @@ def agreement(words: Words, positions: Floats) -> dict[str, Statistic]:
             one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
             found |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
     harmless = words.attribute > 0
-    for name, pairs in (("neighbours", _neighbours(positions)), ("sharers", _sharers(words))):
-        one, other = (words.bits[pairs[:, side]][:, harmless].ravel() for side in (0, 1))
+    for name, rows in (("neighbours", _neighbours(positions)), ("sharers", _sharers(words))):
+        one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
         found |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
     return found
 
@@ -48,22 +48,24 @@ def _of_pairs(one: Bits, other: Bits) -> dict[str, Statistic]:
     size = 1 << _LOW
     near = (2 * _CLOSE - 1) * size - _CLOSE * (_CLOSE - 1)  # ordered pairs closer than _CLOSE
     return {
-        "close low bits": excess(int((apart[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2),
+        "close low bits": excess(
+            int((apart[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2
+        ),
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
         "near misses": _misses(apart),
-        "equal": Statistic(float(equal.mean()) if len(equal) else 0.0),
+        "equal": portion(float(equal.sum()), len(equal)),
     }
 
 
 def _misses(apart: Ints) -> Statistic:
-    """Pairs less than _MOVED apart and not equal, beyond what the number of those further apart lets expect."""
+    """Pairs less than _MOVED apart, but not equal, beyond those expected from how many are further apart."""
     inside = int(((apart > 0) & (apart < _MOVED)).sum())
     around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
     return more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart))
 
 
 def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, Bits]]:
-    """Pairs of numbers of one Gaussian: of one coefficient's channels, or of one attribute; signs left out."""
+    """Pairs of numbers of one Gaussian, one coefficient's channels or one attribute; signs left out."""
     for attribute in attributes:
         own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
         if not own.size:

@@ -47,7 +47,9 @@ def _of_values(values: Bits) -> dict[str, Statistic]:
         found[f"ones in bits {name}"] = share(ones, len(values) * (high - low))
     for count in (4, 8):
         zeros = int((values & np.uint32((1 << count) - 1) == 0).sum())
-        found[f"{count} zeros at the end"] = share(zeros, len(values) if len(values) >> count > 5 else 0, 2.0**-count)
+        found[f"{count} zeros at the end"] = share(
+            zeros, len(values) if len(values) >> count > 5 else 0, 2.0**-count
+        )
     even = values & 1 == 0
     clear = values & np.uint32(14) == 0
     found["zeros above a zero"] = _difference(clear[even], clear[~even], 1 / 8)

@@ -1,8 +1,8 @@
 """Is this model the one that is hidden in that file? Scores for whoever has a candidate, but no key.
 
-Every score is higher the more the file looks as if it held the candidate. By themselves they mean nothing, for
-one candidate resembles all files more than another does: what counts is whether the true one scores higher
-than others do, in files as in those that hold something else (`confirmed`).
+Every score is higher the more the file looks as if it held the candidate. By themselves they mean nothing,
+for one candidate resembles all files more than another does: what counts is whether the true one scores
+higher than others do, and higher than in files that hold something else (`confirmed`).
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from keyss.measure.stealth.opacities import UNDRAWN
 from keyss.measure.stealth.words import Floats, Words
 
 MOST = 20_000  # Gaussians of each that are compared
+_QUERIES = 4000  # rows for which the nearest are sought
+_LEAST_ENERGY = -20.0  # logarithm
 _MATCHED = 0.02  # distance of logarithms of energies; of unlike Gaussians hardly one in a thousand is so near
 _LOW = 13  # bits that may have been replaced
 _LEAST = 50
 
 
 def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
-    """By name. Models may differ in size and SH degree; both orders of rows count, so give them as they are."""
+    """By name. Models may differ in size and SH degree; orders of rows count, so give them as they are."""
     degree = min(file.sh_degree, candidate.sh_degree)
     file, candidate = (_thinned(each.with_sh_degree(degree)) for each in (file, candidate))
     parts = _parts(file)
@@ -35,7 +37,9 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
     theirs = _marginals(candidate)
     for name, part in parts.items():
         own = _marginals(part)
-        found[f"marginals, {name}"] = -float(np.mean([ks_2samp(own[key], theirs[key]).statistic for key in own]))
+        found[f"marginals, {name}"] = -float(
+            np.mean([ks_2samp(own[key], theirs[key], method="asymp").statistic for key in own])
+        )
         found[f"extent, {name}"] = -float(np.abs(np.log(_extent(part) / _extent(candidate))).mean())
         found[f"number, {name}"] = -abs(float(np.log(len(part) / len(candidate))))
     return found
@@ -44,15 +48,17 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
 def confirmed(scores: npt.NDArray[np.float64], true: Sequence[int]) -> float:
     """How often the true candidate is ranked above another one, ties counting half; 0.5 is chance.
 
-    `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Each candidate's scores are
-    taken relative to what it has in files that hold something else, and each file's to those of others.
+    `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Each candidate's scores
+    are taken relative to what it has in files that hold something else, and each file's to those of others.
     """
     scores = np.asarray(scores, float)
     own = np.zeros(scores.shape, bool)
     own[np.arange(len(true)), list(true)] = True
     others = np.where(own, np.nan, scores)
     with np.errstate(all="ignore"):
-        relative = scores - np.nanmean(others, axis=0) - (np.nanmean(others, axis=1) - np.nanmean(others))[:, None]
+        relative = (
+            scores - np.nanmean(others, axis=0) - (np.nanmean(others, axis=1) - np.nanmean(others))[:, None]
+        )
     above = []
     for row, index in zip(np.nan_to_num(relative), true, strict=True):
         rest = np.delete(row, index)
@@ -61,7 +67,7 @@ def confirmed(scores: npt.NDArray[np.float64], true: Sequence[int]) -> float:
 
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
-    """Share of the Gaussians that `other` has too, but with other low bits: what a copy of the cover shows."""
+    """Share of the Gaussians that `other` has too, but with other low bits: what copies of a cover show."""
     own, theirs = (_high_rows(each, slice(None)) for each in (file, other))
     whole = [{row.tobytes() for row in Words.of(each).bits} for each in (file, other)]
     shared = np.isin(own, theirs)
@@ -97,11 +103,18 @@ def _energies(model: Gaussians) -> Floats:
 
 def _by_rows(own: Floats, theirs: Floats) -> dict[str, float]:
     """Nearest rows: how many fit, how well the better half does, and whether they come in the same order."""
+    count = min(len(own), len(theirs))
+    at_ends = max(
+        _correlation(own[part, 0], theirs[:count, 0]) for part in (slice(0, count), slice(-count, None))
+    )
+    # Without harmonics all are alike.
+    own, theirs = (each[(each > _LEAST_ENERGY).all(axis=1)] for each in (own, theirs))
+    own = own[:: max(1, -(-len(own) // _QUERIES))]
+    if min(len(own), len(theirs)) < _LEAST:
+        return {"rows at the same place": at_ends}
     distance, nearest = cKDTree(theirs).query(own)
     best = distance <= np.quantile(distance, 0.25)
     in_order = _correlation(np.flatnonzero(best), nearest[best])
-    count = min(len(own), len(theirs))
-    at_ends = max(_correlation(own[part, 0], theirs[:count, 0]) for part in (slice(0, count), slice(-count, None)))
     return {
         "rows that fit": float((distance < _MATCHED).mean()),
         "nearness of rows, first quarter": -float(np.log(np.quantile(distance, 0.25) + 1e-9)),
@@ -150,6 +163,9 @@ def _marginals(model: Gaussians) -> dict[str, Floats]:
 def _extent(model: Gaussians) -> Floats:
     """[2] ratios of the standard deviations along the principal axes: no similarity changes them."""
     means = model.means.detach().cpu().double().numpy()
-    middle = means[np.linalg.norm(means - np.median(means, axis=0), axis=1).argsort()[: int(0.9 * len(means)) + 2]]
+    middle = means[
+        np.linalg.norm(means - np.median(means, axis=0), axis=1).argsort()[: int(0.9 * len(means)) + 2]
+    ]
     values = np.sqrt(np.linalg.eigvalsh(np.cov(middle.T)).clip(1e-12))
-    return values[:2] / values[2]
+    ratios: Floats = values[:2] / values[2]
+    return ratios

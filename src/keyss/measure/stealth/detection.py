@@ -16,6 +16,7 @@ from keyss.measure.stealth.words import Floats, Ints
 
 _DRAWS = 1000  # of a bootstrap
 _EXCHANGES = 200
+_BEST = 12  # statistics that tell most, for logistic regression
 MOST_NAMED = 40  # single detectors
 
 
@@ -52,7 +53,7 @@ class Examples:
 
 
 def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detection], float]:
-    """Every statistic by itself, the worst first, and what chance makes of the largest area in one of 20 cases.
+    """Every statistic by itself, the worst first, and what chance makes of the largest in one of 20 cases.
 
     Its direction, and what is usual, come from the other scenes.
     """
@@ -74,6 +75,7 @@ def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detecti
 def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
     """Logistic regression and boosted trees over all statistics."""
     from sklearn.ensemble import HistGradientBoostingClassifier
+    from sklearn.feature_selection import SelectKBest, f_classif
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import QuantileTransformer
@@ -85,13 +87,12 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
             held = examples.scene == scene
             others = examples.values[~held]
             usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
-            train, test = (
-                np.where(np.isnan(part), usual, part) for part in (others, examples.values[held])
-            )
+            train, test = (np.where(np.isnan(part), usual, part) for part in (others, examples.values[held]))
             if name == "logistic":
                 # By rank: a few statistics have tails of many standard deviations.
                 spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
-                machine = make_pipeline(spread, LogisticRegression(C=0.005, max_iter=2000))
+                best = SelectKBest(f_classif, k=min(_BEST, train.shape[1]))
+                machine = make_pipeline(spread, best, LogisticRegression(C=0.1, max_iter=2000))
             else:
                 machine = HistGradientBoostingClassifier(
                     max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=seed

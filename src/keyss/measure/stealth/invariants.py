@@ -1,12 +1,12 @@
-"""What some tools keep exactly, and what nearly keeps it: whoever moves low bits turns the one into the other."""
+"""What some tools keep exactly; whoever moves low bits makes of it what is nearly so."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth
-from keyss.measure.stealth.words import ATTRIBUTES, Floats, Words
+from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
+from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Ints, Words
 
 _UNIT = 5e-7  # of a length that was normalised in float32
 _MOVED, _AROUND = 2e-4, 2e-3  # as far as embedding moves a length; what a smooth density is judged by
@@ -18,17 +18,19 @@ _WINDOW = 32
 
 
 def invariants(model: Gaussians, words: Words) -> dict[str, Statistic]:
-    """Unit quaternions, repeated values, values in clusters, short numbers; whole and in parts of the file."""
+    """Unit quaternions in the whole file and in parts of it, repeated values, clusters, short numbers."""
     found = _lengths(model)
     for index, attribute in enumerate(ATTRIBUTES):
         own = words.bits[:, words.of_attribute(index)]
         if not own.size:
             continue
         trained = words.trained[:, words.of_attribute(index)]
-        found[f"short numbers, {attribute}"] = Statistic(float(1 - trained.mean()))
-        repeated = [_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1])]
-        found[f"repeated values, {attribute}"] = Statistic(float(np.mean(repeated)))
-        clusters = [_clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])]
+        found[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
+        repeated = sum(_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
+        found[f"repeated values, {attribute}"] = portion(repeated, own.size)
+        clusters = [
+            _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
+        ]
         hits, trials = (sum(each) for each in zip(*clusters, strict=True))
         found[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
     return found
@@ -41,9 +43,13 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     nearly = int((~unit & (error < _MOVED)).sum())
     around = int(((error >= _MOVED) & (error < _AROUND)).sum())
     found = {
-        "quaternions of unit length": Statistic(float(unit.mean())),
-        "quaternions of nearly unit length": more_than_smooth(nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)),
-        "distance of quaternions from unit length, median": Statistic(float(np.log10(np.median(error) + 1e-9))),
+        "quaternions of unit length": portion(float(unit.sum()), len(unit)),
+        "quaternions of nearly unit length": more_than_smooth(
+            nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
+        ),
+        "distance of quaternions from unit length, median": Statistic(
+            float(np.log10(np.median(error) + 1e-9))
+        ),
     }
     positions = model.means.detach().cpu().double().numpy()
     for name, part in (("space", _cells(positions)), ("rows", np.arange(len(unit)) * _BLOCKS // len(unit))):
@@ -54,21 +60,22 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     return found
 
 
-def _cells(positions: Floats) -> np.ndarray:
+def _cells(positions: Floats) -> Ints:
     """[N] index of the cell of space, cut at quantiles of each coordinate."""
     cuts = np.quantile(positions, np.arange(1, _CELLS) / _CELLS, axis=0)
     index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
-    return np.ravel_multi_index(index, (_CELLS,) * 3)
+    found: Ints = np.ravel_multi_index(index, (_CELLS,) * 3)
+    return found
 
 
-def _repeated(values: np.ndarray) -> float:
-    """Share of the values that occur more than once."""
+def _repeated(values: Bits) -> int:
+    """How many values occur more than once."""
     _, counts = np.unique(values, return_counts=True)
-    return float(counts[counts > 1].sum() / max(len(values), 1))
+    return int(counts[counts > 1].sum())
 
 
 def _clusters(values: Floats) -> tuple[int, int]:
-    """How many gaps between neighbouring values are far smaller than those around, and how many gaps there are.
+    """How many gaps between neighbouring values are far smaller than those around, and how many there are.
 
     Between values of a smooth density gaps over their mean are exponential: one in a hundred is below 0.01.
     """
@@ -80,5 +87,3 @@ def _clusters(values: Floats) -> tuple[int, int]:
     starts = np.clip(np.arange(len(gaps)) - _WINDOW // 2, 0, len(gaps) - _WINDOW)
     around = (sums[starts + _WINDOW] - sums[starts] - gaps) / (_WINDOW - 1)
     return int((gaps < _CLUSTERED * around).sum()), len(gaps)
-
-

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic
+from keyss.measure.stealth.statistic import Statistic, portion
 from keyss.measure.stealth.words import Floats
 
 UNDRAWN = -5.6  # logits below are never drawn
@@ -29,7 +29,7 @@ def opacities(model: Gaussians) -> dict[str, Statistic]:
     """Shares by opacity, and what the Gaussians of the faint part look like beside the others."""
     logits = model.opacity_logits.detach().cpu().double().numpy()
     found = {
-        f"share of opacities, {name}": Statistic(float(((logits >= low) & (logits < high)).mean()))
+        f"share of opacities, {name}": portion(float(((logits >= low) & (logits < high)).sum()), len(logits))
         for name, (low, high) in _SHARES.items()
     }
     found["modes of faint opacities"] = Statistic(float(len(modes(logits[logits < _FAINT]))))
@@ -44,7 +44,7 @@ def opacities(model: Gaussians) -> dict[str, Statistic]:
 
 
 def modes(logits: Floats) -> list[float]:
-    """Where the density of opacity logits [N] has peaks of their own: bands, one for each group hidden there."""
+    """Where the density of opacity logits [N] has separate peaks: one for each group hidden there."""
     if len(logits) < _LEAST:
         return []
     low, high = logits.min() - 1, logits.max() + 1
@@ -57,7 +57,9 @@ def modes(logits: Floats) -> list[float]:
     lowest = 0.0  # since the last mode
     for at in range(1, len(density) - 1):
         lowest = min(lowest, density[at])
-        if not (density[at] >= density[at - 1] and density[at] > density[at + 1] and density[at] >= _LEAST / 2):
+        if not (
+            density[at] >= density[at - 1] and density[at] > density[at + 1] and density[at] >= _LEAST / 2
+        ):
             continue
         if found and lowest > _DIP * min(density[found[-1]], density[at]):
             if density[at] > density[found[-1]]:
@@ -75,7 +77,13 @@ def _shapes(model: Gaussians) -> dict[str, Floats]:
         "size": scales.mean(axis=1),
         "flatness": ordered[:, 1] - ordered[:, 0],
         "elongation": ordered[:, 2] - ordered[:, 1],
-        "length of quaternions": model.quats.detach().cpu().double().norm(dim=1).clamp_min(1e-9).log().numpy(),
+        "length of quaternions": model.quats.detach()
+        .cpu()
+        .double()
+        .norm(dim=1)
+        .clamp_min(1e-9)
+        .log()
+        .numpy(),
     }
     for band in range(1, model.sh_degree + 1):
         part = model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double()

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, rankdata
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic, normal
+from keyss.measure.stealth.statistic import Statistic, normal, portion
 from keyss.measure.stealth.words import Floats
 
 _NEAR = 1e-5  # of the model's size
@@ -37,12 +37,12 @@ def order(model: Gaussians) -> dict[str, Statistic]:
     positions = model.means.detach().cpu().double().numpy()
     size = float(np.linalg.norm(np.subtract(*np.quantile(positions, (0.9, 0.1), axis=0)))) or 1.0
     pairs = len(cKDTree(positions).query_pairs(_NEAR * size, output_type="ndarray"))
-    found["near duplicates"] = Statistic(pairs / count)
+    found["near duplicates"] = portion(pairs, count)
     return found
 
 
 def columns(model: Gaussians) -> dict[str, Floats]:
-    """[N] numbers of a Gaussian by which orders are compared; they do not depend on the frame but for three."""
+    """[N] numbers of a Gaussian by which orders are compared."""
     positions = model.means.detach().cpu().double()
     found = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}
     found["distance"] = (positions - positions.median(0).values).norm(dim=1)

@@ -22,6 +22,7 @@ ATTRIBUTES_LEFT_ALONE = (0, 4)  # positions and constant colours
 _ABOVE, _BELOW = 5, 4  # bits that are seen
 ROWS = 30_000  # of one model
 _TREES, _LEAVES = 60, 24
+_UNSIGNED = np.uint32(0x7FFFFFFF)
 _SURE = 0.1  # distance from 1/2 of a prediction that says something
 _LEAST = 64
 _DISTANCES = slice(0, 2)  # columns of what is seen
@@ -45,7 +46,11 @@ class BitPredictor:
 
         x, y = (np.concatenate(each) for each in zip(*samples, strict=True))
         trees = HistGradientBoostingClassifier(
-            max_iter=_TREES, max_leaf_nodes=_LEAVES, l2_regularization=1.0, min_samples_leaf=50, random_state=seed
+            max_iter=_TREES,
+            max_leaf_nodes=_LEAVES,
+            l2_regularization=1.0,
+            min_samples_leaf=50,
+            random_state=seed,
         )
         return BitPredictor(trees.fit(x, y))
 
@@ -124,7 +129,7 @@ def _seen(words: Words, at: Ints, bit: Ints, beside: Bits, distance: Floats) -> 
 
 def _repeated(bits: Bits) -> Flags:
     """[N, F] which numbers occur more than once, whatever their sign."""
-    _, inverse, times = np.unique(bits & 0x7FFFFFFF, return_inverse=True, return_counts=True)
+    _, inverse, times = np.unique(bits & _UNSIGNED, return_inverse=True, return_counts=True)
     found: Flags = (times > 1)[inverse].reshape(bits.shape)
     return found
 
@@ -145,11 +150,13 @@ def _likes(words: Words, model: Gaussians) -> tuple[Bits, Floats]:
         groups = bits[:, own].reshape(len(bits), -1, width)
         for turn in range(1, width):
             other = np.roll(groups, turn, axis=2).reshape(len(bits), -1)
-            apart = ulps(bits[:, own] & 0x7FFFFFFF, other & 0x7FFFFFFF)
+            apart = ulps(bits[:, own] & _UNSIGNED, other & _UNSIGNED)
             closer = apart < least[:, own]
             nearest[:, own] = np.where(closer, other, nearest[:, own])
             least[:, own] = np.where(closer, apart, least[:, own])
     positions = model.means.detach().cpu().double().numpy()
-    neighbour = cKDTree(positions).query(positions, k=min(2, len(positions)))[1].reshape(len(positions), -1)[:, -1]
+    neighbour = (
+        cKDTree(positions).query(positions, k=min(2, len(positions)))[1].reshape(len(positions), -1)[:, -1]
+    )
     beside = np.stack([nearest, bits[neighbour]])
     return beside, np.log2(1.0 + np.stack([least, ulps(bits, bits[neighbour])]))

@@ -13,9 +13,9 @@ from scipy.special import bdtrc, chdtrc, ndtr, pdtrc
 class Statistic:
     """What a detector counts in one file.
 
-    `error`: standard error from sampling alone, where the statistic does not vary from training to training by
-    anything else; None where it does, so that only control models tell what is usual. `p`: probability of at
-    least as much under an exact null, where there is one.
+    `error`: standard error from sampling alone, where it is known; from training to training a statistic may
+    vary by more, which only control models tell. `p`: probability of at least as much under an exact null,
+    where there is one.
     """
 
     value: float  # NaN where there is too little to count
@@ -44,23 +44,27 @@ def excess(hits: int, trials: int, expected: float) -> Statistic:
     if trials == 0:
         return NOTHING
     p = float(bdtrc(hits - 1, trials, expected)) if hits else 1.0
-    return Statistic(hits / (trials * expected), None, p)
+    most = trials * expected
+    return Statistic(hits / most, math.sqrt(max(hits, most, 1.0)) / most, p)
+
+
+def portion(hits: float, trials: int) -> Statistic:
+    """A share that has no null of its own."""
+    return Statistic(hits / max(trials, 1), math.sqrt(max(hits, 1.0)) / max(trials, 1))
 
 
 def more_than_smooth(hits: int, expected: float, of: int) -> Statistic:
-    """`hits` beyond those expected of a smooth density, as a share, and the Poisson probability of as many."""
-    return Statistic((hits - expected) / max(of, 1), None, float(pdtrc(hits - 1, expected)) if hits else 1.0)
+    """`hits` beyond those of a smooth density, as a share, and the Poisson probability of so many."""
+    error = math.sqrt(max(hits, expected, 1.0)) / max(of, 1)
+    return Statistic((hits - expected) / max(of, 1), error, float(pdtrc(hits - 1, expected)) if hits else 1.0)
 
 
 def dispersion(chi_square: float, degrees: int) -> Statistic:
     """Chi-square per degree of freedom less 1: above 0 is more uneven than chance."""
     if degrees < 10:
         return NOTHING
-    return Statistic(
-        chi_square / degrees - 1, math.sqrt(2 / degrees), float(chdtrc(degrees, chi_square))
-    )
+    return Statistic(chi_square / degrees - 1, math.sqrt(2 / degrees), float(chdtrc(degrees, chi_square)))
 
 
 def named(prefix: str, found: Mapping[str, Statistic]) -> dict[str, Statistic]:
     return {f"{prefix}/{name}": each for name, each in found.items()}
-

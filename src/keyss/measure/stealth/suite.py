@@ -17,7 +17,10 @@ KINDS = ("bits", "agreement", "invariants", "opacities", "order")
 
 
 def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
-    """Statistics by name, "kind: what is counted", where there is enough to count; kinds are KINDS. Takes half a second for 10,000 Gaussians."""
+    """By name, "kind: what is counted", where there is enough to count; kinds are KINDS.
+
+    Takes half a second for 10,000 Gaussians.
+    """
     words = Words.of(model)
     found = {
         "bits": bits(words),

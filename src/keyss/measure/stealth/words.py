@@ -46,7 +46,8 @@ class Words:
     @cached_property
     def trained(self) -> Flags:
         """[N, F] which numbers are not short ones."""
-        return (self.bits & _SHORT) != 0
+        found: Flags = (self.bits & _SHORT) != 0
+        return found
 
     def of_attribute(self, index: int) -> slice:
         """Columns."""
