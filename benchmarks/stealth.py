@@ -1,6 +1,6 @@
 """How well the attacks of `keyss.measure.stealth` tell files that hide something, on models that you have.
 
-    python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain models of three scenes or more
+    python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
     python benchmarks/stealth.py ... --learned bonsai=stego.ply:secret.ply  # stego files, secrets' own models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # files made by something else
     python benchmarks/stealth.py ... --rounded   # models as trainers leave them that round steps

@@ -290,10 +290,10 @@ def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: 
 
 
 def test_given_models_without_room_are_refused_before_any_work(folders: tuple[Path, Path]) -> None:
-    """However large the cap: a warm start adds no Gaussians to those that it is given."""
-    models = [random_gaussians(300, seed=seed) for seed in (0, 1)]
+    """However large the cap: a warm start adds no Gaussians to the cover that it is given."""
+    models = [random_gaussians(200, seed=seed) for seed in (0, 1)]
     secret = Secret(folders[1], "key", models[1])
-    with pytest.raises(UsageError, match=r"600 Gaussians is too small.*`sidecar=True`"):
+    with pytest.raises(UsageError, match=r"cover of 200 Gaussians is too small.*`sidecar=True`"):
         keyss.hide(folders[0], [secret], cover_model=models[0])
 
 

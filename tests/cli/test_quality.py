@@ -63,7 +63,7 @@ def test_a_secret_that_comes_back_empty_is_not_published(
     keyss: Callable[..., Said], models: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Even where empty pictures would be near enough: the limit is far below what they reach."""
-    from keyss.methods.carry.carrying import CarriedSecret
+    from keyss.methods.records.encoding import CarriedSecret
 
     reveal = CarriedSecret.reveal
 

@@ -25,10 +25,10 @@ from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey, random_embeddings
-from keyss.methods.carry.carrying import _COUNT, encode_all
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.opacity_band import hidden_logits, opacity_remap
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
+from keyss.methods.records.encoding import _COUNT, encode_all
 
 KEY = "q7Rv2LxT9bWm4KzD"
 Run = Callable[..., Said]
@@ -37,7 +37,7 @@ Run = Callable[..., Said]
 def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
     """`cover` with `secret` in it, as if `claimed` Gaussians had been hidden and the others were lost."""
     prepared = LOW_BITS.prepare(cover)
-    (records,) = encode_all(prepared, [secret])
+    (records,) = encode_all(prepared, [secret], "carry")
     records = replace(records, header=_COUNT.pack(claimed) + records.header[_COUNT.size :])
     names = salts(identities(cover))
     keys = [DerivedKey(KEY, derivation_of(names[0]))] * len(names)  # the first salt is enough for a reader

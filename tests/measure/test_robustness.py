@@ -36,7 +36,7 @@ from keyss.measure.robustness.survival import (
     mean_over_draws,
     robustness,
 )
-from keyss.methods.carry.carrying import record_request
+from keyss.methods.records.encoding import record_request
 from keyss.methods.registry import open_model
 from methods.carry.carried import embed
 from methods.learned.hiding import hide_scenes

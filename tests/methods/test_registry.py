@@ -183,18 +183,25 @@ def test_a_method_that_this_program_does_not_have_is_named(
         keyss.hide(cover, [Secret(secret, KEY)], method=WholeOptions())
 
 
-@pytest.mark.parametrize("own", ["learned", "carry"])
-def test_what_lies_in_a_model_tells_its_method(own: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "kind", "expected"),
+    [
+        ("learned", "payload", "HiddenSecret"),
+        ("learned", "records", "CarriedSecret"),
+        ("carry", "records", "CarriedSecret"),
+    ],
+)
+def test_what_lies_in_a_model_tells_its_method(method: str, kind: str, expected: str) -> None:
     """One reading of the low bits serves all methods."""
-    from keyss.methods.carry.carrying import encode_all
     from keyss.methods.learned.payload import pack_secret
+    from keyss.methods.records.encoding import encode_all
 
     prepared = LOW_BITS.prepare(trained_like(2500))
     content: dict[str, Callable[[], Any]] = {
-        "learned": lambda: Payload("learned", pack_secret(some_secret(prepared.cover))),
-        "carry": lambda: encode_all(prepared, [trained_like(100, 1)])[0],
+        "payload": lambda: Payload(method, pack_secret(some_secret(prepared.cover))),
+        "records": lambda: encode_all(prepared, [trained_like(100, 1)], method)[0],
     }
-    stego = prepared.embed([(KEY, content[own]())])
+    stego = prepared.embed([(KEY, content[kind]())])
     opened = registry.open_model(stego, KEY)
-    assert type(opened).__module__.startswith(f"keyss.methods.{own}")
+    assert type(opened).__name__ == expected
     assert 0 < len(opened.reveal(stego)) <= 2500

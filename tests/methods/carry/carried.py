@@ -8,7 +8,7 @@ from keyss.channels.base import Records
 from keyss.channels.low_bits import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
-from keyss.methods.carry.carrying import (
+from keyss.methods.records.encoding import (
     CarriedSecret,
     decode,
     encode_all,
@@ -21,7 +21,7 @@ def embed(
     cover: Gaussians, secrets: Sequence[tuple[str, Gaussians]], entropy: bytes | None = None
 ) -> Gaussians:
     prepared = LOW_BITS.prepare(cover)
-    records = encode_all(prepared, [model for _, model in secrets])
+    records = encode_all(prepared, [model for _, model in secrets], "carry")
     return prepared.embed(list(zip((key for key, _ in secrets), records, strict=True)), entropy=entropy)
 
 
@@ -31,7 +31,7 @@ def embed_derived(
     entropy: bytes | None = None,
 ) -> Gaussians:
     prepared = LOW_BITS.prepare(cover)
-    records = encode_all(prepared, [model for _, model in secrets])
+    records = encode_all(prepared, [model for _, model in secrets], "carry")
     keyed = list(zip((keys for keys, _ in secrets), records, strict=True))
     return prepared.embed_derived(keyed, entropy=entropy)
 

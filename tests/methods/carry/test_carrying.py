@@ -21,8 +21,8 @@ from keyss.channels.low_bits.layout import header_carriers, plan_records
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey
-from keyss.methods.carry.carrying import check_degrees, encode_all, record_request, subsampled_counts
-from keyss.methods.carry.table import Table
+from keyss.methods.records.encoding import check_degrees, encode_all, record_request, subsampled_counts
+from keyss.methods.records.table import Table
 from keyss.rendering import render
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 from tiny_scenes import ring_cameras
@@ -331,12 +331,12 @@ def test_too_large_a_secret_is_refused_with_the_number_that_fits(cover: Gaussian
     too_large, small = trained_like(8000, 5), trained_like(500, 6)
     assert prepared.record_capacity([record_request(8000, 3)]) == fits
     with pytest.raises(UsageError, match=rf"8,000 Gaussians are too many.*{fits:,} would fit"):
-        encode_all(prepared, [too_large])
+        encode_all(prepared, [too_large], "carry")
     assert subsampled_counts(prepared, [too_large]) == [fits]
-    assert encode_all(prepared, [too_large[:fits]])[0].plan.cells_per_carrier == 2
+    assert encode_all(prepared, [too_large[:fits]], "carry")[0].plan.cells_per_carrier == 2
     kept = subsampled_counts(prepared, [small, too_large])
     assert kept[0] == 500
-    assert encode_all(prepared, [small, too_large[: kept[1]]])
+    assert encode_all(prepared, [small, too_large[: kept[1]]], "carry")
     with pytest.raises(UsageError, match="nothing fits"):
         subsampled_counts(LOW_BITS.prepare(cover[:200]), [too_large])
     assert Table.floor(3).total <= 264

@@ -17,7 +17,7 @@ from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.ply import read_ply, write_ply
-from keyss.methods.carry.carrying import most_visible
+from keyss.methods.records.encoding import most_visible
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"

@@ -13,7 +13,7 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.loop import Reporter
 from keyss.keys import random_embeddings
 from keyss.methods import registry
-from keyss.methods.base import Context, KeyedSource, SceneInput, Source
+from keyss.methods.base import Context, KeyedSource, Opened, SceneInput, Source
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors
@@ -26,7 +26,12 @@ class Hidden:
 
     stego: Gaussians
     sidecar: bytes | None
-    secrets: tuple[HiddenSecret, ...]
+    opened: tuple[Opened, ...]
+
+    @property
+    def secrets(self) -> tuple[HiddenSecret, ...]:
+        """Those that have a decoder: with a sidecar, and started from points."""
+        return tuple(each for each in self.opened if isinstance(each, HiddenSecret))
 
 
 def hide_scenes(
@@ -49,8 +54,7 @@ def hide_scenes(
     context = Context(torch.device("cpu"), checkpoints, resume, reporter)
     cover, *secrets = map(Source, scenes, plain_models(scenes, given, options.fit, context))
     stego = method.hide(cover, list(map(KeyedSource, secrets, keys)), options, context)
-    opened = tuple(each for each in stego.opened if isinstance(each, HiddenSecret))
-    return Hidden(stego.gaussians, stego.sidecar, opened)
+    return Hidden(stego.gaussians, stego.sidecar, stego.opened)
 
 
 def open_secret(stego: Gaussians, key: str, sidecar: bytes | None = None) -> HiddenSecret:

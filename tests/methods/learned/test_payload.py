@@ -67,7 +67,7 @@ def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
 
 
 def test_another_version_is_refused_by_number() -> None:
-    with pytest.raises(InputError, match=r"version 1.*version 5"):
+    with pytest.raises(InputError, match=r"version 1.*version 6"):
         unpack_secret(_with_header(version=1))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,15 +13,18 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, LearnedOptions, Secret
+from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.bits import usable_carriers
 from keyss.core import InputError, UsageError
+from keyss.fitting.config import FitConfig
 from keyss.measure.hiding import mean_psnr
 from keyss.methods import registry
 from keyss.methods.base import SceneInput
-from keyss.methods.learned import method as learned
-from keyss.methods.learned.method import with_low_bits
+from keyss.methods.learned import publication
+from keyss.methods.learned.room import record_degree, with_low_bits
 from keyss.rendering.orbit import scene_of_model
-from tiny_scenes import random_gaussians
+from methods.learned.hiding import hide_scenes, open_secret
+from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
 
@@ -78,7 +82,7 @@ def test_what_training_will_not_make_random_is_refused() -> None:
 
 
 def test_payloads_go_to_a_sidecar_rather_than_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of models that are fitted here it is not known before how many carriers they have."""
+    """Started from points, it is not known before how many carriers there will be."""
 
     class Unusable:
         prepare: Callable[[Gaussians], None]
@@ -89,14 +93,40 @@ def test_payloads_go_to_a_sidecar_rather_than_nowhere(monkeypatch: pytest.Monkey
 
             self.prepare = refuse
 
-    models = [trained_like(2000), trained_like(1500, 1)]
-    monkeypatch.setattr(learned, "LOW_BITS", Unusable())
-    options = LearnedOptions(iterations=2)
-    result = keyss.hide(models[0], [Secret(models[1], KEY)], method=options, width=24, min_psnr=0)
-    assert result.sidecar is not None
-    assert result.metrics.details["sidecar_because"] == "no low bits"
-    revealed = keyss.reveal(result.stego, KEY, decoder=result.sidecar)
+    monkeypatch.setattr(publication, "LOW_BITS", Unusable())
+    scenes = [tiny_scene(seed) for seed in range(2)]
+    fit = FitConfig(iterations=2, max_gaussians=6000)
+    options = replace(LearnedOptions(), start="points", decoder="network", fit=fit)
+    plains = [random_gaussians(seed=seed) for seed in range(2)]
+    hidden = hide_scenes(scenes, [KEY], options, plains=plains)
+    assert hidden.sidecar is not None
+    revealed = open_secret(hidden.stego, KEY, hidden.sidecar).reveal(hidden.stego)
     assert np.isfinite(revealed.means.numpy()).all()
+
+
+def test_low_bits_that_are_not_random_after_all_get_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of models that are fitted here it is not known before; the training is not lost."""
+    prepare, seen = LOW_BITS.prepare, []
+
+    def at_first_not(model: Gaussians) -> LowBitsCover:
+        seen.append(model)
+        if len(seen) == 1:
+            raise InputError("no low bits")
+        return prepare(model)
+
+    models = [trained_like(2000), trained_like(900, 1)]
+    monkeypatch.setattr(type(LOW_BITS), "prepare", lambda self, cover: at_first_not(cover))
+    result = keyss.hide(
+        models[0], [Secret(models[1], KEY)], method=LearnedOptions(iterations=2), width=24, min_psnr=0
+    )
+    assert len(seen) == 2
+    assert "dithered_cover_psnr_against_the_one_before" in result.metrics.details
+    assert [len(keyss.reveal(result.stego, KEY))] == result.metrics.details["gaussians_before_pruning"]
+
+
+@pytest.mark.parametrize(("degree", "expected"), [(0, None), (1, 0), (2, 2), (3, 3)])
+def test_harmonics_that_a_record_has_room_for(degree: int, expected: int | None) -> None:
+    assert record_degree(degree) == expected
 
 
 def test_fewer_harmonics_than_a_secret_has_are_said() -> None:

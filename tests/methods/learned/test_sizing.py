@@ -1,12 +1,13 @@
-"""Models take the place of photos: room for all of their Gaussians, and both come out as they went in."""
+"""Models take the place of photos: the cover keeps its Gaussians, and both come out as they went in."""
 
 from __future__ import annotations
 
 from keyss.fitting.image_metrics import mean_psnr
+from keyss.methods import registry
 from keyss.methods.base import SceneInput
 from keyss.methods.learned.options import LearnedOptions, sized
 from keyss.rendering.orbit import scene_of_model
-from methods.learned.hiding import hide_scenes, open_secret
+from methods.learned.hiding import hide_scenes
 from tiny_scenes import random_gaussians
 
 SIZE = 48
@@ -16,9 +17,10 @@ def test_one_model_hides_in_another_without_photos() -> None:
     models = [random_gaussians(1200, seed=0), random_gaussians(700, seed=1)]
     scenes = [scene_of_model(model, "m", size=SIZE) for model in models]
     config = sized(LearnedOptions(), [SceneInput(model, photos=False) for model in models])
-    assert (config.fit.max_gaussians, config.fit.iterations, config.fit.sh_degree) == (1900, 400, 3)
+    assert (config.fit.max_gaussians, config.fit.iterations, config.fit.sh_degree) == (1200, 400, 3)
     hidden = hide_scenes(scenes, ["key"], config.with_fit(iterations=30, evaluate_every=0), plains=models)
-    revealed = open_secret(hidden.stego, "key").reveal(hidden.stego)
+    assert len(hidden.stego) == 1200
+    revealed = registry.open_model(hidden.stego, "key").reveal(hidden.stego)
     assert mean_psnr(hidden.stego, scenes[0].test, scenes[0].background) > 40
     assert mean_psnr(revealed, scenes[1].test, scenes[1].background) > 40
 
@@ -29,8 +31,10 @@ def test_what_is_asked_for_is_kept() -> None:
     asked = LearnedOptions().with_fit(iterations=900, max_gaussians=500)
     found = sized(asked, inputs)
     assert (found.fit.iterations, found.fit.max_gaussians) == (900, 500)
-    too_few = LearnedOptions().with_fit(max_gaussians=189)
-    assert sized(too_few, inputs) == too_few  # something has to be left out: a training like any other
+    for options, total in ((LearnedOptions(), 120), (LearnedOptions(sidecar=True), 190)):
+        assert sized(options, inputs).fit.max_gaussians == total
+        too_few = options.with_fit(max_gaussians=total - 1)
+        assert sized(too_few, inputs) == too_few  # something has to be left out: a training like any other
     assert sized(asked, [inputs[0], SceneInput(models[1], photos=True)]) == asked
     assert sized(asked, [inputs[0], SceneInput(None, photos=True)]) == asked
 

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from channels.low_bits.trained_like import trained_like
 from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
@@ -40,7 +41,7 @@ def _placed(count: int) -> list[PlacedScene]:
 
 
 def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
-    config = LearnedOptions(fit=FitConfig(max_gaussians=330))
+    config = LearnedOptions(fit=FitConfig(max_gaussians=330), sidecar=True)
     start = make_start(_placed(3), config, torch.Generator())
     assert len(start) == 330
     decoded = []
@@ -59,7 +60,7 @@ def test_warm_start_shows_the_cover_and_hides_the_secrets() -> None:
 
 
 def test_the_key_brings_back_the_opacities_that_a_warm_start_hides() -> None:
-    config = LearnedOptions(fit=FitConfig(max_gaussians=10_000))
+    config = LearnedOptions(fit=FitConfig(max_gaussians=10_000), sidecar=True)
     placed = _placed(3)
     start = make_start(placed, config, torch.Generator())
     for secret in (1, 2):
@@ -91,9 +92,25 @@ def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
     useless = replace(wall, means=wall.means + 1000)
     faint = replace(wall, opacity_logits=torch.full((200,), -9.0))
     both = PlacedScene.of(placed.scene, Gaussians.cat([useless, wall, faint]), Similarity.identity())
-    start = make_start([both], LearnedOptions(fit=FitConfig(max_gaussians=150)), torch.Generator())
+    config = LearnedOptions(fit=FitConfig(max_gaussians=150), sidecar=True)
+    start = make_start([both], config, torch.Generator())
     assert (start.means.abs() < 100).all()
     assert (start.opacity_logits == 5).all()
+
+
+def test_secrets_in_records_take_no_place_of_the_covers() -> None:
+    placed = [
+        PlacedScene.of(tiny_scene(seed), trained_like(count, seed), Similarity.identity())
+        for seed, count in ((0, 2000), (1, 1500), (2, 9000))
+    ]
+    start = make_start(placed, LearnedOptions(), torch.Generator())
+    drawn = start.opacity_logits > DRAWN_LOGIT
+    assert int(drawn.sum()) == int((placed[0].plain.opacity_logits > DRAWN_LOGIT).sum())
+    hidden = len(start) - int(drawn.sum())
+    # Two records to a Gaussian that carries something, of which there are fewer than all, and headers.
+    assert 2000 < hidden < 4000
+    fewer = make_start(placed, LearnedOptions(secret_share=0.2), torch.Generator())
+    assert len(fewer) - int(drawn.sum()) == 2 * int(0.2 * int(drawn.sum()))
 
 
 def test_start_from_points_divides_the_cap_between_the_scenes() -> None:

@@ -51,7 +51,7 @@ class StealthResult:
 
     @property
     def least_confirmation(self) -> float:
-        """The least p-value of confirming a secret, corrected for the number of scores; 1 if there is none."""
+        """The least p-value of confirming a secret, corrected for their number; 1 if there is none."""
         rows = [row for each in self.confirmations if each is not None for row in each.scores]
         return min([1.0, *(row.p * len(rows) for row in rows)])
 

@@ -14,8 +14,9 @@ from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
-from keyss.methods.carry.carrying import (
-    NAME,
+from keyss.methods.carry.options import PRESETS, CarryOptions
+from keyss.methods.dither import cost, dither, sampled
+from keyss.methods.records.encoding import (
     CarriedSecret,
     check_degrees,
     decode,
@@ -25,9 +26,7 @@ from keyss.methods.carry.carrying import (
     record_requests,
     subsampled_counts,
 )
-from keyss.methods.carry.options import PRESETS, CarryOptions
-from keyss.methods.carry.quantise import out_of_range
-from keyss.methods.dither import cost, dither, sampled
+from keyss.methods.records.quantise import out_of_range
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
@@ -36,6 +35,9 @@ _DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
 _DITHER_AND_PRUNE = (
     f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
 )
+
+
+NAME = "carry"
 
 
 class CarryMethod:
@@ -111,7 +113,7 @@ class CarryMethod:
         }
         whole, counts = models, _counts(prepared, models, options)
         models = [most_visible(model, count) for model, count in zip(whole, counts, strict=True)]
-        records = encode_all(prepared, models)
+        records = encode_all(prepared, models, NAME)
         stego = prepared.embed(list(zip(keys, records, strict=True)))
         opened = [self.unpack(LOW_BITS.extract(stego, key)) for key in keys]
         seconds = time.monotonic() - start

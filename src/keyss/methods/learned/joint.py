@@ -173,6 +173,18 @@ class JointRun:
         return to_gaussians(self.parameters).detach()
 
     @torch.no_grad()
+    def separated(self) -> tuple[Gaussians, list[Gaussians]]:
+        """After a warm start: the cover's own Gaussians, and each secret's as its decoder shows them."""
+        model = self.gaussians()
+        cover = torch.ones(len(model), dtype=torch.bool, device=model.device)
+        secrets = []
+        for decoder, embedding in self._keyed_decoders():
+            decoded = decoder(model, embedding)
+            secrets.append(decoded[decoded.opacities >= DRAWN_OPACITY])
+            cover &= ~decoder.band.contains(model.opacity_logits)
+        return model[cover], secrets
+
+    @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
         secrets = len(self.embeddings)
         names = ["cover", *(f"secret {i}" if secrets > 1 else "secret" for i in range(1, secrets + 1))]

@@ -79,7 +79,7 @@ class LearnedOptions(MethodOptions):
     incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
     incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
 
-    secret_share: float = 1.0  # warm start: Gaussians of each secret for one of the cover
+    secret_share: float = 1.0  # warm start: Gaussians of each secret for one of the cover, at most
     warm_rate: float = 1.0  # warm start: factor on the rates of the Gaussians, which are nearly right
     # At the cap, what asks to grow waits until something is pruned; freeze: nothing is (the authors' code).
     at_cap: Literal["wait", "freeze"] = "wait"
@@ -109,6 +109,14 @@ class LearnedOptions(MethodOptions):
                 f"mask {','.join(self.mask)} with start {self.start} needs a network"
             )
 
+    @property
+    def in_records(self) -> bool:
+        """Whether secrets are published in the low bits of the cover's own Gaussians.
+
+        Otherwise the published model has Gaussians of the secrets, or some that it shares with them.
+        """
+        return self.start == "warm" and not self.sidecar
+
     def adapted(self, **changes: Any) -> Self:
         """The same with changed fields, and with a network where an opacity remap cannot do it."""
         start, mask = (changes.get(name, getattr(self, name)) for name in ("start", "mask"))
@@ -125,9 +133,9 @@ class LearnedOptions(MethodOptions):
 def sized(options: LearnedOptions, inputs: Sequence[SceneInput]) -> LearnedOptions:
     """`options` for the cover and secrets of `inputs`, with the SH degree of the published model.
 
-    Where models are all there is, the published model holds the Gaussians of all of them unless
-    `options.max_gaussians` says otherwise. If nothing has to be left out the start is right already: the
-    training is short and gentle, for large steps would only do harm.
+    Where models are all there is, the published model has the cover's Gaussians, or with a sidecar those of
+    all, unless `options.max_gaussians` says otherwise. If nothing of it has to be left out the start is right
+    already: the training is short and gentle, for large steps would only do harm.
     """
     degree, cover = options.sh_degree, inputs[0].model
     if degree is None and cover is not None and options.start == "warm":
@@ -135,7 +143,7 @@ def sized(options: LearnedOptions, inputs: Sequence[SceneInput]) -> LearnedOptio
     if degree is not None:
         options = replace(options, fit=replace(options.fit, sh_degree=degree))
     models = [each.model for each in inputs if each.model is not None and not each.photos]
-    total = sum(len(model) for model in models)
+    total = sum(len(model) for model in (models[:1] if options.in_records else models))
     if len(models) < len(inputs) or (options.max_gaussians or total) < total:
         return options
     fit = replace(

@@ -28,9 +28,8 @@ from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.methods.base import Frame, Remains
 from keyss.methods.learned.decoder import Decoder, DecoderShape, parse_mask
-from keyss.methods.learned.rank_shift import CHANNELS, KEY_BYTES, KNOTS, RankShift
 
-FORMAT, VERSION = "keyss-secret", 5
+FORMAT, VERSION = "keyss-secret", 6
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
@@ -77,7 +76,6 @@ class HiddenSecret:
     decoder: Decoder
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
-    rank_shift: RankShift | None = None  # what the secret's Gaussians are published as, if not as they are
     # [M, 7] position, opacity logit and constant colour of all transparent Gaussians: formats round their
     # opacities to nothing, and some drop the colours of what is transparent.
     faint: Tensor | None = None
@@ -104,8 +102,6 @@ class HiddenSecret:
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
         """What the decoder makes of `stego` for an embedding [64]; see `Opened.decode`."""
         decoder = self.decoder.to(stego.device)
-        if self.rank_shift is not None:
-            stego = self.rank_shift.decrypt(stego)
         decoded: Gaussians = decoder(
             stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device)
         )
@@ -184,13 +180,6 @@ def pack_secret(secret: HiddenSecret) -> bytes:
     tensors["anchors"] = secret.anchors.contiguous()
     if secret.faint is not None:
         tensors["faint"] = secret.faint.contiguous()
-    if secret.rank_shift is not None:
-        tensors |= {
-            "rank_shift.key": torch.frombuffer(bytearray(secret.rank_shift.key), dtype=torch.uint8),
-            "rank_shift.band": torch.tensor(secret.rank_shift.band),
-            "rank_shift.own": secret.rank_shift.own,
-            "rank_shift.shown": secret.rank_shift.shown,
-        }
     return safetensors.torch.save(tensors, {"keyss": msgspec.json.encode(header).decode()})
 
 
@@ -221,9 +210,6 @@ def _read_header(data: bytes) -> _Header:
 
 
 def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
-    rank_shift = _rank_shift(
-        {name: tensors.pop(name) for name in list(tensors) if name.startswith("rank_shift.")}
-    )
     if not all(
         value.dtype in (torch.float16, torch.float32) and value.isfinite().all() for value in tensors.values()
     ):
@@ -243,20 +229,4 @@ def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
         torch.tensor(header.frame.rotation, dtype=torch.float64),
         torch.tensor(header.frame.translation, dtype=torch.float64),
     )
-    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, rank_shift, faint, header.count)
-
-
-def _rank_shift(tensors: dict[str, Tensor]) -> RankShift | None:
-    if not tensors:
-        return None
-    key, band, own, shown = (tensors[f"rank_shift.{name}"] for name in ("key", "band", "own", "shown"))
-    tables = (own, shown)
-    if not (
-        key.dtype == torch.uint8
-        and key.shape == (KEY_BYTES,)
-        and band.shape == (2,)
-        and all(table.dtype == torch.float32 and table.shape == (CHANNELS, KNOTS) for table in tables)
-        and all(table.isfinite().all() and (table.diff(dim=1) >= 0).all() for table in tables)
-    ):
-        raise InputError("keyed rank shift: expected a key, a band and two ascending tables")
-    return RankShift(bytes(key.tolist()), (float(band[0]), float(band[1])), own, shown)
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, faint, header.count)

@@ -13,6 +13,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
+from keyss.methods.learned.room import divided, shares, usable_share
 from keyss.methods.learned.targets import PlacedScene
 from keyss.rendering.contributions import contributions
 
@@ -35,10 +36,10 @@ def _from_points(
     fit = config.fit
     chosen = [scenes[index].scene for index in chosen_scenes(config.points, len(scenes))]
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in chosen]
-    shares = divided([len(points) for points, _ in clouds], [1.0] * len(clouds), fit.max_gaussians)
+    counts = divided([len(points) for points, _ in clouds], [1.0] * len(clouds), fit.max_gaussians)
     parts = [
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
-        for (points, colors), share in zip(clouds, shares, strict=True)
+        for (points, colors), share in zip(clouds, counts, strict=True)
     ]
     return Gaussians.cat(parts)
 
@@ -48,31 +49,17 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gauss
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     # What is never drawn would lie among the hidden.
     plains = [plain[(plain.opacity_logits > DRAWN_LOGIT) & ~plain.overflow] for plain in plains]
-    weights = [1.0] + [config.secret_share] * (len(scenes) - 1)
-    shares = divided([len(plain) for plain in plains], weights, config.fit.max_gaussians)
+    usable = usable_share(plains[0], config.fit.sh_degree)
+    counts = shares([len(plain) for plain in plains], config, usable)
     chosen = [
         _most_contributing(plain, placed.scene, share)
-        for plain, placed, share in zip(plains, scenes, shares, strict=True)
+        for plain, placed, share in zip(plains, scenes, counts, strict=True)
     ]
     parts = chosen[:1] + [
         replace(part, opacity_logits=hidden_logits(part.opacity_logits, secret))
         for secret, part in enumerate(chosen[1:])
     ]
     return Gaussians.cat(parts)
-
-
-def divided(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
-    """`total` items divided by `weights`, nowhere more than `available`; what is left over is given on."""
-    shares = [0] * len(available)
-    while (left := total - sum(shares)) > 0:
-        open_ends = [i for i in range(len(available)) if shares[i] < available[i]]
-        if not open_ends:
-            break
-        weight = sum(weights[i] for i in open_ends)
-        for i in open_ends:
-            fair = max(1, int(left * weights[i] / weight))
-            shares[i] += min(fair, available[i] - shares[i], total - sum(shares))
-    return shares
 
 
 def _most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:

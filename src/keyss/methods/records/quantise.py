@@ -30,7 +30,7 @@ import torch
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
-from keyss.methods.carry.table import BANDS, CHROMA_FEWER, Table
+from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
 
 Floats = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint32]

@@ -15,8 +15,8 @@ from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, Secret
 from keyss.core.gaussians import DRAWN_OPACITY
 from keyss.files.ply import write_ply
-from keyss.methods.carry.quantise import Codec, outliers
-from keyss.methods.carry.table import Table
+from keyss.methods.records.quantise import Codec, outliers
+from keyss.methods.records.table import Table
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 

@@ -20,10 +20,9 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.methods.base import Frame, Remains
-from keyss.methods.carry.quantise import Codec
-from keyss.methods.carry.table import Table
+from keyss.methods.records.quantise import Codec
+from keyss.methods.records.table import Table
 
-NAME = "carry"
 _COUNT = struct.Struct("<I")
 
 
@@ -83,14 +82,14 @@ def check_degrees(channel: Channel, cover: int, secrets: Sequence[int]) -> None:
         )
 
 
-def _encode(model: Gaussians, plan: RecordPlan) -> Records:
+def _encode(model: Gaussians, plan: RecordPlan, method: str) -> Records:
     """As precise as the plan has room for."""
     table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
     if table is None:
         raise ValueError(f"{plan.record_bytes} bytes are too few for a record of SH degree {model.sh_degree}")
     codec = Codec.fit(model, table)
     header = _COUNT.pack(len(model)) + codec.pack()
-    return Records(NAME, header, codec.encode(model), plan, most_visible_rows(model, plan.copies))
+    return Records(method, header, codec.encode(model), plan, most_visible_rows(model, plan.copies))
 
 
 def decode(records: Records) -> CarriedSecret:
@@ -105,10 +104,13 @@ def decode(records: Records) -> CarriedSecret:
     return CarriedSecret(codec.decode(records.records), count, codec.table.total)
 
 
-def encode_all(prepared: PreparedCover, models: Sequence[Gaussians]) -> list[Records]:
-    """The records of all models, as they fit into one cover together. Raises UsageError if they do not."""
+def encode_all(prepared: PreparedCover, models: Sequence[Gaussians], method: str) -> list[Records]:
+    """The records of all models, as they fit into one cover together. Raises UsageError if they do not.
+
+    `method`: the name of the one that will open them.
+    """
     plans = prepared.plan_records(record_requests(models))
-    return [_encode(model, plan) for model, plan in zip(models, plans, strict=True)]
+    return [_encode(model, plan, method) for model, plan in zip(models, plans, strict=True)]
 
 
 def subsampled_counts(prepared: PreparedCover, models: Sequence[Gaussians]) -> list[int]:
