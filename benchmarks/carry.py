@@ -31,8 +31,8 @@ from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.methods.records.encoding import record_request
 from keyss.methods.dither import cost
+from keyss.methods.records.encoding import record_request
 from keyss.rendering import render
 from methods.carry.carried import embed, extract
 

@@ -151,21 +151,18 @@ def _make(job: Job) -> list[File]:
 
 
 def _pieces(file: File) -> Iterable[tuple[str, Gaussians]]:
-    """The whole model and parts of it, the same ones of all files of one pair."""
+    """The whole model and disjoint parts of it, two to four, the same ones of all files of one pair."""
     yield "whole", file.model
     count = len(file.model)
-    if count < 2 * PART_SIZES[0]:
-        return
     random = np.random.default_rng([ord(letter) for letter in file.pair])
-    for name in ("random", "space"):
-        size = int(random.integers(PART_SIZES[0], min(PART_SIZES[1], count // 2) + 1))
-        if name == "random":
-            rows = np.sort(random.permutation(count)[:size])
-        else:
-            centre = file.model.means[int(random.integers(count))]
-            nearest = (file.model.means - centre).norm(dim=1).argsort()[:size]
-            rows = np.sort(nearest.numpy())
-        yield name, file.model[torch.from_numpy(rows)]
+    parts = min(int(random.integers(2, 5)), count // PART_SIZES[0])
+    if parts < 2:
+        return
+    for rows in np.array_split(random.permutation(count), parts):
+        yield "random", file.model[torch.from_numpy(np.sort(rows)[: PART_SIZES[1]])]
+    axis = int((file.model.means.quantile(0.9, 0) - file.model.means.quantile(0.1, 0)).argmax())
+    for rows in np.array_split(file.model.means[:, axis].numpy().argsort(kind="stable"), parts):
+        yield "space", file.model[torch.from_numpy(np.sort(rows)[: PART_SIZES[1]])]
 
 
 def _statistics(piece: Gaussians) -> dict[str, float]:

@@ -14,10 +14,10 @@ import numpy as np
 
 from keyss.measure.stealth.words import Floats, Ints
 
-_DRAWS = 1000  # of a bootstrap
-_EXCHANGES = 200
+_DRAWS = 300  # of a bootstrap
+_EXCHANGES = 100
 _BEST = 12  # statistics that tell most, for logistic regression
-MOST_NAMED = 40  # single detectors
+MOST_NAMED = 10  # single detectors
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,6 @@ def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detecti
 def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
     """Logistic regression and boosted trees over all statistics."""
     from sklearn.ensemble import HistGradientBoostingClassifier
-    from sklearn.feature_selection import SelectKBest, f_classif
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import QuantileTransformer
@@ -89,10 +88,12 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
             usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
             train, test = (np.where(np.isnan(part), usual, part) for part in (others, examples.values[held]))
             if name == "logistic":
-                # By rank: a few statistics have tails of many standard deviations.
+                # By rank, for a few statistics have tails of many standard deviations.
                 spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
-                best = SelectKBest(f_classif, k=min(_BEST, train.shape[1]))
-                machine = make_pipeline(spread, best, LogisticRegression(C=0.1, max_iter=2000))
+                above = _lean(_ranks(train), examples.hidden[~held])
+                best = np.argsort(-np.abs(above))[:_BEST]
+                train, test = train[:, best], test[:, best]
+                machine = make_pipeline(spread, LogisticRegression(C=0.1, max_iter=2000))
             else:
                 machine = HistGradientBoostingClassifier(
                     max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=seed
@@ -141,8 +142,7 @@ class _HeldOut:
         signed = np.empty_like(self.centred)
         for held, others, ranks in self.folds:
             labels = hidden[others]
-            above = ranks[labels == 1].mean(axis=0) - ranks[labels == 0].mean(axis=0)
-            signed[held] = self.centred[held] * np.where(above >= 0, 1, -1)
+            signed[held] = self.centred[held] * np.where(_lean(ranks, labels) >= 0, 1, -1)
         return signed
 
     def areas(self, hidden: Ints) -> Floats:
@@ -151,6 +151,12 @@ class _HeldOut:
         positives = int(hidden.sum())
         found: Floats = ranks[hidden == 1].sum(axis=0) - positives * (positives + 1) / 2
         return found / (positives * (len(hidden) - positives))
+
+
+def _lean(ranks: Floats, hidden: Ints) -> Floats:
+    """[S] how much higher statistics rank where something is hidden."""
+    found: Floats = ranks[hidden == 1].mean(axis=0) - ranks[hidden == 0].mean(axis=0)
+    return found
 
 
 def _error(scores: Floats, examples: Examples, draws: int = _DRAWS) -> float:

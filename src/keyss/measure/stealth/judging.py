@@ -104,7 +104,8 @@ def _confirmed(file: Gaussians, controls: Sequence[Gaussians], candidate: Gaussi
 
 def _rows(own: Mapping[str, Statistic], controls: Sequence[Mapping[str, Statistic]]) -> list[JudgedStatistic]:
     """Those that all have, the least likely first."""
-    names = [name for name in own if all(name in each for each in controls)]
+    every = [own, *controls]
+    names = [name for name in own if all(name in each and math.isfinite(each[name].value) for each in every)]
     samples = {name: [each[name] for each in controls] for name in names}
     usual: dict[str, list[float]] = {}
     for name, others in samples.items():

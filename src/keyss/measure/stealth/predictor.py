@@ -25,6 +25,7 @@ _TREES, _LEAVES = 60, 24
 _UNSIGNED = np.uint32(0x7FFFFFFF)
 _SURE = 0.1  # distance from 1/2 of a prediction that says something
 _LEAST = 64
+_OFTEN = 6  # times: three channels of a grey Gaussian and of its sibling
 _DISTANCES = slice(0, 2)  # columns of what is seen
 
 
@@ -128,9 +129,9 @@ def _seen(words: Words, at: Ints, bit: Ints, beside: Bits, distance: Floats) -> 
 
 
 def _repeated(bits: Bits) -> Flags:
-    """[N, F] which numbers occur more than once, whatever their sign."""
+    """[N, F] which numbers occur again and again, whatever their sign."""
     _, inverse, times = np.unique(bits & _UNSIGNED, return_inverse=True, return_counts=True)
-    found: Flags = (times > 1)[inverse].reshape(bits.shape)
+    found: Flags = (times > _OFTEN)[inverse].reshape(bits.shape)
     return found
 
 
