@@ -26,7 +26,7 @@ from keyss.runs.files import STEGO
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = LearnedOptions(
-    fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0),
+    fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
 )
 SIDECAR = replace(CONFIG, sidecar=True)
 
@@ -303,9 +303,10 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
     for index, count in enumerate((1500, 700)):
         keyss.write_model(tmp_path / f"{index}.ply", random_gaussians(count, seed=index))
     cover, secret = (tmp_path / f"{index}.ply" for index in (0, 1))
-    python = LearnedOptions(sidecar=True).with_fit(iterations=2)
+    python = LearnedOptions(sidecar=True).with_fit(iterations=2, seed=0)
     keyss.hide(cover, [Secret(secret, "the key")], method=python, width=24, out=tmp_path / "python")
     arguments = ["--cover", str(cover), "--secret", str(secret), "--width", "24", "--iterations", "2"]
+    arguments += ["--seed", "0"]
     assert main(["hide", "--sidecar", *arguments, "-o", str(tmp_path / "line")]) == 0
     for name in ("private/config.json", "publish/stego.ply", "publish/decoder.sealed"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name

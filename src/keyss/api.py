@@ -39,9 +39,9 @@ from keyss.methods.plain_models import plain_models
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.report.page import write_report as write_report
-from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of
+from keyss.runs.config import Background, FitRunConfig, PathLike, RunConfig, colour_of, path_of, secret_ids
 from keyss.runs.files import CONFIG, METRICS, MODEL, SIDECAR, STEGO, plain_names, writers
-from keyss.runs.folder import RunFolder, check_not_published, write_again
+from keyss.runs.folder import RunFolder, check_not_published, recorded_seed, write_again
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_model, as_scene, open_file, open_run, read_sidecar, sidecar_beside
 from keyss.runs.planning import Plan, check_disk, plan_hiding
@@ -90,10 +90,12 @@ def fit(
 
     `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
     `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
-    `resume` goes on.
+    `resume` goes on. Without a seed in `config` the run draws one from the system, and `config.json` records
+    it; to be resumed it needs none.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
-    config = config or FitConfig()
+    recorded = recorded_seed(Path(out), "config", "seed") if resume and out is not None else None
+    config = (config or FitConfig()).seeded(recorded)
     target = resolve_device(device)
     settings = FitRunConfig(
         scene=path_of(scene),
@@ -127,7 +129,7 @@ def fit(
                 iterations=config.iterations,
                 seconds=round(result.seconds, 1),
                 width=_width(loaded),
-                seed=config.seed,
+                seed=config.known_seed,
             )
             folder.write(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
     return result
@@ -154,6 +156,8 @@ def hide(
     Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
     come first unless they are given. `method`: a name for default options, or a method's own options
     (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
+    Without a seed in the options' `fit` the run draws one from the system, and `config.json` records it; to
+    be resumed it needs none.
 
     The secrets lie encrypted in the low bits of `stego.ply`; with `LearnedOptions(sidecar=True)` they are in
     a file `decoder.sealed`. `out` (a folder) gets these in `publish/`, and `private/` with the plain models,
@@ -164,6 +168,8 @@ def hide(
     is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
     chosen, options = _method(method, secrets)
+    recorded = recorded_seed(Path(out), "options", "fit", "seed") if resume and out is not None else None
+    options = replace(options, fit=options.fit.seeded(recorded))
     keys = [secret.key for secret in secrets]
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
@@ -218,7 +224,7 @@ def hide(
         photos = tuple(each.photos for each in inputs)
         metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
         if folder:
-            payloads = tuple(each.fingerprint() for each in stego.opened)
+            payloads = secret_ids(options.fit.known_seed, stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
@@ -404,8 +410,8 @@ def evaluate(
     `metrics.json`.
 
     `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
-    by default, drawn from `seed`; only for methods whose keys condition a decoder. Raises WrongKeyError for a
-    key that opens nothing, UsageError for a secret without a key.
+    by default, drawn from `seed`, by default the run's own; only for methods whose keys condition a decoder.
+    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
     """
     target = resolve_device(device)
     opened = open_run(run, keys)
@@ -420,7 +426,7 @@ def evaluate(
         opened.scenes(train_pictures=False),
         [None if model is None else model.to(target) for model in opened.plain_models()],
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
-        seed=seed or 0,
+        seed=opened.metrics.seed if seed is None else seed,
     )
     metrics = replace(opened.metrics, **vars(measured))
     write_again(opened.folder, "hide", METRICS, partial(write_record, record=metrics))
@@ -525,7 +531,7 @@ def _measured(
         scenes,
         [model.to(device) for model in models],
         wrong_keys=WRONG_KEYS,
-        seed=options.fit.seed,
+        seed=options.fit.known_seed,
     )
     return HideMetrics(
         **vars(measured),
@@ -536,7 +542,7 @@ def _measured(
         iterations=stego.iterations,
         seconds=round(stego.seconds, 1),
         width=_width(scenes[0]),
-        seed=options.fit.seed,
+        seed=options.fit.known_seed,
         against_plain=against_plain,
         details=stego.details,
     )

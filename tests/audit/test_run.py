@@ -76,7 +76,7 @@ def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 2
     assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "stego.ply"))
     assert found.leaks == LeaksResult(((), ()))
-    assert (found.controls.models, found.controls.seeds) == (2, (1, 2))
+    assert (found.controls.models, len(set(found.controls.seeds))) == (2, 2)
     assert (run / "private" / "audit" / "pictures" / "a.png").exists()
     assert not (run / "private" / "checkpoint").exists()
     assert KEY not in (run / "private" / "audit" / "audit.json").read_text()

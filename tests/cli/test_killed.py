@@ -18,7 +18,18 @@ import pytest
 
 PROGRAM = [sys.executable, "-c", "from keyss.cli.process import main; main()"]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-SIZE = ("--preset", "quick", "--iterations", "150", "--max-gaussians", "100", "--device", "cpu")
+SIZE = (
+    "--preset",
+    "quick",
+    "--iterations",
+    "150",
+    "--max-gaussians",
+    "100",
+    "--device",
+    "cpu",
+    "--seed",
+    "0",
+)
 UNFINISHED = ("unfinished", "lock", "checkpoint")  # in names of what may not be left
 
 

@@ -58,7 +58,7 @@ class FinishedParts:
 
     def keep(self, part: str, result: PartResult[Any]) -> None:
         for name, picture in result.pictures.items():
-            (self.folder / part).mkdir(exist_ok=True)
+            (self.folder / part).mkdir(exist_ok=True, mode=0o700)
             write_bytes(self.folder / part / name, png_bytes(picture))
         kept = _FinishedPart(section=result.section, pictures=tuple(result.pictures))
         write_record(self.folder / f"{part}.json", kept)

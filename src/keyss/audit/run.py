@@ -111,7 +111,7 @@ def audit(
 def _inputs(subject: AuditSubject, seed: int) -> dict[str, object]:
     """What finished parts depend on."""
     return {
-        "payloads": [secret.fingerprint() for secret in subject.run.opened],
+        "payloads": subject.run.config.payloads,
         "stego": subject.stego.digest(),
         "original": subject.original.digest(),
         "scenes": [scene.digest() for scene in subject.scenes],

@@ -73,7 +73,7 @@ def subject_of(
     """Read, reveal and fit what the audit needs; plain models are kept in the run's `folder` and used again.
 
     `original`: a plain model of the cover, by default the run's own. `controls`: how many are trained, from
-    the seeds after the run's own and `seed`. Raises UsageError without a plain model of the cover.
+    seeds that follow from the run's own and `seed`. Raises UsageError without a plain model of the cover.
     """
     scenes = run.scenes()
     plain, *baselines = run.plain_models()
@@ -85,7 +85,7 @@ def subject_of(
     config = run.config.options.fit
     if original is not None or run.config.models_given[0]:  # whose size is not that of this run
         config = replace(config, max_gaussians=max(len(plain), 16))
-    seeds = tuple(run.config.options.fit.seed + seed + index for index in range(1, controls + 1))
+    seeds = tuple(run.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
     return AuditSubject(
         run=run,
         scenes=tuple(scenes),

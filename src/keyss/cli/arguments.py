@@ -22,7 +22,9 @@ def optional(metavar: str, help: str, otherwise: str, aliases: list[str] | None 
 Device = Annotated[
     Literal["auto", "cpu", "cuda"], arg(help="Where to compute; auto takes a CUDA GPU where there is one.")
 ]
-Seed = Annotated[int | None, optional("N", "Seed of everything random.", "the preset's")]
+Seed = Annotated[
+    int | None, optional("N", "Seed of everything random, to repeat a run.", "drawn by the system")
+]
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "File with the key, once for each secret.", "KEYSS_KEY, or a hidden prompt"),
@@ -54,8 +56,7 @@ def preset_sizes(presets: Mapping[str, FitConfig]) -> str:
 
 def schedule(iterations: int | None, max_gaussians: int | None, seed: int | None) -> dict[str, int]:
     """What was asked for on the command line of the fields of `FitConfig`."""
-    checked = None if seed is None else checked_seed(seed)
-    asked = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": checked}
+    asked = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": seed}
     return {name: value for name, value in asked.items() if value is not None}
 
 

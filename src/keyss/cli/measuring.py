@@ -23,7 +23,7 @@ def evaluate(
         int | None, optional("N", "Number of random wrong keys to try.", "32, where there is a decoder")
     ] = None,
     device: Device = "auto",
-    seed: Annotated[int | None, optional("N", "Seed of the wrong keys.", "0")] = None,
+    seed: Annotated[int | None, optional("N", "Seed of the wrong keys.", "the run's")] = None,
 ) -> None:
     """Measure a hiding run on test views, with the keys and with wrong ones.
 

@@ -55,7 +55,8 @@ def run_demo(
 ) -> DemoResult:
     """Everything from photos to a comparison picture, in the folder `out`.
 
-    The key is `demo-key-SEED`, known to everybody. On the CPU, one seed gives the same `stego.ply` and
+    The key is `demo-key-SEED`, known to everybody, and so is the seed: the pictures are to be the same every
+    time, and nothing has to stay hidden. On the CPU, one seed gives the same `stego.ply` and
     `secret.ply` every time. Raises KeyssError and its children; whatever is raised, Ctrl-C included,
     nothing of the demo stays in the folder.
     """

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import secrets
+from dataclasses import dataclass, replace
 
 from keyss.core.errors import UsageError
+
+MOST_SEED = 2**48 - 1  # every reader of JSON takes it as it is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +23,8 @@ class FitConfig:
     max_gaussians: int = 30_000  # cap; pruning always makes room below it
     sh_degree: int = 3
     ssim_weight: float = 0.2  # lambda of the photometric loss
-    seed: int = 0
+    # Without one, a run draws its own from the system when it begins: nobody else can repeat that run.
+    seed: int | None = None
 
     means_rate: float = 1.6e-4  # times the scene's extent, decays to 1 % of it
     scales_rate: float = 5e-3
@@ -47,6 +52,26 @@ class FitConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise UsageError(f"`{name}`: expected {low} to {high}, got {value}")
+        if self.seed is not None and not 0 <= self.seed <= MOST_SEED:
+            raise UsageError(f"`seed`: expected 0 to {MOST_SEED}, got {self.seed}")
+
+    def seeded(self, otherwise: int | None = None) -> FitConfig:
+        """The same with a seed: its own, else `otherwise`, else one that the system draws now."""
+        if self.seed is not None:
+            return self
+        return replace(self, seed=secrets.randbelow(MOST_SEED + 1) if otherwise is None else otherwise)
+
+    @property
+    def known_seed(self) -> int:
+        """The seed of a run that has begun. Raises ValueError without one: see `seeded`."""
+        if self.seed is None:
+            raise ValueError("a run begins with a seed: `seeded` draws one")
+        return self.seed
+
+    def seed_of(self, use: str) -> int:
+        """A seed for one part of a run, from which nothing follows of those of the other parts."""
+        digest = hashlib.sha256(f"keyss/v1/seed {self.known_seed} {use}".encode()).digest()
+        return int.from_bytes(digest[:8], "little") & MOST_SEED
 
     def sh_degree_at(self, iteration: int) -> int:
         """SH degree in use: one more every 1,000 iterations or every sixth of a shorter run."""

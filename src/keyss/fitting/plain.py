@@ -47,7 +47,7 @@ class PlainRun:
         self.background = scene.background.to(device)
         self.iterations = config.iterations
         self.iteration = 0
-        self.generator = torch.Generator().manual_seed(config.seed)
+        self.generator = torch.Generator().manual_seed(config.known_seed)
         points, colors = initial_points(scene, config.max_gaussians, self.generator)
         start = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
         self.parameters = to_parameters(start, device)
@@ -106,17 +106,17 @@ def fit_scene(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> FitResult:
-    """Train plain 3DGS on the training views of `scene`.
+    """Train plain 3DGS on the training views of `scene`; what is to be resumed needs a seed.
 
     Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a checkpoint of another run.
     """
-    config = config or FitConfig()
+    config = (config or FitConfig()).seeded()
     run = PlainRun(scene, config, torch.device(device))
     seconds = train(
         run,
         title,
         fingerprint={"scene": scene.digest(), "config": asdict(config), "device": str(device)},
-        seed=config.seed,
+        seed=config.known_seed,
         checkpoint=checkpoint,
         resume=resume,
         checkpoint_seconds=config.checkpoint_seconds,

@@ -200,7 +200,10 @@ class Method(Protocol):
         """What will come of it; `options` are prepared."""
 
     def hide(self, cover: Source, secrets: Sequence[KeyedSource], options: Any, context: Context) -> Stego:
-        """Hide the secrets; `options` are prepared. Raises KeyssError and its children, Interrupted."""
+        """Hide the secrets; `options` are prepared and have a seed.
+
+        Raises KeyssError and its children, Interrupted.
+        """
 
     def unpack(self, content: Content) -> Opened:
         """The secret that lies in what a channel gave. Raises InputError for damage."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -19,6 +20,8 @@ def plain_models(
 ) -> list[Gaussians]:
     """Plain models of the scenes on the CPU, in their own frames; those that are not given are fitted.
 
+    Each from a seed of its own, which follows from that of `config`: what one model tells of its seed tells
+    nothing of the others'.
     Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
     """
     models = []
@@ -28,7 +31,7 @@ def plain_models(
             folder = context.checkpoints
             model = fit_scene(
                 scene,
-                config,
+                replace(config, seed=config.seed_of(f"plain model {index}")),
                 device=context.device,
                 title=f"plain model of the {role} ({scene.name})",
                 checkpoint=folder / f"plain-{index}.safetensors" if folder else None,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -16,7 +17,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.methods import registry
-from keyss.methods.base import MethodOptions
+from keyss.methods.base import MethodOptions, Opened
 from keyss.runs.records import read_record
 
 PathLike = str | Path
@@ -37,7 +38,7 @@ class RunConfig(Generic[OptionsT]):
     width: int | None  # to which photos were shrunk
     background: tuple[float, float, float] | None  # where it was chosen
     skip_missing: bool = False  # whether photos that are not there were left out
-    payloads: tuple[str, ...]  # `Opened.fingerprint` of each secret
+    payloads: tuple[str, ...]  # `secret_ids` of the secrets
     options: OptionsT  # of the method
 
 
@@ -63,7 +64,15 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
         raise InputError(f"{path}: method {name!r} is not known; this program has {known}")
     generic: Any = RunConfig
     config: RunConfig[MethodOptions] = read_record(path, generic[registry.METHODS[name].options])
+    if config.options.fit.seed is None:
+        raise InputError(f"{path}: expected the seed of the run, got none")
     return config
+
+
+def secret_ids(seed: int, opened: Iterable[Opened]) -> tuple[str, ...]:
+    """By what a run of this seed knows its secrets; the same secret has another name in every run."""
+    made_of = (f"keyss/v1/secret {seed} {each.fingerprint()}".encode() for each in opened)
+    return tuple(hashlib.sha256(data).hexdigest()[:16] for data in made_of)
 
 
 def path_of(source: PathLike | Scene | Gaussians) -> str | None:

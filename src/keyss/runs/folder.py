@@ -144,8 +144,8 @@ class RunFolder:
         """
         try:
             with _typed(self.path):
-                (self.path / PRIVATE).mkdir(parents=True, exist_ok=True)
-                (self.path / PRIVATE).chmod(0o700)
+                self.path.mkdir(parents=True, exist_ok=True)
+                _keep_private(self.path)
             with lock(self.path / _LOCK):
                 before = read_manifest(self.path)  # again: now nobody else changes it
                 if not self._continues:
@@ -182,7 +182,7 @@ class RunFolder:
         with _typed(self.path):
             for name, write in writers.items():
                 _refuse_foreign(self.path, name)
-                (staging / name).parent.mkdir(parents=True, exist_ok=True)
+                _make_folders(self.path, f"{_STAGING}/{name}")
                 write(staging / name)
                 written = [staging / name]
                 if written[0].is_dir():
@@ -207,7 +207,7 @@ class RunFolder:
         try:
             for name in self._names:
                 staged, target = self.path / _STAGING / name, self.path / name
-                target.parent.mkdir(parents=True, exist_ok=True)
+                _make_folders(self.path, name)
                 if name.startswith(f"{PUBLISH}/"):
                     staged.chmod(0o666 & ~_umask())
                 os.replace(staged, target)
@@ -267,7 +267,7 @@ def clear(folder: Path) -> None:
 def write_again(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
     """Write a file of a finished stage anew. Raises OutputError, also where a process is at work."""
     with _typed(folder):
-        (folder / PRIVATE).mkdir(mode=0o700, exist_ok=True)
+        _keep_private(folder)
         with lock(folder / _LOCK):
             _write_entered(folder, stage, name, write)
 
@@ -291,6 +291,15 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
+def recorded_seed(folder: Path, *names: str) -> int | None:
+    """The seed of the interrupted run in a folder, which is this argument of it; None where there is none."""
+    running = read_manifest(folder).running
+    found: Any = running and running.arguments
+    for name in names:
+        found = found.get(name) if isinstance(found, dict) else None
+    return found if isinstance(found, int) else None
+
+
 def _drop_unfinished(folder: Path, there: Manifest) -> None:
     """Remove the traces of a run that `there` knows to be unfinished.
 
@@ -308,8 +317,21 @@ def _write_entered(folder: Path, stage: str, name: str, write: Callable[[Path], 
     if not any(name in names for names in there.files.values()):
         names = {**there.files, stage: (*there.files.get(stage, ()), name)}
         write_record(folder / MANIFEST, replace(there, files=names))
-    (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
+    _make_folders(folder, name)
     write(folder / name)
+
+
+def _keep_private(folder: Path) -> None:
+    """Make the part of a run's folder that is its owner's alone; one of others gets so."""
+    (folder / PRIVATE).mkdir(mode=0o700, exist_ok=True)
+    (folder / PRIVATE).chmod(0o700)
+
+
+def _make_folders(folder: Path, name: str) -> None:
+    """The folders of a file in a run's folder: those in `private/` are its owner's alone, wherever moved."""
+    mode = 0o700 if name.startswith(f"{PRIVATE}/") else 0o777
+    for parent in reversed(PurePosixPath(name).parents[:-1]):
+        (folder / parent).mkdir(mode=mode, exist_ok=True)
 
 
 def _refuse_foreign(folder: Path, name: str) -> None:

@@ -18,7 +18,7 @@ from keyss.files.streams import is_standard
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
-from keyss.runs.config import Background, PathLike, RunConfig, read_config
+from keyss.runs.config import Background, PathLike, RunConfig, read_config, secret_ids
 from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, is_run, model_in, plain_names, run_folder
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
@@ -79,10 +79,9 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego, sidecar = read_model(folder / STEGO), sidecar_beside(folder / STEGO)
-    found = {}
-    for key in keys:
-        opened = open_file(stego, key, sidecar)
-        found[opened.fingerprint()] = (opened, key)
+    every = [open_file(stego, key, sidecar) for key in keys]
+    names = secret_ids(config.options.fit.known_seed, every)
+    found = dict(zip(names, zip(every, keys, strict=True), strict=True))
     if set(found) != set(config.payloads):
         raise UsageError(
             f"expected the keys of all {len(config.payloads)} secret(s), got {len(found)} of them"

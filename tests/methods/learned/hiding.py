@@ -45,12 +45,14 @@ def hide_scenes(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Hidden:
-    """Hide `scenes[1:]` in `scenes[0]`; models are fitted where `plains` has none."""
+    """Hide `scenes[1:]` in `scenes[0]`, with seed 0 unless `options` have one.
+
+    Models are fitted where `plains` has none.
+    """
     given = plains or [None] * len(scenes)
     method = registry.get("learned")
-    options = method.prepare(
-        [SceneInput(model, photos=True) for model in given], replace(options, sidecar=sidecar)
-    )
+    options = replace(options, sidecar=sidecar, fit=options.fit.seeded(0))
+    options = method.prepare([SceneInput(model, photos=True) for model in given], options)
     context = Context(torch.device("cpu"), checkpoints, resume, reporter)
     cover, *secrets = map(Source, scenes, plain_models(scenes, given, options.fit, context))
     stego = method.hide(cover, list(map(KeyedSource, secrets, keys)), options, context)

@@ -26,7 +26,7 @@ from methods.learned.hiding import Hidden, hide_scenes, open_secret
 from tiny_scenes import random_gaussians, tiny_scene
 
 CONFIG = LearnedOptions(
-    fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0),
+    fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
 )
 # What the paper has, small.
 PAPER = replace(

@@ -79,7 +79,11 @@ def test_one_outlier_costs_the_bulk_less_than_a_decibel(bits: int, name: str, va
 def test_no_share_of_hostile_values_spoils_the_bulk(
     data: st.DataObject, degree: int, more: int, share: float
 ) -> None:
-    """At most three times the error that lines for the bulk alone make: those at its edge cost 1.5 bits."""
+    """At most three times the error that lines for the bulk alone make.
+
+    2.5 times is what the rule for outliers allows a line to be stretched; what is left is for the errors of
+    rounding, of which so few numbers have no exact mean.
+    """
     model = _bulk(300, data.draw(st.integers(0, 9)), degree)
     changed = model.map(torch.clone)
     bad = torch.zeros(300, dtype=torch.bool)
@@ -97,8 +101,23 @@ def test_no_share_of_hostile_values_spoils_the_bulk(
             (getattr(each, name) - getattr(model, name))[usual].double().square().mean().sqrt()
             for each in (alone, found)
         )
-        # Values up to 4 times the 95 % quantile are no outliers, and may stretch the line so much.
-        assert float(now) <= 4 * float(own) + 1e-6, name
+        assert float(now) <= 3 * float(own) + 1e-6, name
+
+
+def test_one_value_at_the_edge_of_a_bulk_that_others_move_costs_no_more() -> None:
+    """The worst that few values can do: most of them widen the bulk, the last one lies at its new edge."""
+    model, bits = _bulk(300, degree=0), Table.floor(0).total
+    alone = _coded(model, bits)
+    for value in np.linspace(-16, 16, 17):
+        changed = _with(model, torch.arange(9), "opacity_logits", 16.0)
+        changed = _with(changed, torch.tensor([0]), "opacity_logits", float(value))
+        usual = ~torch.from_numpy(outliers(changed))
+        usual[:9] = False
+        own, now = (
+            (each.opacity_logits - model.opacity_logits)[usual].double().square().mean().sqrt()
+            for each in (alone, _coded(changed, bits))
+        )
+        assert float(now) <= 3 * float(own), value
 
 
 def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:

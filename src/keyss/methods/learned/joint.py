@@ -45,7 +45,7 @@ class JointRun:
         self.embeddings = [embedding.to(device) for embedding in embeddings]
         self.iterations = config.fit.iterations
         self.iteration = 0
-        self.generator = torch.Generator().manual_seed(config.fit.seed)
+        self.generator = torch.Generator().manual_seed(config.fit.known_seed)
         self.poses = CombinedPoses(scenes, device)
         self.watched = [subsample_views(placed.scene.test, 8) for placed in scenes]
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
@@ -68,7 +68,7 @@ class JointRun:
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
 
         with torch.random.fork_rng():
-            torch.manual_seed(config.fit.seed)
+            torch.manual_seed(config.fit.known_seed)
             # One for each secret: who opens one of them holds no network that knows another.
             self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
         for decoder, embedding in self._keyed_decoders():

@@ -90,7 +90,7 @@ class LearnedMethod:
         options = training_options(options)
         sources, keys = [cover, *(each.source for each in secrets)], [each.key for each in secrets]
         scenes = [source.scene for source in sources]
-        derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.seed))
+        derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.known_seed))
         derived = [DerivedKey(key, derivation) for key in keys]
         # What training does not reach keeps its low bits: those of a quantised model would be no good.
         entropy = hashlib.sha256(b"keyss/v1/dither" + b"".join(key.expand("writer", 32) for key in derived))
@@ -121,7 +121,7 @@ class LearnedMethod:
                 "options": json.loads(json.dumps(asdict(options))),  # tuples as they are read back
                 "device": context.device.type,
             },
-            seed=options.fit.seed,
+            seed=options.fit.known_seed,
             checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,
             resume=context.resume,
             checkpoint_seconds=options.fit.checkpoint_seconds,

@@ -130,7 +130,7 @@ def _with_decoders(
         stego = stego[run.drawn().cpu()]
     numbers = np.frombuffer(stream(discarded, "order", 8 * len(stego)), "<u8")
     stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
-    anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.seed))
+    anchors = choose_anchors(stego, torch.Generator().manual_seed(options.fit.known_seed))
     transparent = stego[stego.opacities < DRAWN_OPACITY]
     faint = None
     if options.sidecar and len(transparent):

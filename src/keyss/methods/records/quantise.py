@@ -40,7 +40,9 @@ Mask = npt.NDArray[np.bool_]
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is drawn at all
 _MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
-_BULK = 0.95  # quantile of the distances from the median that tells how far the bulk reaches
+_TAIL = 0.05  # share of the numbers that says nothing of how far the bulk reaches, on each side if both count
+_EVEN_MARGIN = 0.75  # on a line divided evenly the bulk's neighbourhood ends as many of its widths from it
+_FAR = 8.0  # on one by asinh it ends at as many times the bulk's distance from the median
 _FURTHEST = 1e30  # no value that a line may give is larger
 _CHUNK = 1 << 14  # Gaussians at a time when packing: every bit takes a byte meanwhile
 _LEAST_SPREAD = 1e-9
@@ -92,10 +94,9 @@ class _Kind(NamedTuple):
     even: bool = False  # whether their line is divided evenly, else by asinh
     clips: bool = False  # whether the furthest of the bulk may be clipped
     centred: bool = False  # whether zero is the centre
-    farthest: float = 8.0  # beyond as many times the reach of the bulk is an outlier
 
 
-_EVEN, _POSITION = _Kind(even=True, farthest=4.0), _Kind()
+_EVEN, _POSITION = _Kind(even=True), _Kind()
 _COLOUR, _HARMONIC = _Kind(clips=True), _Kind(clips=True, centred=True)
 
 
@@ -249,11 +250,26 @@ def outliers(gaussians: Gaussians) -> Mask:
     """[N] which Gaussians have a number far outside of the bulk; none where that would be all."""
     found = np.zeros(len(gaussians), bool)
     for values, _, kind in _numbers(gaussians, Table.floor(gaussians.sh_degree)):
-        sample = _sample(values)
-        centre = np.median(sample)
-        bulk = np.quantile(np.abs(sample - centre), _BULK, method="lower")
-        found |= (np.abs(values - centre) > kind.farthest * bulk).any(axis=1)
+        low, high = _neighbourhood(_sample(values), kind)
+        found |= ((values < low) | (values > high)).any(axis=1)
     return found if not found.all() else ~found
+
+
+def _neighbourhood(values: Floats, kind: _Kind) -> tuple[float, float]:
+    """The ends of what is not far outside of the bulk of `values`.
+
+    Quantiles tell how far the bulk reaches. Fewer than `_TAIL` of the values, whatever they are, cannot move
+    these beyond the others. So they make a line that is divided evenly at most 2.5 times (the bulk and two
+    margins) as long as the others alone need, and each number as much less precise.
+    """
+    if kind.even:
+        low = float(np.quantile(values, _TAIL, method="higher"))
+        high = float(np.quantile(values, 1 - _TAIL, method="lower"))
+        margin = _EVEN_MARGIN * (high - low)
+        return low - margin, high + margin
+    centre = float(np.median(values))
+    reach = _FAR * float(np.quantile(np.abs(values - centre), 1 - _TAIL, method="lower"))
+    return centre - reach, centre + reach
 
 
 def out_of_range(gaussians: Gaussians) -> int:

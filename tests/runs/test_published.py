@@ -1,0 +1,120 @@
+"""What lies beside the published model: of every method nothing that names or shows a secret."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import keyss
+from channels.low_bits.trained_like import trained_like
+from fitting.test_plain import InterruptAt
+from keyss import CarryOptions, FitConfig, Gaussians, LearnedOptions, Secret
+from keyss.core.errors import Interrupted
+from keyss.methods.base import MethodOptions
+from keyss.methods.learned.options import PRESETS
+from keyss.methods.records.encoding import CarriedSecret
+from keyss.runs.config import secret_ids
+
+KEY = "a key of many characters: 93hXmQ2"
+FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)
+METHODS = {
+    "learned": LearnedOptions(fit=FIT, iterations=4),
+    "learned with a sidecar": LearnedOptions(fit=FIT, iterations=4, sidecar=True),
+    "paper": replace(PRESETS["paper"], fit=FIT, hidden=(8, 8), branch=8, sidecar=True),
+    "carry": CarryOptions(fit=FIT),
+}
+SIDECARS = {"learned with a sidecar", "paper"}
+
+
+@pytest.fixture(autouse=True)
+def umask() -> Iterator[None]:
+    """The usual one: what is not kept private can be read by everybody."""
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+def _hide(folder: Path, options: MethodOptions, **how: object) -> Path:
+    """A hiding of models in files whose names tell what they are."""
+    names = {"of-a-meadow.ply": trained_like(1500, 0), "of-the-treasure.ply": trained_like(100, 1)}
+    for name, model in names.items():
+        keyss.write_model(folder / name, model)
+    cover, secret = (folder / name for name in names)
+    out = folder / "run"
+    keyss.hide(
+        cover,
+        [Secret(secret, KEY)],
+        method=options,
+        width=24,
+        min_psnr=0,
+        out=out,
+        **how,  # type: ignore[arg-type]
+    )
+    return out
+
+
+def _modes(folder: Path) -> dict[str, int]:
+    paths = [folder, *folder.rglob("*")]
+    return {str(path.relative_to(folder.parent)): stat.S_IMODE(path.stat().st_mode) for path in paths}
+
+
+def _telling(run: Path, folder: Path) -> list[bytes]:
+    """What would show a reader who has a guess that it is right: names, the seed, hashes and numbers."""
+    config = json.loads((run / "private" / "config.json").read_text())
+    models: list[Gaussians] = [keyss.read_model(folder / "of-the-treasure.ply")]
+    models += [keyss.read_model(path) for path in (run / "private").glob("*.ply")]
+    raw = [getattr(model, name).numpy() for model in models for name in ("means", "quats", "sh")]
+    digests = [hashlib.new(kind, each.tobytes()) for kind in ("sha256", "blake2b") for each in raw]
+    digests += [hashlib.sha256(path.read_bytes()) for path in folder.glob("*.ply")]
+    texts = [KEY, "treasure", "meadow", str(folder), str(config["options"]["fit"]["seed"])]
+    texts += [*config["payloads"], *(digest.hexdigest()[:16] for digest in digests)]
+    return [text.encode() for text in texts] + [digest.digest()[:8] for digest in digests]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_only_what_is_needed_is_published_and_it_tells_of_no_secret(tmp_path: Path, method: str) -> None:
+    run = _hide(tmp_path, METHODS[method])
+    published = {"stego.ply"} | ({"decoder.sealed"} if method in SIDECARS else set())
+    assert {path.name for path in (run / "publish").iterdir()} == published
+    assert {path.name for path in run.iterdir()} == {"publish", "private"}
+    for name in published:
+        data = (run / "publish" / name).read_bytes()
+        assert [text for text in _telling(run, tmp_path) if text in data] == [], name
+        assert data[: 1 << 12].count(b"comment") == 0
+    assert set(_modes(run / "private").values()) == {0o700, 0o600}
+
+
+def test_checkpoints_are_private_while_a_run_is_interrupted(tmp_path: Path) -> None:
+    with pytest.raises(Interrupted):
+        _hide(tmp_path, METHODS["learned"], reporter=InterruptAt(2))
+    run = tmp_path / "run"
+    modes = _modes(run / "private")
+    assert any("checkpoint" in name and name.endswith(".safetensors") for name in modes)
+    assert set(modes.values()) == {0o700, 0o600}
+    assert {path.name for path in run.iterdir()} == {"private"}
+
+
+def test_what_is_opened_is_private_wherever_it_is_written(tmp_path: Path) -> None:
+    run = _hide(tmp_path, METHODS["carry"])
+    keyss.reveal(run / "publish" / "stego.ply", KEY, out=tmp_path / "revealed.ply")
+    assert _modes(tmp_path / "revealed.ply") == {"revealed.ply": 0o600}
+    (run / "private").chmod(0o755)  # as an older program left it
+    keyss.evaluate(run, [KEY])
+    assert set(_modes(run / "private").values()) == {0o700, 0o600}
+
+
+def test_a_secret_has_another_name_in_every_run() -> None:
+    """Who sees the names of two runs cannot tell that they hide the same, nor look one up."""
+    opened = CarriedSecret(trained_like(100), 100, 568)
+    names = {seed: secret_ids(seed, [opened]) for seed in (1, 2)}
+    assert names[1] == secret_ids(1, [opened])
+    assert names[1] != names[2]
+    assert opened.fingerprint() not in names[1] + names[2]
+    assert secret_ids(1, [replace(opened, gaussians=trained_like(100, 1))]) != names[1]

@@ -1,0 +1,103 @@
+"""Randomness of training: the system's unless a seed is given, and on record either way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import keyss
+from fitting.test_plain import InterruptAt
+from keyss import CarryOptions, FitConfig, Gaussians, LearnedOptions, Secret
+from keyss.core.errors import Interrupted, OutputError
+from keyss.methods.base import MethodOptions
+from tiny_scenes import tiny_scene
+
+FIT = FitConfig(iterations=20, max_gaussians=300, grow_start=0.2, grow_every=5, evaluate_every=0)
+KEY = "a key of many characters: 93hXmQ2"
+METHODS = [LearnedOptions(fit=FIT, sidecar=True), CarryOptions(fit=FIT)]
+
+
+def _hidden(options: MethodOptions) -> Gaussians:
+    secret = Secret(tiny_scene(1), KEY)
+    return keyss.hide(tiny_scene(0), [secret], method=options, min_psnr=0).stego
+
+
+def _rotations(model: Gaussians) -> set[bytes]:
+    """Of all that training moved, without the low bits that hiding changes."""
+    bits = model.quats.numpy().view(np.uint32) & ~np.uint32(0xFFF)
+    start = np.array([1, 0, 0, 0], np.float32).view(np.uint32)
+    return {row.tobytes() for row in bits if (row != start).any()}
+
+
+def _interrupted_seed(run: Path, *names: str) -> int:
+    found = json.loads((run / "private" / "manifest.json").read_text())["running"]["arguments"]
+    for name in names:
+        found = found[name]
+    assert isinstance(found, int)
+    return found
+
+
+@pytest.mark.parametrize("options", METHODS, ids=["learned", "carry"])
+def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: MethodOptions) -> None:
+    one, two = (_rotations(_hidden(options)) for _ in range(2))
+    assert min(len(one), len(two)) > 100
+    assert not one & two
+
+
+@pytest.mark.parametrize("options", METHODS, ids=["learned", "carry"])
+def test_with_one_seed_they_have_all_in_common(options: MethodOptions) -> None:
+    one, two = (_rotations(_hidden(options.with_fit(seed=7))) for _ in range(2))
+    assert one == two
+
+
+def test_two_fits_have_no_rotation_in_common() -> None:
+    one, two = (_rotations(keyss.fit(tiny_scene(), config=FIT).gaussians) for _ in range(2))
+    assert not one & two
+
+
+def test_the_plain_models_of_one_hiding_have_seeds_of_their_own(tmp_path: Path) -> None:
+    secret = Secret(tiny_scene(0), KEY)  # the cover's own photos
+    options = CarryOptions(fit=replace(FIT, seed=7))
+    keyss.hide(tiny_scene(0), [secret], method=options, min_psnr=0, out=tmp_path / "run")
+    cover, own = (
+        keyss.read_model(tmp_path / "run" / "private" / f"{name}.ply") for name in ("cover", "secret-1")
+    )
+    assert not _rotations(cover) & _rotations(own)
+
+
+@pytest.mark.parametrize("given", [None, 7])
+def test_a_fit_goes_on_with_the_seed_that_it_began_with(tmp_path: Path, given: int | None) -> None:
+    scene, run = tiny_scene(), tmp_path / "run"
+    with pytest.raises(Interrupted):
+        keyss.fit(scene, config=replace(FIT, seed=given), out=run, reporter=InterruptAt(10))
+    seed = _interrupted_seed(run, "config", "seed")
+    assert given in (None, seed)
+    with pytest.raises(OutputError, match=rf"config: seed {seed} then, 8 now"):
+        keyss.fit(scene, config=replace(FIT, seed=8), out=run, resume=True)
+    keyss.fit(scene, config=FIT, out=run, resume=True)
+    assert json.loads((run / "private" / "config.json").read_text())["config"]["seed"] == seed
+    keyss.fit(scene, config=replace(FIT, seed=seed), out=tmp_path / "whole")
+    assert (run / "model.ply").read_bytes() == (tmp_path / "whole" / "model.ply").read_bytes()
+
+
+@pytest.mark.parametrize("iteration", [10, 30])
+def test_a_hiding_goes_on_with_the_seed_that_it_began_with(tmp_path: Path, iteration: int) -> None:
+    """Interrupted while fitting a plain model, and while training all scenes together."""
+    joint = LearnedOptions(fit=FIT, iterations=40, sidecar=True)
+    scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"
+    with pytest.raises(Interrupted):
+        keyss.hide(*scenes, method=joint, min_psnr=0, out=run, reporter=InterruptAt(iteration))
+    seed = _interrupted_seed(run, "options", "fit", "seed")
+    keyss.hide(*scenes, method=joint, min_psnr=0, out=run, resume=True)
+    metrics, config = (
+        json.loads((run / "private" / f"{name}.json").read_text()) for name in ("metrics", "config")
+    )
+    assert metrics["seed"] == config["options"]["fit"]["seed"] == seed
+    whole = replace(joint, fit=replace(joint.fit, seed=seed))
+    keyss.hide(*scenes, method=whole, min_psnr=0, out=tmp_path / "whole")
+    for name in ("stego.ply", "decoder.sealed"):
+        assert (run / "publish" / name).read_bytes() == (tmp_path / "whole" / "publish" / name).read_bytes()
