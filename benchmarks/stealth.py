@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
@@ -33,8 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys, rounded
-from keyss.channels.low_bits import LOW_BITS
-from keyss.core import Gaussians
+from keyss.core import Gaussians, UsageError
 from keyss.files.models import read_model
 from keyss.measure.stealth.confirmation import candidate_scores, confirmed
 from keyss.measure.stealth.detection import Detection, Examples, learned_detectors, single_detectors
@@ -91,7 +91,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seconds = round(time.monotonic() - started)
     print(_table(found, confirmations, files, seconds))
     if options.json:
-        record = {"seconds": seconds, "detections": found, "confirmations": confirmations}
+        named = [[file.kind, file.scene, file.pair, piece] for file, piece, _ in pieces]
+        record = {
+            "pieces": [[*name, row] for name, row in zip(named, rows, strict=True)],
+            "seconds": seconds,
+            "detections": found,
+            "confirmations": confirmations,
+        }
         Path(options.json).write_text(json.dumps(record, indent=1, default=asdict))
 
 
@@ -132,7 +138,7 @@ def _one_thread() -> None:
 
 
 def _make(job: Job) -> list[File]:
-    """The plain model, and what something is hidden in; a model that takes nothing is left out."""
+    """The plain model, and what something is hidden in."""
     cover = read_model(job.path)
     if job.given:
         return [
@@ -145,9 +151,10 @@ def _make(job: Job) -> list[File]:
     secret = carried.pruned_to_fit(cover, read_model(job.secret))
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
     made.append(File("carried", job.scene, job.path, stego, job.secret))
-    size = min(PAYLOAD_BYTES, LOW_BITS.prepare(cover).carriers)
-    sealed = embed_derived(cover, [(keys(2 * job.index + 1), os.urandom(size))], os.urandom(32))
-    return [*made, File("sealed", job.scene, job.path, sealed)]
+    with suppress(UsageError):  # a small model has no room for a payload
+        sealed = embed_derived(cover, [(keys(2 * job.index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
+        made.append(File("sealed", job.scene, job.path, sealed))
+    return made
 
 
 def _pieces(file: File) -> Iterable[tuple[str, Gaussians]]:

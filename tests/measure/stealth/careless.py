@@ -20,7 +20,9 @@ def plain(seed: int, count: int = COUNT) -> Gaussians:
     generator = torch.Generator().manual_seed(1000 + seed)
     strength = torch.exp(2.0 * torch.randn(count, 1, 1, generator=generator) - 3.0)
     sh = torch.cat([model.sh[:, :1], model.sh[:, 1:] * strength], dim=1)
-    logits = model.opacity_logits.double().abs() * 2.5 - 5.2
+    # Low bits of their own, for subtracting leaves zeros in numbers near 0.
+    noise = 1e-5 * torch.randn(count, generator=generator, dtype=torch.float64)
+    logits = model.opacity_logits.double().abs() * 2.5 - 5.2 + noise
     model = replace(model, sh=sh, opacity_logits=logits.float())
     first = model.log_scales.mean(1) + torch.randn(count, generator=generator)
     return model[first.argsort()]

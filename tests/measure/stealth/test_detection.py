@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from keyss.measure.stealth.detection import Examples, auc, learned_detectors, single_detectors
+from keyss.measure.stealth.detection import Examples, areas, learned_detectors, single_detectors
 from keyss.measure.stealth.suite import stealth_statistics
 from measure.stealth.careless import overwritten, plain, plain_rounded
 
@@ -27,14 +27,16 @@ def _examples(shift: float, seed: int = 0, models: int = 24, statistics: int = 6
 def test_the_area_is_that_of_scikit_learn() -> None:
     random = np.random.default_rng(0)
     hidden, scores = random.integers(0, 2, 200), random.integers(0, 20, 200).astype(float)
-    assert auc(scores, hidden) == pytest.approx(roc_auc_score(hidden, scores))
+    scene = np.arange(200) % 2
+    expected = [roc_auc_score(hidden[scene == each], scores[scene == each]) for each in (0, 1)]
+    assert areas(scores[:, None], hidden, scene) == pytest.approx(np.mean(expected))
 
 
 def test_a_statistic_that_tells_is_found() -> None:
     found, chance = single_detectors(_examples(3.0))
     assert found[0].name == "0"
     assert found[0].auc > 0.95 > chance
-    assert all(each.auc > 0.9 for each in learned_detectors(_examples(3.0)))
+    assert all(each.auc > 0.85 for each in learned_detectors(_examples(5.0)))
 
 
 def test_the_best_of_many_random_ones_is_no_better_than_chance() -> None:
@@ -43,8 +45,14 @@ def test_the_best_of_many_random_ones_is_no_better_than_chance() -> None:
     assert all(abs(each.auc - 0.5) < 0.25 for each in learned_detectors(_examples(0.0, seed=3)))
 
 
+def test_detectors_of_nothing_come_out_at_a_half() -> None:
+    """Not below, as when scores of scenes that learned from each other are compared."""
+    found = [each.auc for seed in range(12) for each in learned_detectors(_examples(0.0, seed, statistics=5))]
+    assert np.mean(found) == pytest.approx(0.5, abs=0.06)
+
+
 def test_a_direction_that_holds_in_one_scene_only_does_not_count() -> None:
-    examples = _examples(0.0, models=40)
+    examples = _examples(0.0, models=40, statistics=8)
     odd = examples.scene == 0
     examples.values[odd, 1] += 9.0 * examples.hidden[odd]
     found, _ = single_detectors(examples)
@@ -62,4 +70,4 @@ def test_careless_embedding_is_told_where_bits_were_not_random(natural, least: f
             scenes.append(str(seed % SCENES))
             models.append(str(seed))
     examples = Examples.of(rows, hidden, scenes, models)
-    assert all(least <= each.auc <= most for each in learned_detectors(examples))
+    assert least <= max(each.auc for each in learned_detectors(examples)) <= most

@@ -16,7 +16,8 @@ from keyss.measure.stealth.words import Floats, Ints
 
 _DRAWS = 300  # of a bootstrap
 _EXCHANGES = 100
-_BEST = 12  # statistics that tell most, for logistic regression
+_BEST = 12  # statistics that tell most, for logistic regression ...
+_FEWEST = 16  # ... one for so many examples, for others fit by chance
 MOST_NAMED = 10  # single detectors
 
 
@@ -58,18 +59,21 @@ def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detecti
     Its direction, and what is usual, come from the other scenes.
     """
     held_out = _HeldOut.of(examples)
-    areas = held_out.areas(examples.hidden)
+    scores = held_out.scores(examples.hidden)
+    found = areas(scores, examples.hidden, examples.scene)
     random = np.random.default_rng(seed)
     largest = []
     for _ in range(_EXCHANGES):
         flip = random.integers(0, 2, examples.model.max() + 1)[examples.model]
-        largest.append(held_out.areas(examples.hidden ^ flip).max())
-    scores = held_out.scores(examples.hidden)
-    found = [
-        Detection(examples.names[index], float(areas[index]), _error(scores[:, index], examples))
-        for index in np.argsort(-areas)[:MOST_NAMED]
+        exchanged = examples.hidden ^ flip
+        largest.append(areas(held_out.scores(exchanged), exchanged, examples.scene).max())
+    worst = np.argsort(-found)[:MOST_NAMED]
+    errors = _errors(scores[:, worst], examples)
+    named = [
+        Detection(examples.names[index], float(found[index]), float(error))
+        for index, error in zip(worst, errors, strict=True)
     ]
-    return found, float(np.quantile(largest, 0.95))
+    return named, float(np.quantile(largest, 0.95))
 
 
 def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
@@ -91,7 +95,7 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
                 # By rank, for a few statistics have tails of many standard deviations.
                 spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
                 above = _lean(_ranks(train), examples.hidden[~held])
-                best = np.argsort(-np.abs(above))[:_BEST]
+                best = np.argsort(-np.abs(above))[: min(_BEST, 1 + len(train) // _FEWEST)]
                 train, test = train[:, best], test[:, best]
                 machine = make_pipeline(spread, LogisticRegression(C=0.1, max_iter=2000))
             else:
@@ -99,16 +103,31 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
                     max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=seed
                 )
             scores[held] = machine.fit(train, examples.hidden[~held]).decision_function(test)
-        found.append(Detection(f"{name} over all", auc(scores, examples.hidden), _error(scores, examples)))
+        (area,) = areas(scores[:, None], examples.hidden, examples.scene)
+        (error,) = _errors(scores[:, None], examples)
+        found.append(Detection(f"{name} over all", float(area), float(error)))
     return found
 
 
-def auc(scores: Floats, hidden: Ints) -> float:
-    """Area under the ROC curve, ties counting half."""
-    ranks = _ranks(scores[:, None])[:, 0]
-    positives = int(hidden.sum())
-    negatives = len(hidden) - positives
-    return float((ranks[hidden == 1].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+def areas(scores: Floats, hidden: Ints, scene: Ints) -> Floats:
+    """[S] areas under the ROC curves of scores [E, S], ties counting half: means over scenes.
+
+    Each scene's files are compared with each other only. Over all together, scores of scenes that learned
+    from each other would be compared, and detectors of nothing come out below a half.
+    """
+    total, weights = np.zeros(scores.shape[1]), 0
+    for each in np.unique(scene):
+        held = scene == each
+        own = hidden[held]
+        positives = int(own.sum())
+        negatives = len(own) - positives
+        if positives and negatives:
+            ranks = _ranks(scores[held])
+            above = ranks[own == 1].sum(axis=0) - positives * (positives + 1) / 2
+            total += len(own) * above / (positives * negatives)
+            weights += len(own)
+    found: Floats = total / max(weights, 1)
+    return found
 
 
 def _ranks(values: Floats) -> Floats:
@@ -145,13 +164,6 @@ class _HeldOut:
             signed[held] = self.centred[held] * np.where(_lean(ranks, labels) >= 0, 1, -1)
         return signed
 
-    def areas(self, hidden: Ints) -> Floats:
-        """[S] areas of all statistics."""
-        ranks = _ranks(self.scores(hidden))
-        positives = int(hidden.sum())
-        found: Floats = ranks[hidden == 1].sum(axis=0) - positives * (positives + 1) / 2
-        return found / (positives * (len(hidden) - positives))
-
 
 def _lean(ranks: Floats, hidden: Ints) -> Floats:
     """[S] how much higher statistics rank where something is hidden."""
@@ -159,13 +171,21 @@ def _lean(ranks: Floats, hidden: Ints) -> Floats:
     return found
 
 
-def _error(scores: Floats, examples: Examples, draws: int = _DRAWS) -> float:
-    """Standard error of an area: whole models are drawn again."""
+def _errors(scores: Floats, examples: Examples) -> Floats:
+    """[S] standard errors of areas: whole models are drawn again, scene by scene."""
     random = np.random.default_rng(0)
     rows = [np.flatnonzero(examples.model == model) for model in np.unique(examples.model)]
-    areas = []
-    for _ in range(draws):
-        drawn = np.concatenate([rows[index] for index in random.integers(len(rows), size=len(rows))])
-        if 0 < examples.hidden[drawn].sum() < len(drawn):
-            areas.append(auc(scores[drawn], examples.hidden[drawn]))
-    return float(np.std(areas))
+    scenes = np.array([examples.scene[own[0]] for own in rows])
+    strata = [np.flatnonzero(scenes == scene) for scene in np.unique(scenes)]
+    found = []
+    for _ in range(_DRAWS):
+        chosen = np.concatenate(
+            [
+                random.choice(np.flatnonzero(scenes == scene), (scenes == scene).sum())
+                for scene in np.unique(scenes)
+            ]
+        )
+        drawn = np.concatenate([rows[index] for index in chosen])
+        found.append(areas(scores[drawn], examples.hidden[drawn], examples.scene[drawn]))
+    errors: Floats = np.std(found, axis=0)
+    return errors
