@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from keyss.core import Camera, Gaussians, Scene, View
 from keyss.core.gaussians import SH_C0
@@ -37,13 +38,25 @@ def random_gaussians(count: int = 200, seed: int = 0, sh_degree: int = 3) -> Gau
     k = (sh_degree + 1) ** 2
     sh = 0.05 * torch.randn(count, k, 3, generator=generator)
     sh[:, 0] = (torch.rand(count, 3, generator=generator) - 0.5) / SH_C0
-    return Gaussians(
+    model = Gaussians(
         means=0.5 * torch.randn(count, 3, generator=generator),
         quats=torch.randn(count, 4, generator=generator),
-        log_scales=math.log(0.12) + 0.3 * torch.randn(count, 3, generator=generator),
-        opacity_logits=1 + torch.randn(count, generator=generator),
-        sh=sh,
+        log_scales=_to_the_last_bit(math.log(0.12) + 0.3 * torch.randn(count, 3, generator=generator)),
+        opacity_logits=_to_the_last_bit(1 + torch.randn(count, generator=generator)),
+        sh=_to_the_last_bit(sh),
     )
+    # Multiples of numbers of single precision have low bits that depend on each other; trained ones have not.
+    return model.map(
+        lambda values: (
+            values * (1 + 1e-6 * torch.randn(values.shape, generator=generator, dtype=torch.float64))
+        ).float()
+    )
+
+
+def _to_the_last_bit(values: Tensor) -> Tensor:
+    """`values` as training leaves them: a sum lies on the grid of its larger part, which low bits show."""
+    noise = torch.rand(values.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    return (values.double() + 2e-6 * (noise - 0.5)).float()
 
 
 def tiny_scene(seed: int = 0, views: int = 16, distance: float = 4.0) -> Scene:

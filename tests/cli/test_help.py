@@ -11,8 +11,24 @@ import pytest
 
 from cli.said import COMMANDS, Said
 from keyss import __version__
+from keyss.files.ply import write_ply
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.methods import registry
+from tiny_scenes import random_gaussians
+
+LOADS_LITTLE = """
+import contextlib, io, sys
+from keyss.cli import main
+
+def loaded(*arguments):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main(arguments)
+    return set(sys.modules)
+
+for arguments in (["--help"], ["keygen"], ["info", "nowhere"]):
+    assert not loaded(*arguments) & {"torch", "numpy", "keyss.methods"}, arguments
+assert not loaded("info", sys.argv[1]) & {"numba", "scipy", "keyss.methods"}
+"""
 
 
 class TestHelp:
@@ -68,11 +84,14 @@ class TestHelp:
         said = keyss("hide", "--method", method, "--help").out
         assert [line.rstrip() for line in said.splitlines()] == meant.splitlines()
 
-    def test_needs_no_method_to_be_loaded(self) -> None:
-        """`keyss --help` answers at once: torch takes seconds."""
-        program = "import sys; from keyss.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-        program += "assert not {'torch', 'keyss.methods'} & set(sys.modules)"
-        subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+    def test_what_needs_little_loads_little(self, tmp_path: Path) -> None:
+        """Help, a new key and a wrong name answer at once, for torch takes seconds; methods take one more."""
+        write_ply(tmp_path / "model.ply", random_gaussians(10))
+        subprocess.run(
+            [sys.executable, "-c", LOADS_LITTLE, tmp_path / "model.ply"],
+            check=True,
+            stderr=subprocess.DEVNULL,
+        )
 
     @pytest.mark.parametrize("arguments", [("--version",), ("-V",), ("version",)])
     def test_of_the_version(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:

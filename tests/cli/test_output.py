@@ -39,11 +39,11 @@ def shell(redirection: str, *arguments: object, **environment: str) -> subproces
     ],
 )
 def test_results_are_whole_whatever_becomes_of_the_output(
-    world: Path, tmp_path: Path, redirection: str, status: int
+    tmp_path: Path, redirection: str, status: int
 ) -> None:
-    secret = tmp_path / "secret.ply"
-    stego, key = world / "hidden" / "publish" / "stego.ply", world / "key.txt"
-    arguments = ["reveal", stego, "--key-file", key, "-o", secret]
+    """Of a command that says where its result is, and starts at once."""
+    key = tmp_path / "key.txt"
+    arguments: list[object] = ["keygen", "-o", key]
     if redirection == "| left":
         done = _with_a_reader_that_leaves(arguments)
     else:
@@ -51,6 +51,15 @@ def test_results_are_whole_whatever_becomes_of_the_output(
     assert done.returncode == status, done.stderr
     assert b"Traceback" not in done.stderr
     assert b"internal error" not in done.stderr
+    assert len(key.read_bytes()) == 17
+    assert [path.name for path in tmp_path.iterdir()] == ["key.txt"]
+
+
+@pytest.mark.parametrize(("redirection", "status"), [("<&- >&- 2>&-", 0), (">/dev/full", 5)])
+def test_so_is_a_secret(world: Path, tmp_path: Path, redirection: str, status: int) -> None:
+    secret, stego = tmp_path / "secret.ply", world / "hidden" / "publish" / "stego.ply"
+    done = shell(redirection, "reveal", stego, "--key-file", world / "key.txt", "-o", secret)
+    assert done.returncode == status, done.stderr
     assert len(read_ply(secret)) > 0
     assert [path.name for path in tmp_path.iterdir()] == ["secret.ply"]
 

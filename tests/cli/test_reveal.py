@@ -17,9 +17,7 @@ import torch
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
 from keyss.channels.base import Payload
-from keyss.channels.low_bits import LOW_BITS, cells, channel
-from keyss.channels.low_bits.bits import identities
-from keyss.channels.low_bits.channel import derivation_of, salts
+from keyss.channels.low_bits import LOW_BITS, cells, reading
 from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
@@ -39,9 +37,7 @@ def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
     prepared = LOW_BITS.prepare(cover)
     (records,) = encode_all(prepared, [secret], "carry")
     records = replace(records, header=_COUNT.pack(claimed) + records.header[_COUNT.size :])
-    names = salts(identities(cover))
-    keys = [DerivedKey(KEY, derivation_of(names[0]))] * len(names)  # the first salt is enough for a reader
-    return prepared.embed_derived([(keys, records)])
+    return prepared.embed([(KEY, records)])
 
 
 def learned(cover: Gaussians, key: str) -> tuple[Gaussians, bytes]:
@@ -126,7 +122,7 @@ class TestOpensNothing:
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         """Counts derived keys, and blocks of AES."""
         done = {"keys": 0, "blocks": 0}
-        encrypt, derive = cells._encrypt, channel.DerivedKey
+        encrypt, derive = cells._encrypt, reading.DerivedKey
 
         def counted(key: bytes, data: np.ndarray) -> np.ndarray:
             done["blocks"] += data.size // 16
@@ -137,7 +133,7 @@ class TestOpensNothing:
             return derive(*arguments)  # type: ignore[arg-type]
 
         monkeypatch.setattr(cells, "_encrypt", counted)
-        monkeypatch.setattr(channel, "DerivedKey", derived)
+        monkeypatch.setattr(reading, "DerivedKey", derived)
         return done
 
     def test_in_the_same_words_after_the_same_work(
@@ -154,7 +150,7 @@ class TestOpensNothing:
             made.append(dict(work))
         assert said[0] == said[1] == said[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == channel.SALTS_TRIED
+        assert made[0]["keys"] == reading.SALTS_TRIED
         assert_refused(said[0], 3, "opens nothing here")
         for word in ("another key", "decoder.sealed", "converted or quantised", "moved", "trained on"):
             assert word in said[0].err

@@ -8,9 +8,6 @@ another. Keys are text, normalised to NFKC, so that one key typed on two systems
 from __future__ import annotations
 
 import hmac
-import math
-import secrets
-import string
 import unicodedata
 from dataclasses import dataclass
 
@@ -27,26 +24,10 @@ from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
 
-ALPHABET = string.ascii_letters + string.digits
 SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
 MAX_KEY_BYTES = 4096
-
-
-def generate_key(length: int = 16) -> str:
-    """A random alphanumeric key from the system's random source: 5.95 bits a character.
-
-    Raises UsageError for a length outside 1 to 1024.
-    """
-    if not 1 <= length <= 1024:
-        raise UsageError(f"a key has 1 to 1024 characters, not {length}")
-    return "".join(secrets.choice(ALPHABET) for _ in range(length))
-
-
-def length_for(bits: int) -> int:
-    """The number of characters with which `generate_key` reaches `bits`."""
-    return math.ceil(bits / math.log2(len(ALPHABET)))
 
 
 TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4

@@ -18,6 +18,8 @@ from keyss.keys.derivation import expand
 
 DATA_KEY_BYTES = 32
 MAX_PAYLOAD_BYTES = 64 << 20  # before compression
+# A payload that compresses to n bytes has at most MOST_RATIO n + SMALL_PAYLOAD, or is not compressed at all.
+MOST_RATIO, SMALL_PAYLOAD = 16, 1 << 20
 SMALLEST_BUCKET = 4096
 OVERHEAD = 4 + 16  # length of what is compressed, and the tag
 _NONCE = bytes(12)
@@ -67,11 +69,14 @@ def decrypt(data_key: bytes, encrypted: bytes, associated: bytes = b"") -> bytes
     # What follows is bounded although only a holder of the key can have written it.
     unpacker = zlib.decompressobj()
     try:
-        payload = unpacker.decompress(packed, MAX_PAYLOAD_BYTES)
+        payload = unpacker.decompress(packed, _most(len(packed)))
     except zlib.error as error:
         raise InputError(f"the encrypted data cannot be decompressed: {error}") from error
     if len(packed) != length or not unpacker.eof or unpacker.unused_data:
-        raise InputError("the encrypted data are not whole, or larger than 64 MiB")
+        raise InputError(
+            f"the encrypted data are not whole, or larger than the {_most(len(packed)):,} bytes that so "
+            "short data may become"
+        )
     return payload
 
 
@@ -82,4 +87,10 @@ def _cipher(data_key: bytes) -> ChaCha20Poly1305:
 
 
 def _compressed(payload: bytes) -> bytes:
-    return zlib.compress(payload, 9)
+    packed = zlib.compress(payload, 9)
+    return packed if len(payload) <= _most(len(packed)) else zlib.compress(payload, 0)
+
+
+def _most(packed: int) -> int:
+    """Bytes that `packed` bytes may become: what a reader spends memory on."""
+    return min(MAX_PAYLOAD_BYTES, MOST_RATIO * packed + SMALL_PAYLOAD)

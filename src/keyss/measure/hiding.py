@@ -19,6 +19,7 @@ from keyss.keys import random_embeddings
 from keyss.methods.base import Opened
 from keyss.rendering import render
 
+WRONG_KEYS = 32
 _FIDELITY_VIEWS = 8
 
 
@@ -74,7 +75,7 @@ def measure_hiding(
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     baselines: Sequence[Gaussians | None],  # plain models of the scenes, each in its own frame
     *,
-    wrong_keys: int = 32,
+    wrong_keys: int = WRONG_KEYS,
     seed: int = 0,
 ) -> HidingQuality:
     """Qualities of cover and secrets, of plain models, and what wrong keys show.

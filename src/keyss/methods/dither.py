@@ -15,17 +15,19 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.low_bits.bits import is_uniform
+from keyss.channels.low_bits.usable import chance_of_bits, is_uniform
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 from keyss.rendering import render
 from keyss.rendering.orbit import orbit
 
+_BITS, _CHANCE = 9, 1e-6  # low bits that depend on each other are not random
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
 _SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
 _VIEWS, _SIZE = 4, 256
 _SAMPLE = 20_000  # Gaussians
+_UNIT = 1e-5  # by which the length of a unit quaternion may differ from 1
 _FAINT = 1e-3  # standard deviation of harmonics that a model does not have
 
 Floats = npt.NDArray[np.float32]
@@ -34,9 +36,11 @@ Floats = npt.NDArray[np.float32]
 def dither(model: Gaussians, entropy: bytes) -> Gaussians:
     """`model` with new low bits where they are not random; positions and constant colours stay.
 
-    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay as they are.
+    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay as they are, and so do
+    quaternions of unit length, which is known exactly: see `keyss.channels.low_bits.bits`.
     """
     changed = {}
+    unit = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs() < _UNIT
     for name in ("log_scales", "quats", "opacity_logits", "sh"):
         values = getattr(model, name).detach().cpu().clone(memory_format=torch.contiguous_format)
         columns = values.view(len(values), -1).numpy()
@@ -45,6 +49,8 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
                 random = stream(entropy, f"dither/{name}/{column}", 8 * len(columns))
                 noise = np.frombuffer(random, "<u8").astype(np.float64) / 2.0**63 - 1
                 columns[:, column] = _dithered(columns[:, column], noise)
+        if name == "quats":
+            values[unit] = model.quats.detach().cpu()[unit]
         changed[name] = values
     return Gaussians(means=model.means, **changed)
 
@@ -63,8 +69,10 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     if count <= 0:
         return model
     seed = int.from_bytes(stream(entropy, "dither/raised", 8), "little") >> 1
-    noise = torch.randn(len(model), count // 3, 3, generator=torch.Generator().manual_seed(seed))
-    return replace(model, sh=torch.cat([model.sh, _FAINT * noise.to(model.sh)], dim=1))
+    generator = torch.Generator().manual_seed(seed)
+    # Scaled before they are rounded: a product of single precision keeps a trace of its factor.
+    noise = _FAINT * torch.randn(len(model), count // 3, 3, generator=generator, dtype=torch.float64)
+    return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
 
 
 def cost(before: Gaussians, after: Gaussians) -> float:
@@ -80,7 +88,10 @@ def cost(before: Gaussians, after: Gaussians) -> float:
 
 
 def _is_natural(values: Floats) -> bool:
-    return len(np.unique(values)) > _FEW * len(values) and is_uniform(values)
+    if len(np.unique(values)) <= _FEW * len(values) or not is_uniform(values):
+        return False
+    words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
+    return chance_of_bits(words, _BITS) > _CHANCE
 
 
 def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:

@@ -49,12 +49,13 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
                 raise
             return Decoy.of(stego, derived)
     reader = LowBitsReader.of(stego)
-    for derived in reader.keys(key, 1) if decoy else reader.keys(key):
+    if not decoy:
+        return _unpacked(reader.open(key))
+    for derived in reader.keys(key, 1):
         try:
             return _unpacked(reader.extract(derived))
         except WrongKeyError:
-            if decoy:
-                return Decoy.of(stego, derived)
+            return Decoy.of(stego, derived)
     raise WrongKeyError("this key opens nothing here")
 
 

@@ -1,23 +1,23 @@
-"""The verb `info`: what is in a file or a folder."""
+"""The verb `info`: what is in a file or a folder.
+
+What one kind of them needs is imported where it is used: all of it together takes seconds.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from torch import Tensor
-
-from keyss.channels.sidecar import MAGIC, read_header
 from keyss.core.errors import InputError
-from keyss.core.scene import Scene
 from keyss.files.foreign import what_it_is
-from keyss.files.models import is_model_path, read_model
-from keyss.files.scenes import load_scene
 from keyss.files.streams import is_standard
-from keyss.runs.files import METRICS, MODEL, STEGO
-from keyss.runs.metrics import FitMetrics, HideMetrics
-from keyss.runs.opening import read_sidecar
-from keyss.runs.records import read_record
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from keyss.core.scene import Scene
+    from keyss.runs.metrics import FitMetrics, HideMetrics
 
 Corner = tuple[float, ...]  # [3] world units
 
@@ -91,18 +91,34 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
 
 
 def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    if is_standard(path):
-        return _model_info(path)
-    if path.is_dir():
-        if (path / STEGO).exists():
-            return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
-        if (path / MODEL).exists():
-            return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
-        return _scene_info(load_scene(path, skip_missing=True))
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
-    if is_model_path(path):
-        return _model_info(path)
+    if not is_standard(path):
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+        if path.is_dir():
+            return _folder_info(path)
+
+    from keyss.files.models import is_model_path
+
+    return _model_info(path) if is_standard(path) or is_model_path(path) else _sidecar_info(path)
+
+
+def _folder_info(path: Path) -> RunInfo | SceneInfo:
+    from keyss.files.scenes import load_scene
+    from keyss.runs.files import METRICS, MODEL, STEGO
+    from keyss.runs.metrics import FitMetrics, HideMetrics
+    from keyss.runs.records import read_record
+
+    if (path / STEGO).exists():
+        return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
+    if (path / MODEL).exists():
+        return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
+    return _scene_info(load_scene(path, skip_missing=True))
+
+
+def _sidecar_info(path: Path) -> SidecarInfo:
+    from keyss.channels.sidecar import MAGIC, read_header
+    from keyss.runs.opening import read_sidecar
+
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
     if start != MAGIC:
@@ -119,6 +135,8 @@ def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
 
 
 def _model_info(path: Path) -> ModelInfo:
+    from keyss.files.models import read_model
+
     model = read_model(path)
     return ModelInfo(
         kind="3DGS model",

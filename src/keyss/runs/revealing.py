@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict
 
 import torch
 
@@ -43,6 +44,15 @@ _CAUSE = (
     "were removed from the published file or changed in it, as pruning by opacity, cropping, editing and "
     "converting do"
 )
+
+
+class RevealOptions(TypedDict, total=False):
+    """Those of `keyss.api.reveal` that `reveal_model` takes as they are."""
+
+    decoder: PathLike | bytes | None
+    frame: Frame
+    decoy: bool
+    force: bool
 
 
 def reveal_model(

@@ -15,10 +15,12 @@ import torch
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
 from keyss.channels.low_bits import LOW_BITS, LowBitsReader
-from keyss.channels.low_bits.bits import identities, read_low_bits, usable_carriers
-from keyss.channels.low_bits.channel import _key_cipher, derivation_of, salts
-from keyss.channels.low_bits.layout import header_carriers, plan_records
-from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
+from keyss.channels.low_bits.bits import identities, read_low_bits
+from keyss.channels.low_bits.ciphers import key_cipher
+from keyss.channels.low_bits.layout import Room, plan_records
+from keyss.channels.low_bits.salts import salt_rows
+from keyss.channels.low_bits.usable import usable_carriers
+from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey
 from keyss.methods.records.encoding import check_degrees, encode_all, record_request, subsampled_counts
@@ -56,12 +58,12 @@ def rows_of(model: Gaussians) -> set[bytes]:
 
 def salt_of(model: Gaussians, own: list[DerivedKey], before: Gaussians) -> DerivedKey:
     """The key under the salt that a reader of `model` tries first."""
-    names = salts(identities(before))
-    return own[names.index(salts(identities(model))[0])]
+    return own[LowBitsReader.of(before).salts.index(LowBitsReader.of(model).salts[0])]
 
 
-def test_round_trip(stego: Gaussians, secret: Gaussians) -> None:
-    carried = extract(stego, KEY)
+def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
+    secret = secret[:400]
+    carried = extract(embed(cover, [(KEY, secret)]), KEY)
     assert carried.count == len(carried.gaussians) == len(secret)
     found = carried.gaussians
     order, other = found.means[:, 0].argsort(), secret.means[:, 0].argsort()
@@ -121,7 +123,7 @@ def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gauss
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
         carriers = LowBitsReader.of(stego)
         carried = extract_derived(carriers, own[0])
-        cells, _ = _key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
+        cells, _ = key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
         seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])  # a third key hides nothing
@@ -143,8 +145,9 @@ def test_a_secret_as_large_as_the_cover_and_three_that_share(cover: Gaussians) -
     large, own = trained_like(3000, 7), keys()
     carried = extract_derived(LowBitsReader.of(embed_derived(cover, [(own, large)])), own[0])
     assert len(carried.gaussians) == 3000
-    secrets = [(keys(seed), trained_like(1500, seed)) for seed in (1, 2, 3)]
-    stego = LowBitsReader.of(embed_derived(cover, secrets))
+    secrets = [(keys(seed), trained_like(1400, seed)) for seed in (1, 2, 3)]
+    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
+        stego = LowBitsReader.of(embed_derived(cover, secrets))
     for each, model in secrets:
         assert len(extract_derived(stego, each[0]).gaussians) == len(model)
 
@@ -183,7 +186,7 @@ def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
     assert rows_of(carried.gaussians) <= whole
     assert carried.count == len(secret)
     copies = LOW_BITS.prepare(cover).plan_records([record_request(1200, 3)])[0].copies
-    assert 0 < copies < 300
+    assert 0 < copies <= 300
     expected = 0.75 * (len(secret) - copies) + (1 - 0.25**2) * copies
     assert len(carried.gaussians) == pytest.approx(expected, abs=4 * (0.19 * 1200) ** 0.5)
 
@@ -196,18 +199,18 @@ def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     half = stego[stego.means[:, axis] > stego.means[:, axis].median()]
     found = extract_derived(LowBitsReader.of(half), salt_of(half, own, stego)).gaussians
-    assert 0.45 * len(secret) < len(found) < 0.6 * len(secret)
+    assert 0.45 * len(secret) < len(found) < 0.65 * len(secret)  # of those that are there twice, 3 in 4
     assert found.means[:, axis].median() == pytest.approx(float(secret.means[:, axis].median()), abs=0.4)
 
 
-def test_a_single_bit_costs_one_gaussian_at_most(cover: Gaussians, secret: Gaussians) -> None:
+def test_a_single_bit_costs_one_carrier_at_most(cover: Gaussians, secret: Gaussians) -> None:
     """Any bit of any value: low ones, high ones, positions; through the whole key, both salts included."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
-    own = [_derived(stego, index) for index in range(3)]
+    own = list(LowBitsReader.of(stego).keys(KEY, 3))
     whole = rows_of(extract(stego, KEY).gaussians)
     random = np.random.default_rng(0)
-    names = salts(identities(stego))
-    first = [name.tobytes() for name in identities(stego)].index(names[0])
+    names = LowBitsReader.of(stego).salts
+    first = int(salt_rows(stego, identities(stego), read_low_bits(stego))[0])
     for trial in range(60):
         row = first if trial < 5 else int(random.integers(len(stego)))
         changed = _with_flipped_bit(stego, row, int(random.integers(59)), int(random.integers(31)))
@@ -215,16 +218,12 @@ def test_a_single_bit_costs_one_gaussian_at_most(cover: Gaussians, secret: Gauss
             continue
         carriers = LowBitsReader.of(changed)
         found: set[bytes] = set()
-        for name in salts(carriers.identities)[:2]:
+        for name in carriers.salts[:2]:
             if name in names[:3]:
                 found = rows_of(extract_derived(carriers, own[names.index(name)]).gaussians)
                 break
-        assert len(whole - found) <= 1
+        assert len(whole - found) <= 2  # that divide the carrier
         assert found <= whole
-
-
-def _derived(stego: Gaussians, index: int) -> DerivedKey:
-    return DerivedKey(KEY, derivation_of(salts(identities(stego))[index]))
 
 
 def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaussians | None:
@@ -292,7 +291,7 @@ def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     carriers = LowBitsReader.of(stego)
-    cells, _ = _key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
+    cells, _ = key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
     keep = np.zeros(len(stego), bool)
     keep[np.flatnonzero(cells)[:2]] = True
     with pytest.raises(WrongKeyError):  # nothing but key cells: as good as nothing
@@ -308,25 +307,35 @@ def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians
 
 
 def test_layouts_follow_from_a_secret_s_own_size() -> None:
-    """Whole carriers up to half of them, halves above; others do not change that while there is room."""
-    small, large = record_request(40_000, 3), record_request(85_000, 3)
-    alone = plan_records([small], 90_000, 3)[0]
-    assert alone.cells_per_carrier == 1
-    assert alone.copies == 45_000 - 40_000 - header_carriers(3, small.header_bytes)
+    """Whole carriers up to a fifth of them, halves above; others do not change that while there is room."""
+    room = Room(90_000, 75)
+    left = 90_000 - 4 * room.header_carriers(record_request(1, 3).header_bytes)
+    small, middle, large = (record_request(count, 3) for count in (16_000, 40_000, 85_000))
+    alone = [plan_records([each], 90_000, 3)[0] for each in (small, middle, large)]
+    assert [each.cells_per_carrier for each in alone] == [1, 2, 2]
+    assert [each.copies for each in alone] == [left // 5 - 16_000, left // 2 - 40_000, left - 85_000]
     assert plan_records([record_request(10_000, 3)], 90_000, 3)[0].copies == 2500
-    assert plan_records([small, small], 90_000, 3) == [alone, alone]
-    halves = plan_records([large], 90_000, 3)[0]
-    assert halves.cells_per_carrier == 2
-    assert plan_records([small, large], 90_000, 3) == [alone, replace(halves, copies=0)]
-    assert [each.cells_per_carrier for each in plan_records([small] * 3, 90_000, 3)] == [2, 2, 2]
-    table = Table.of_size(8 * alone.record_bytes, 3)
+    for fitting in (
+        [small] * 4,
+        [middle] * 4,
+        [middle, middle, large],
+        [large, large],
+        [middle, middle, small],
+    ):
+        plans = plan_records(fitting, 90_000, 3)
+        assert plans == [plan_records([each], 90_000, 3)[0] for each in fitting]
+        assert room.arrangement(plans, fitting).as_alone
+    for crowded in ([small] * 5, [record_request(60_000, 3)] * 2 + [middle]):
+        plans = plan_records(crowded, 90_000, 3)
+        assert not room.arrangement(plans, crowded).as_alone
+    table = Table.of_size(8 * alone[0].record_bytes, 3)
     assert table is not None
     assert table.total > 560
 
 
 def test_too_large_a_secret_is_refused_with_the_number_that_fits(cover: Gaussians) -> None:
     prepared = LOW_BITS.prepare(cover)
-    header = header_carriers(3, record_request(1, 3).header_bytes)
+    header = Room(prepared.carriers, 75).header_carriers(record_request(1, 3).header_bytes)
     fits = 2 * (prepared.carriers - header)
     too_large, small = trained_like(8000, 5), trained_like(500, 6)
     assert prepared.record_capacity([record_request(8000, 3)]) == fits
@@ -363,7 +372,8 @@ def test_values_that_are_not_random_stay_as_they_are(cover: Gaussians) -> None:
 
 def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
     model = trained_like(1500, seed=9)
-    model = replace(model, means=model.means / 4, log_scales=model.log_scales + 1, sh=model.sh * 2)
+    log_scales = (0.7371 * model.log_scales.double()).float()
+    model = replace(model, means=model.means / 4, log_scales=log_scales, sh=model.sh * 2)
     stego = embed_derived(model, [(keys(), trained_like(1000))], entropy=os.urandom(32))
     for camera in ring_cameras(4):
         error = (render(model, camera) - render(stego, camera)).square().mean()
@@ -374,13 +384,11 @@ def test_strangers_in_the_places_of_the_first_salts_do_not_lock_out_the_key(
     stego: Gaussians, secret: Gaussians
 ) -> None:
     """Three added Gaussians come before all of the model's own in the order of salts."""
-    first = salts(identities(stego))[0]
-    strangers = trained_like(40_000, seed=9)
-    names = [row.tobytes() for row in identities(strangers)]
-    before = sorted((name, index) for index, name in enumerate(names) if name < first)[:3]
-    assert len(before) == 3
-    added = strangers[torch.tensor([index for _, index in before])]
+    own = LowBitsReader.of(stego).salts
+    added = trained_like(200, seed=9)
+    added.sh[:, 1:] *= 20
+    added = added[torch.from_numpy(salt_rows(added, identities(added), read_low_bits(added))[:3])]
     crowded = Gaussians.cat([added, stego])
-    assert first not in salts(identities(crowded))[:3]
+    assert not set(own) & set(LowBitsReader.of(crowded).salts[:3])
     assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
     assert len(extract(crowded, KEY).gaussians) == len(secret)

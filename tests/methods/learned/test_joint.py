@@ -126,9 +126,9 @@ def test_a_model_too_small_for_its_low_bits_is_refused_before_any_work() -> None
 
 def test_a_model_large_enough_carries_its_secrets() -> None:
     scenes = _scenes()[0]
-    fit = replace(CONFIG.fit, iterations=30, max_gaussians=2600, grow_every=10, grow_start=0.1)
+    fit = replace(CONFIG.fit, iterations=30, max_gaussians=3200, grow_every=10, grow_start=0.1)
     config = replace(CONFIG, fit=fit)
-    many = [random_gaussians(2600, seed=7), *_scenes()[1][1:]]
+    many = [random_gaussians(3200, seed=7), *_scenes()[1][1:]]
     hidden = hide_scenes(scenes, KEYS, config, plains=many)
     assert hidden.sidecar is None
     assert len(hidden.stego) > 2500

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from keyss.core import InputError
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
+from keyss.methods.learned import payload
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
 from tiny_scenes import random_gaussians
@@ -64,6 +65,24 @@ def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
         halved = name in dict(secret.decoder.named_parameters())
         assert torch.equal(exact, value.half().float() if halved else value), name
     assert pack_secret(opened) == PACKED
+
+
+def test_a_large_decoder_takes_the_gaussians_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its sizes are the file's: without that 3 kB could ask for 34 kB for each Gaussian at once."""
+    secret, stego = _secret(), random_gaussians()
+    with torch.no_grad():
+        for parameter in secret.decoder.parameters():
+            parameter.normal_(std=0.1)
+    at_once = secret.decode(stego, secret.embedding)
+    sizes: list[int] = []
+    secret.decoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
+    monkeypatch.setattr(payload, "_DECODED_NUMBERS", 7 * secret.decoder.shape.numbers)
+    with torch.no_grad():
+        in_parts = secret.decode(stego, secret.embedding)
+    assert max(sizes) == 7
+    assert sum(sizes) == len(stego)
+    for name, values in vars(at_once).items():
+        torch.testing.assert_close(getattr(in_parts, name), values.detach())
 
 
 def test_another_version_is_refused_by_number() -> None:

@@ -14,7 +14,7 @@ import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, LearnedOptions, Secret
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
-from keyss.channels.low_bits.bits import usable_carriers
+from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import InputError, UsageError
 from keyss.fitting.config import FitConfig
 from keyss.measure.hiding import mean_psnr

@@ -18,7 +18,7 @@ from scipy.special import bdtrc
 
 from keyss.channels.low_bits import reed_solomon
 from keyss.channels.low_bits.bits import bytes_per_gaussian
-from keyss.channels.low_bits.layout import header_carriers, part_bytes, shares
+from keyss.channels.low_bits.layout import Room, shares
 from keyss.core.errors import InputError, UsageError
 from keyss.keys.encryption import encrypted_size
 
@@ -61,6 +61,11 @@ class Spread:
 
     def decode(self, chunks: Bytes, size: int) -> bytes:
         """The first `size` bytes from numbered chunks in any order. Raises InputError if too few are left."""
+        if self.blocks * self.k > len(chunks):  # before there is memory for that many
+            raise InputError(
+                "the key is right, but too much of the model was removed: there are "
+                f"{len(chunks):,} of the {self.blocks * self.k:,} chunks that are needed"
+            )
         blocks: list[dict[int, Bytes]] = [{} for _ in range(self.blocks)]
         for number, chunk in zip(_numbers(chunks).tolist(), chunks[:, NUMBER_BYTES:], strict=True):
             if number < self.blocks * self.n:
@@ -87,15 +92,15 @@ def _numbers(chunks: Bytes) -> npt.NDArray[np.int64]:
     return numbers
 
 
-def chunk_bytes(sh_degree: int) -> int:
-    """Bytes of payload in one cell: 0, 12, 35 and 66 at degrees 0 to 3."""
-    return max(0, bytes_per_gaussian(sh_degree) - TAG_BYTES - NUMBER_BYTES) if part_bytes(sh_degree) else 0
+def chunk_bytes(width: int) -> int:
+    """Bytes of payload in one cell of a Gaussian of `width`: 0, 12, 35 and 66 at SH degrees 0 to 3."""
+    return max(0, width - TAG_BYTES - NUMBER_BYTES) if Room(0, width).part_bytes else 0
 
 
-def plan_spread(carriers: int, secrets: int, sh_degree: int, size: int) -> Spread | None:
-    """The most redundant way to spread `size` bytes for each of `secrets`; None if it would not be safe."""
-    chunk = chunk_bytes(sh_degree)
-    left = carriers // shares(secrets) - header_carriers(sh_degree, 0)
+def plan_spread(carriers: int, parts: int, width: int, size: int) -> Spread | None:
+    """The most redundant way to spread `size` bytes over one of `parts` of the carriers; None: not safe."""
+    chunk = chunk_bytes(width)
+    left = carriers // parts - Room(carriers, width).header_carriers(0)
     if chunk < 1 or left < 1:
         return None
     blocks = min(-(-left // reed_solomon.MAX_CHUNKS), MAX_BLOCKS)
@@ -104,22 +109,27 @@ def plan_spread(carriers: int, secrets: int, sh_degree: int, size: int) -> Sprea
     return Spread(blocks, n, k, chunk) if k <= _most_data(n, blocks) else None
 
 
-def payload_capacity(carriers: int, secrets: int = 1, sh_degree: int = 3) -> int:
-    """Bytes of encrypted payload for each of `secrets` in a model with so many carriers; may be 0."""
-    smallest = plan_spread(carriers, secrets, sh_degree, 1)
+def parts_alone(carriers: int, width: int, size: int) -> int:
+    """In one of how many parts of the carriers there is enough room for `size` bytes: 4, or else 2."""
+    return 4 if plan_spread(carriers, 4, width, size) is not None else 2
+
+
+def payload_capacity(carriers: int, secrets: int = 1, width: int = 75) -> int:
+    """Bytes of encrypted payload for each of `secrets` in so many carriers of `width` bytes; may be 0."""
+    smallest = plan_spread(carriers, shares(secrets), width, 1)
     if smallest is None:
         return 0
     return smallest.blocks * _most_data(smallest.n, smallest.blocks) * smallest.chunk
 
 
-def carriers_for(size: int, secrets: int, sh_degree: int) -> int:
-    """The least number of carriers in which `size` bytes for each of `secrets` fit. `sh_degree`: 1 to 3."""
-    if chunk_bytes(sh_degree) == 0:
-        raise ValueError(f"no number of carriers will do for SH degree {sh_degree}")
+def carriers_for(size: int, secrets: int, width: int) -> int:
+    """The least number of carriers in which `size` bytes for each of `secrets` fit."""
+    if chunk_bytes(width) == 0:
+        raise ValueError(f"no number of carriers of {width} bytes will do")
     enough = 1 << 10
-    while payload_capacity(enough, secrets, sh_degree) < size:
+    while payload_capacity(enough, secrets, width) < size:
         enough *= 2
-    return bisect_left(range(enough), size, key=lambda each: payload_capacity(each, secrets, sh_degree))
+    return bisect_left(range(enough), size, key=lambda each: payload_capacity(each, secrets, width))
 
 
 def check_payload_fits(
@@ -130,15 +140,19 @@ def check_payload_fits(
     `usable`: the share of its Gaussians whose low bits will be random.
     """
     size = encrypted_size(compressed)
-    if payload_capacity(int(gaussians * usable), secrets, sh_degree) < size:
-        raise UsageError(too_small(gaussians, usable, size, secrets, sh_degree))
+    width = bytes_per_gaussian(sh_degree)
+    if payload_capacity(int(gaussians * usable), secrets, width) < size:
+        raise UsageError(too_small(gaussians, usable, size, secrets, width))
 
 
-def too_small(gaussians: int, usable: float, size: int, secrets: int, sh_degree: int) -> str:
+def too_small(gaussians: int, usable: float, size: int, secrets: int, width: int) -> str:
     """What to tell the owner of a model of which a share `usable` can be used."""
-    if chunk_bytes(sh_degree) == 0:
-        return "a model of SH degree 0 has no room for anything in its low bits"
-    need = carriers_for(size, secrets, sh_degree) / max(usable, 0.01)
+    if chunk_bytes(width) == 0:
+        return (
+            f"a model whose Gaussians hold {width} bytes has no room for anything in its low bits: there are "
+            "8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
+        )
+    need = carriers_for(size, secrets, width) / max(usable, 0.01)
     digits = max(0, len(str(int(need))) - 2)
     rounded = math.ceil(need / 10**digits) * 10**digits
     each = "" if secrets == 1 else f" for each of {secrets} secrets"

@@ -76,6 +76,11 @@ class DecoderShape:
         """Numbers that describe one Gaussian: 11 + 3 K attributes and 6 per octave."""
         return 11 + 3 * (self.sh_degree + 1) ** 2 + 6 * self.frequencies
 
+    @property
+    def numbers(self) -> int:
+        """Numbers that decoding one Gaussian takes at most, a few times over."""
+        return 4 * (self.inputs_size + sum(self.hidden) + len(self.mask) * self.branch)
+
     def channels(self, attribute: str) -> int:
         return CHANNELS.get(attribute, 3 * (self.sh_degree + 1) ** 2)
 

@@ -34,6 +34,7 @@ ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
 _ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
+_DECODED_NUMBERS = 1 << 23  # that a decoder holds at a time: 32 MiB, for its sizes are the file's
 _SLACK = 0.01  # of the Gaussians: rounding takes some over the limit of what is drawn, and others back
 _WEIGHTS = "decoder."
 # What reading a damaged header or damaged weights can raise.
@@ -101,11 +102,13 @@ class HiddenSecret:
 
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
         """What the decoder makes of `stego` for an embedding [64]; see `Opened.decode`."""
-        decoder = self.decoder.to(stego.device)
-        decoded: Gaussians = decoder(
-            stego.with_sh_degree(decoder.shape.sh_degree), embedding.to(stego.device)
-        )
-        return decoded
+        decoder, embedding = self.decoder.to(stego.device), embedding.to(stego.device)
+        stego = stego.with_sh_degree(decoder.shape.sh_degree)
+        if torch.is_grad_enabled():
+            return decoder(stego, embedding)  # type: ignore[no-any-return]
+        step = max(1, _DECODED_NUMBERS // decoder.shape.numbers)
+        starts = range(0, max(1, len(stego)), step)
+        return Gaussians.cat([decoder(stego[at : at + step], embedding, stego) for at in starts])
 
     def remains(self, revealed: Gaussians) -> Remains:
         """None where nothing of what was revealed is ever drawn."""

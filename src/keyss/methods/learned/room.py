@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import torch
 
 from keyss.channels.low_bits import LOW_BITS
-from keyss.channels.low_bits.bits import usable_carriers
-from keyss.channels.low_bits.layout import record_capacity
+from keyss.channels.low_bits.bits import bytes_per_gaussian
+from keyss.channels.low_bits.layout import Room, record_capacity
 from keyss.channels.low_bits.spread import TYPICAL_SHARE, check_payload_fits
+from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -72,9 +73,13 @@ def _secret_sizes(wanted: Sequence[int], cover: int, options: LearnedOptions, us
     degree = record_degree(options.fit.sh_degree)
     if degree is None:
         return [0] * len(most)
-    requests = [record_request(each, degree) for each in most]
-    room = record_capacity(requests, int(usable * cover), options.fit.sh_degree)
-    return divided(most, [1.0] * len(most), room)
+    carriers, sh_degree = int(usable * cover), options.fit.sh_degree
+    # No key should tell whether there are other secrets; where that leaves nothing, what fits at all.
+    room = Room(carriers, bytes_per_gaussian(sh_degree))
+    if each := room.unnoticed_records(Table.floor(degree).record_bytes, len(most)):
+        return [min(count, each) for count in most]
+    requests = [record_request(count, degree) for count in most]
+    return divided(most, [1.0] * len(most), record_capacity(requests, carriers, sh_degree))
 
 
 def divided(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:

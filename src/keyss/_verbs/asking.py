@@ -1,0 +1,74 @@
+"""What `hide` and `plan` are asked for, checked before any work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.scene import Scene
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.methods import registry
+from keyss.methods.base import Method, MethodOptions, SceneInput
+from keyss.rendering.orbit import is_model
+from keyss.runs.config import PathLike, path_of
+from keyss.runs.opening import as_model
+
+
+@dataclass(frozen=True)
+class Secret:
+    """A scene, a .ply file or a model to hide, and the key that is to open it."""
+
+    scene: PathLike | Scene | Gaussians
+    key: str = field(repr=False)
+    model: PathLike | Gaussians | None = None  # a plain 3DGS model of it, if there is one already
+
+
+def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
+    """A method and its options. Raises UsageError for as many secrets, or for keys, as it cannot have."""
+    if isinstance(chosen, MethodOptions):
+        method, options = registry.of_options(chosen), chosen
+    else:
+        method = registry.get(chosen)
+        options = next(iter(method.presets.values()))
+    if not 1 <= len(secrets) <= method.most_secrets:
+        raise UsageError(
+            f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
+        )
+    _check_keys([secret.key for secret in secrets])
+    return method, options
+
+
+def inputs_of(
+    sources: Sequence[PathLike | Scene | Gaussians], models: Sequence[PathLike | Gaussians | None]
+) -> list[SceneInput]:
+    """Scenes and the plain models that are given with them, or that they are. Raises UsageError."""
+    inputs = []
+    for index, (source, model) in enumerate(zip(sources, models, strict=True)):
+        photos = isinstance(source, Scene) or not is_model(source)
+        if not photos:
+            if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
+                argument = "model" if index else "cover_model"
+                what = "a source in memory" if isinstance(source, Gaussians) else source
+                raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
+            model = source  # type: ignore[assignment]
+        found = None if model is None else as_model(model)
+        if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
+            what = "the secret" if index else "the cover"
+            raise UsageError(f"nothing of {what}'s model can be seen: all of its Gaussians are transparent")
+        inputs.append(SceneInput(found, photos))
+    return inputs
+
+
+def _check_keys(keys: Sequence[str]) -> None:
+    """Raise UsageError for keys that cannot be, or are the same to key derivation, before any work."""
+    cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
+    derived = [DerivedKey(key, cheap) for key in keys]
+    for (i, a), (j, b) in combinations(enumerate(derived, 1), 2):
+        if a.equals(b):
+            raise UsageError(
+                f"secrets {i} and {j} have the same key, which can open one of them only: give each its own "
+                "(`keyss keygen` makes one)"
+            )

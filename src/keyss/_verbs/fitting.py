@@ -1,0 +1,81 @@
+"""`fit`: a plain model of a scene."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+
+from keyss.core.scene import Scene
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import quality
+from keyss.fitting.loop import Reporter
+from keyss.fitting.plain import FitResult, fit_scene
+from keyss.rendering import Backend, resolve_device
+from keyss.runs.config import Background, FitRunConfig, PathLike, colour_of, path_of
+from keyss.runs.files import CONFIG, METRICS, MODEL, writers
+from keyss.runs.folder import RunFolder, recorded_seed
+from keyss.runs.metrics import FitMetrics
+from keyss.runs.opening import as_scene
+
+
+def fit(
+    scene: PathLike | Scene,
+    *,
+    config: FitConfig | None = None,
+    width: int | None = None,
+    background: Background = None,
+    skip_missing: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> FitResult:
+    """Train plain 3DGS on a scene.
+
+    `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
+    `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
+    `resume` goes on. Without a seed in `config` the run draws one from the system, and `config.json` records
+    it; to be resumed it needs none.
+    Raises KeyssError and its children; Interrupted on Ctrl-C.
+    """
+    recorded = recorded_seed(Path(out), "config", "seed") if resume and out is not None else None
+    config = (config or FitConfig()).seeded(recorded)
+    target = resolve_device(device)
+    settings = FitRunConfig(
+        scene=path_of(scene),
+        width=width,
+        background=colour_of(background),
+        skip_missing=skip_missing,
+        config=config,
+    )
+    folder = None
+    if out is not None:
+        told = asdict(settings) | {"device": target.type}
+        folder = RunFolder(
+            out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
+        )
+    loaded = as_scene(scene, width, background, skip_missing=skip_missing)
+    with folder.work() if folder else nullcontext():
+        result = fit_scene(
+            loaded,
+            config,
+            device=target,
+            title=f"fit {loaded.name}",
+            checkpoint=folder.checkpoints / "fit.safetensors" if folder else None,
+            resume=resume,
+            reporter=reporter,
+        )
+        if folder:
+            test = quality(result.gaussians.to(target), loaded.test, loaded.background.to(target))
+            metrics = FitMetrics(
+                **asdict(test),
+                gaussians=len(result.gaussians),
+                iterations=config.iterations,
+                seconds=round(result.seconds, 1),
+                width=loaded.train[0].camera.width,
+                seed=config.known_seed,
+            )
+            folder.write(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
+    return result

@@ -1,0 +1,256 @@
+"""Which Gaussians of a model can get new low bits without anybody noticing.
+
+In a trained model the low bits are uniformly random for everybody who does not know how it was trained, but
+not all of them. A Gaussian is left alone, as a whole, so that none contradicts itself, for one of these:
+
+- *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
+  occur too often (after a few steps of training many are the same small multiple of the learning rate).
+- *Coincidences*: numbers that agree in all bits above the written ones would agree in nothing else
+  afterwards. These are near-equal components (grey colours, round Gaussians), Gaussians that share whole
+  triples of numbers (clones that training hardly moved apart), unit quaternions, and Gaussians that occur
+  twice.
+- *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
+
+Coincidences are found in what embedding leaves as it is. A Gaussian whose bits are random must hardly ever be
+left alone for any other reason: what is left stays, embedding makes more of the same kind by chance, and
+twice as many as expected would be seen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.stats import binom
+
+from keyss.channels.low_bits.bits import (
+    FIELDS,
+    GEOMETRY,
+    QUATS,
+    UNUSED_BITS,
+    Flags,
+    Layout,
+    Words,
+    blocks,
+    coarse_lengths,
+    identities,
+    used_words,
+)
+from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+
+LEAST_USABLE = 0.5  # share of the Gaussians of a cover
+# What small numbers may give away: squared separation (d') of a plain file and one with new bits, to somebody
+# who knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
+GIVEN_AWAY = 0.03
+
+_GROUPS = (slice(0, 3), QUATS, slice(7, 8), slice(8, None))  # scales, quaternions, opacity, harmonics
+_GROUP_NAMES = ("log scales", "quaternions", "opacity logits", "harmonics")
+
+# A value is not random, but a short number or zero, when at least this many low bits of its mantissa are
+# zero; by chance that happens to one value in a million.
+_SHORT = np.uint32((1 << 20) - 1)
+# Nor is a Gaussian, when so many of its values have so many zeros; by chance one in three million is that.
+_ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
+
+_EXACT = 1e-6  # of the length of a unit quaternion in single precision
+_SAMPLE = 20_000
+_SHIFTS = (UNUSED_BITS, UNUSED_BITS + 4)  # two overlapping bytes
+_LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in trained models, above 50 in others
+_CHANCE = 1e-6  # that a model with uniform bits is refused
+
+
+def usable_carriers(gaussians: Gaussians) -> Flags:
+    """[N] which Gaussians have low bits that look like those of trained values, and can be replaced."""
+    layout = Layout.of(gaussians)
+    usable = ~_occur_together(gaussians, layout)
+    frequent = _frequent_values(gaussians)
+    counts = [np.zeros_like(count_trailing_zeros(np.zeros(0, np.uint32))) for _ in _GROUPS]
+    start = 0
+    for part in blocks(gaussians):
+        used, rows = used_words(part), slice(start, start + len(part))
+        usable[rows] &= _are_measured(used, layout, frequent) & ~near_equal(used, layout)
+        if layout.quats:
+            usable[rows] &= ~_have_unit_length(used)
+        for group, count in zip(_GROUPS, counts, strict=True):
+            count += count_trailing_zeros(used[usable[rows], group])
+        start += len(part)
+    least = [least_exponent(count, GIVEN_AWAY / len(_GROUPS)) for count in counts]
+    start = 0
+    for part in blocks(gaussians):
+        used, rows = used_words(part), slice(start, start + len(part))
+        for group, limit in zip(_GROUPS, least, strict=True):
+            if layout.quats or group != QUATS:
+                values = used[:, group]
+                usable[rows] &= ~((exponents(values) < limit) & (values & 1 == 0)).any(axis=1)
+        start += len(part)
+    return usable
+
+
+def check_usable(gaussians: Gaussians, usable: Flags) -> None:
+    """Raise InputError unless half of the Gaussians are `usable` [N], with uniform low bits in every field.
+
+    Uniform: chi-square of the frequencies of two overlapping bytes, and every bit given the field's exponent,
+    the last bit and the bit below; over at most 20,000 Gaussians.
+    """
+    if not len(usable) or usable.mean() < LEAST_USABLE:
+        share = usable.mean() if len(usable) else 0.0
+        raise InputError(
+            f"only {share:.0%} of the Gaussians have random low bits; the others hold short, repeated or "
+            "predictable values: the model was quantised or hardly trained, and what is put there could be "
+            "seen"
+        )
+    layout, rows = Layout.of(gaussians), np.flatnonzero(usable)
+    rows = rows[:: max(1, len(rows) // _SAMPLE)]
+    used = used_words(gaussians[torch.from_numpy(rows)])
+    for column in layout.columns:
+        ratio = max(_chi_square(used[:, column] >> shift & 255) for shift in _SHIFTS)
+        if ratio > _LARGEST_RATIO:
+            name = FIELDS[column] if column < GEOMETRY else "f_rest"
+            raise InputError(
+                f"the low bits of {name} are not random in this model (chi-square "
+                f"{ratio:.1f} per degree of freedom, 1 expected), so that nothing can be hidden in them: "
+                "it was quantised, scaled or moved after its training"
+            )
+    for name, group in zip(_GROUP_NAMES, _GROUPS, strict=True):
+        if layout.quats or group != QUATS:
+            bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
+            if used[:, group].size and (chance := chance_of_bits(used[:, group], bits)) < _CHANCE:
+                raise InputError(
+                    f"the low bits of {name} are not random in this model: they depend on the size of the "
+                    f"numbers or on each other (by chance that happens with p = {chance:.0e}), so that "
+                    "nothing can be hidden in them"
+                )
+
+
+def is_uniform(values: npt.NDArray[np.float32]) -> bool:
+    """Whether one property [N] has low bits whose bytes are uniform."""
+    words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
+    return all(_chi_square(words >> shift & 255) <= _LARGEST_RATIO for shift in _SHIFTS)
+
+
+def chance_of_bits(words: Words, bits: int) -> float:
+    """How likely bits 1 to `bits` - 1 of words [...] are what they are, if all of them are uniform.
+
+    Exactly, of the most unlikely one given exponent, last bit and the bit below it; times how many there are.
+    """
+    flat = words.ravel()
+    context = exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
+    chances: list[npt.NDArray[np.float64]] = []
+    for bit in range(UNUSED_BITS, bits):
+        below = (flat >> np.uint32(bit - 1) & 1).astype(np.int64) if bit > 1 else 0
+        times = np.bincount(context | below, minlength=1024)
+        ones = np.bincount((context | below)[(flat >> np.uint32(bit) & 1) == 1], minlength=1024)
+        ones, times = ones[times > 0], times[times > 0]
+        smaller = np.minimum(ones, times - ones)
+        chances.append(np.minimum(1, 2 * binom.cdf(smaller, times, 0.5)))
+    every = np.concatenate(chances)
+    return min(1.0, float(every.min() * len(every)))
+
+
+def near_equal(used: Words, layout: Layout) -> Flags:
+    """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
+
+    Decided by the bits that embedding leaves, which by chance are the same, or neighbours, in some 3 % of all
+    Gaussians. `used`: [N, F] of `used_words`.
+    """
+    shifts = [int(mask).bit_length() for mask in layout.mask]
+    high = ((used & np.uint32(0x7FFFFFFF)) >> np.array(shifts, np.uint32)).astype(np.int32)
+    found = np.zeros(len(used), dtype=bool)
+    together = [high[:, None, 0:3], high[:, GEOMETRY:].reshape(len(used), -1, 3)]
+    if layout.quats:
+        together.append(high[:, None, QUATS])
+    for values in together:
+        found |= (np.diff(np.sort(values, axis=2), axis=2) <= 1).any(axis=(1, 2))
+    return found
+
+
+def exponents(words: Words) -> npt.NDArray[np.uint8]:
+    """[...] the biased binary exponents."""
+    return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
+
+
+def _are_measured(used: Words, layout: Layout, frequent: list[Words]) -> Flags:
+    """[N] whether no number in use is short, subnormal or frequent, and few have many zeros."""
+    large = exponents(used)
+    fine = ((used & _SHORT) != 0) & (large > 0) & (large < 254)
+    for group, values in zip(_GROUPS, frequent, strict=True):
+        fine[:, group] &= ~np.isin(used[:, group], values)
+    zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
+    measured: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
+    return measured
+
+
+def _have_unit_length(used: Words) -> Flags:
+    """[N] whether a quaternion has it, and whatever its low bits are could have it."""
+    near = np.abs(coarse_lengths(used) - 1) < 1e-4
+    quats = used[:, QUATS].view(np.float32).astype(np.float64)
+    unit: Flags = near & (np.abs(np.linalg.norm(np.where(near[:, None], quats, 0), axis=1) - 1) < _EXACT)
+    return unit
+
+
+def _occur_together(gaussians: Gaussians, layout: Layout) -> Flags:
+    """[N] whether the Gaussian, its scales, its quaternion or two harmonics in a row occur twice.
+
+    Of harmonics, those with numbers 1 and 2, 3 and 4 and so on, of all colours. Decided by the bits that
+    embedding leaves.
+    """
+    together = [np.arange(3)]
+    if layout.quats:
+        together.append(np.arange(3, 7))
+    together += [np.arange(start, start + 6) for start in range(GEOMETRY, len(layout.mask) - 5, 6)]
+    keys = np.empty((len(together) + 1, len(gaussians)), np.uint64)
+    keys[-1] = identities(gaussians)[:, :8].copy().view("<u8")[:, 0]
+    start = 0
+    for part in blocks(gaussians):
+        high = used_words(part) & ~layout.mask & ~np.uint32(1)
+        for key, columns in zip(keys, together, strict=False):
+            key[start : start + len(part)] = _hashes(high[:, columns])
+        start += len(part)
+    found = np.zeros(len(gaussians), dtype=bool)
+    for key in keys:
+        _, inverse, times = np.unique(key, return_inverse=True, return_counts=True)
+        found |= times[inverse] > 1
+    return found
+
+
+def _hashes(words: Words) -> npt.NDArray[np.uint64]:
+    """[N] of rows [N, C]; equal ones of different rows are as rare as chance."""
+    state = np.zeros(len(words), np.uint64)
+    for column in range(words.shape[1]):
+        state = (state ^ words[:, column]) * np.uint64(0x9E3779B97F4A7C15)
+        state ^= state >> np.uint64(29)
+    return state
+
+
+def _frequent_values(gaussians: Gaussians) -> list[Words]:
+    """For each group of fields [V] the values that occur more often than is likely."""
+    used = used_words(gaussians)
+    found = []
+    for group in _GROUPS:
+        flat = np.sort(used[:, group], axis=None)
+        more = _unlikely_copies(flat.size) - 1
+        found.append(np.unique(flat[more:][flat[more:] == flat[: len(flat) - more]]))
+    return found
+
+
+def _unlikely_copies(count: int) -> int:
+    """The least c from 3 on so that sets of c equal ones are rare among `count` values: 3 up to a million.
+
+    For 2^26 equally likely values there would be count^c / c! / 2^(26 (c - 1)) such sets, here at most 30.
+    """
+    copies = 3
+    while count**copies / math.factorial(copies) > 30 * 2 ** (26 * (copies - 1)):
+        copies += 1
+    return copies
+
+
+def _chi_square(bytes_: npt.NDArray[np.integer[Any]]) -> float:
+    """Per degree of freedom, of the frequencies of numbers below 256."""
+    counts = np.bincount(bytes_, minlength=256)
+    expected = len(bytes_) / 256
+    return float(((counts - expected) ** 2).sum() / expected / 255)

@@ -1,0 +1,146 @@
+"""Filling the carriers of a cover, in random order: headers, contents, and noise in all the rest."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from keyss.channels.base import Bytes, Content, Payload, RecordRequest, Records
+from keyss.channels.low_bits import parameters, spread
+from keyss.channels.low_bits.cells import CellCipher
+from keyss.channels.low_bits.ciphers import (
+    ASSOCIATED,
+    chunk_cipher,
+    key_cipher,
+    parameter_cipher,
+    payload_key,
+)
+from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, SALTS, Room, payload_parts
+from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
+from keyss.core.errors import KeyssWarning, UsageError
+from keyss.keys.derivation import DerivedKey, expand, stream
+from keyss.keys.encryption import compressed_size, encrypt, encrypted_size
+
+_NOTICED = (
+    "the secrets are too large, or too many, to lie in this cover as each would alone: who holds one of the "
+    "keys can notice that there are other secrets"
+)
+
+
+class Writer:
+    """The low bits of carriers with identities `names` [C, 16], each of `width` bytes.
+
+    `entropy`: 32 bytes that nobody else knows. `salts`: of the model, which keys are derived with.
+    """
+
+    def __init__(self, names: Bytes, width: int, entropy: bytes, salts: list[bytes]) -> None:
+        self._entropy = entropy
+        self._salts = bytes(each[0] for each in salts).ljust(SALTS, b"\0")
+        self._room = Room(len(names), width)
+        self.order = self._shuffled("order", len(names))  # [C] carriers; what follows is in this order
+        self._names = names[self.order]
+        noise = stream(entropy, "low-bits/noise", len(names) * width)
+        self.table = np.frombuffer(bytearray(noise), np.uint8).reshape(len(names), width)
+        self._next = 0  # carrier that is not in use yet
+
+    def payloads(self, contents: Sequence[tuple[Sequence[DerivedKey], Payload]], gaussians: int) -> None:
+        """Every secret fills its share of the carriers. `gaussians`: of the model, for what is said of it."""
+        carriers, width = self._room.carriers, self._room.width
+        sizes = [encrypted_size(compressed_size(content.data)) for _, content in contents]
+        parts, as_alone = payload_parts([spread.parts_alone(carriers, width, size) for size in sizes])
+        start = 0
+        for index, (keys, content) in enumerate(contents):
+            # Spread as its own size asks: what a key shows must not depend on the sizes of other secrets.
+            plan = spread.plan_spread(carriers, parts[index], width, sizes[index])
+            if plan is None:
+                usable = carriers / gaussians
+                raise UsageError(spread.too_small(gaussians, usable, sizes[index], len(contents), width))
+            self._next, end = start, start + carriers // parts[index]
+            data_key = self._data_key(index)
+            packed = PayloadParameters(content.method, self._salts, sizes[index], plan).pack()
+            self._header(keys, data_key, packed)
+            encrypted = encrypt(payload_key(data_key), content.data, ASSOCIATED, size=sizes[index])
+            self._whole(chunk_cipher(data_key, width), plan.encode(encrypted, end - self._next))
+            start = end
+        if not as_alone:
+            warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
+
+    def records(self, contents: Sequence[tuple[Sequence[DerivedKey], Records]]) -> None:
+        """Headers in the first carriers, records in the others; see `layout`."""
+        requests = [
+            RecordRequest(len(content.records), content.records.shape[1], len(content.header))
+            for _, content in contents
+        ]
+        plans = [content.plan for _, content in contents]
+        arrangement = self._room.arrangement(plans, requests)
+        for index, (keys, content) in enumerate(contents):
+            cells, size = content.plan.cells_per_carrier, content.records.shape[1]
+            packed = RecordParameters(content.method, self._salts, cells, size, content.header).pack()
+            self._header(keys, self._data_key(index), packed)
+        carriers = np.arange(arrangement.header_carriers, self._room.carriers)
+        divided = [i for i, plan in enumerate(plans) if plan.cells_per_carrier > 1]
+        whole = [i for i, plan in enumerate(plans) if plan.cells_per_carrier == 1]
+        # Those that divide carriers lie in random cells of all carriers, as each would alone; what they leave
+        # untouched is random too.
+        if divided:
+            cells = plans[divided[0]].cells_per_carrier
+            free = self._shuffled("cells", cells * len(carriers))
+            touched = np.zeros(len(carriers), bool)
+            for index in divided:
+                count = len(contents[index][1].records) + len(contents[index][1].copied)
+                own, free = free[:count], free[count:]
+                self._place(index, contents[index][1], carriers[own // cells], own % cells)
+                touched[own // cells] = True
+            carriers = carriers[~touched]
+        for index in whole:
+            count = len(contents[index][1].records) + len(contents[index][1].copied)
+            own, carriers = carriers[:count], carriers[count:]
+            self._place(index, contents[index][1], own, np.zeros(count, np.int64))
+        if not arrangement.as_alone:
+            warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
+
+    def _place(
+        self, index: int, content: Records, rows: npt.NDArray[np.int64], slots: npt.NDArray[np.int64]
+    ) -> None:
+        """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
+        size = self._room.width // content.plan.cells_per_carrier
+        split = len(content.records)
+        for label, records, part in (
+            ("record", content.records, slice(split)),
+            ("copy", content.records[content.copied], slice(split, None)),
+        ):
+            cipher = CellCipher(self._data_key(index), label, records.shape[1])
+            columns = (slots[part] * size)[:, None] + np.arange(cipher.cell_bytes)
+            self.table[rows[part, None], columns] = cipher.encrypt(
+                self._names[rows[part]], records, slots[part]
+            )
+
+    def _shuffled(self, label: str, count: int) -> npt.NDArray[np.int64]:
+        """[count] the numbers from 0 on in random order."""
+        return np.argsort(np.frombuffer(stream(self._entropy, f"low-bits/{label}", 8 * count), "<u8"))
+
+    def _data_key(self, index: int) -> bytes:
+        return expand(self._entropy, f"low-bits/data-key/{index}", DATA_KEY_BYTES)
+
+    def _header(self, keys: Sequence[DerivedKey], data_key: bytes, packed: bytes) -> None:
+        for key in keys:
+            copies = np.frombuffer(data_key * KEY_COPIES, np.uint8).reshape(KEY_COPIES, -1)
+            self._whole(key_cipher(key), copies)
+        parts = parameters.parts_of(packed, self._room.width)
+        self._whole(parameter_cipher(data_key, self._room.width), parts)
+
+    def _whole(self, cipher: CellCipher, data: Bytes) -> None:
+        """A carrier for each row of `data`; what a cell does not need of it stays noise."""
+        rows = slice(self._next, self._next + len(data))
+        self.table[rows, : cipher.cell_bytes] = cipher.encrypt(self._names[rows], data)
+        self._next += len(data)
+
+
+def digest(content: Content) -> bytes:
+    """32 bytes that say which content it is."""
+    data = content.data if isinstance(content, Payload) else content.header + content.records.tobytes()
+    return hashlib.sha256(data).digest()
