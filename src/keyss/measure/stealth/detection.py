@@ -179,12 +179,7 @@ def _errors(scores: Floats, examples: Examples) -> Floats:
     strata = [np.flatnonzero(scenes == scene) for scene in np.unique(scenes)]
     found = []
     for _ in range(_DRAWS):
-        chosen = np.concatenate(
-            [
-                random.choice(np.flatnonzero(scenes == scene), (scenes == scene).sum())
-                for scene in np.unique(scenes)
-            ]
-        )
+        chosen = np.concatenate([random.choice(own, len(own)) for own in strata])
         drawn = np.concatenate([rows[index] for index in chosen])
         found.append(areas(scores[drawn], examples.hidden[drawn], examples.scene[drawn]))
     errors: Floats = np.std(found, axis=0)
