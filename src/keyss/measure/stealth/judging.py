@@ -16,6 +16,7 @@ from keyss.measure.stealth.statistic import Statistic
 from keyss.measure.stealth.suite import stealth_statistics
 from keyss.measure.stealth.words import Floats
 
+_AGREEMENT = 0.03  # of its size, to which a statistic without a known error can be relied on
 _MANY = 1e7  # degrees of freedom: a normal number
 
 
@@ -149,8 +150,8 @@ def _p(found: Statistic, controls: Sequence[Statistic], excess: float | None) ->
     if excess is not None and between <= 3 * excess * sampling:
         variance, degrees = excess * (own + sampling / count), _MANY
     else:
-        # What never varies has no variance to go by: a tenth of its size, so that new things are seen at all.
-        floor = (0.1 * max(abs(mean), 1e-3)) ** 2 if between + sampling + own == 0 else 0.0
+        # Few controls may agree by chance, and what never varies has no variance to go by.
+        floor = (_AGREEMENT * max(abs(mean), 1e-3)) ** 2 if sampling + own == 0 else 0.0
         unknown = between * (1 + 1 / count) + floor
         variance = unknown + own + sampling / count
         degrees = min(_MANY, (count - 1) * variance**2 / max(unknown, 1e-150) ** 2)

@@ -12,6 +12,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, normal, portion
 from keyss.measure.stealth.words import Floats
 
+_KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
 _NEAR = 1e-5  # of the model's size
 
 
@@ -31,7 +32,9 @@ def order(model: Gaussians) -> dict[str, Statistic]:
         correlation = float(np.corrcoef(rows, ranks)[0, 1]) if np.ptp(values) > 0 else 0.0
         found[f"row and {name}, correlation"] = normal(correlation, 1 / math.sqrt(count - 1))
         half = ks_2samp(values[: count // 2], values[count // 2 :], method="asymp")
-        found[f"halves of rows, {name}"] = Statistic(float(half.statistic), None, float(half.pvalue))
+        found[f"halves of rows, {name}"] = Statistic(
+            float(half.statistic), _KS_SPREAD * math.sqrt(4 / count), float(half.pvalue)
+        )
         jumps = np.abs(np.diff(ranks)).mean() / count
         found[f"neighbouring rows, {name}"] = normal(float(jumps), 0.2236 / math.sqrt(count), 1 / 3)
     positions = model.means.detach().cpu().double().numpy()
