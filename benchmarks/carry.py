@@ -25,14 +25,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from channels.low_bits.trained_like import trained_like
 from keyss import read_model, write_model
-from keyss.channels.low_bits.usable import usable_carriers
 from keyss.channels.low_bits.layout import record_capacity
+from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.methods.records.encoding import record_request
 from keyss.methods.dither import cost
+from keyss.methods.records.encoding import record_request
 from keyss.rendering import render
 from methods.carry.carried import embed, extract
 

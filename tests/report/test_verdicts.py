@@ -31,6 +31,10 @@ def _sealwatch(spa: Data, ws: Data, spam: Data) -> Data:
     return {name: {"plain": [], "stego": [], "roc": roc} for name, roc in found.items()}
 
 
+def _score(p: float) -> Data:
+    return {"name": f"candidate: {p}", "value": 0, "low": 0, "high": 0, "p": p, "exact": None}
+
+
 NEUTRAL = _roc(0.5, 0.4, 0.6)
 ALL_FINE: list[Change] = [
     (IMAGES.format("cover"), 27.5),
@@ -48,6 +52,9 @@ ALL_FINE: list[Change] = [
     ("parameters.two_sample.stego", [{"auc": 0.55, "low": 0.54, "high": 0.56}]),
     ("parameters.two_sample.control", [{"auc": 0.52, "low": 0.51, "high": 0.53}]),
     ("parameters.two_sample.original", []),
+    ("stealth.least", 0.2),
+    ("stealth.least_of_controls", 0.5),
+    ("stealth.confirmations", [{"scores": [_score(0.1), _score(0.02)]}, None]),
     (STEGEXPOSE, _roc(0.75, 0.3, 1.0)),
     ("stegexpose.control.stegexpose.roc", NEUTRAL),
     (SPAM, None),
@@ -89,6 +96,8 @@ def test_the_whole_audit(fine: Data) -> None:
         "secret 2 on test photos": "missed",
         "wrong keys": "fine",
         "leaks without the key": "fine",
+        "the file by itself": "fine",
+        "guessing the secret": "fine",
         "attributes of the Gaussians": "fine",
         "classifier between models": "fine",
         "StegExpose on renders": "fine",
@@ -112,6 +121,9 @@ def test_the_whole_audit(fine: Data) -> None:
         ("leaks without the key", LEAK.format(0, 1, "psnr_fitted"), 1.0, 1.01, "visible"),
         ("leaks without the key", LEAK.format(0, 1, "ssim_fitted"), 0.05, 0.051, "visible"),
         ("leaks without the key", LEAK.format(0, 1, "gradient_coarse"), 0.1, 0.11, "visible"),
+        ("the file by itself", "stealth.least", 0.01, 0.009, "visible"),
+        ("the file by itself", "stealth.least", 0.2, 0.0, "visible"),
+        ("guessing the secret", "stealth.confirmations.0.scores.1.p", 0.005, 0.0049, "visible"),
         ("attributes of the Gaussians", "parameters.distances.opacity.ratio", 1.5, 1.51, "visible"),
         ("classifier between models", "parameters.two_sample.stego.0.auc", 0.6, 0.61, "visible"),
         ("StegExpose on renders", f"{STEGEXPOSE}.low", 0.5, 0.51, "visible"),
@@ -168,8 +180,17 @@ def test_a_detector_is_judged_beside_what_it_finds_between_controls(fine: Data) 
     assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")
 
 
+def test_a_file_is_as_unusual_as_plain_models_are(fine: Data) -> None:
+    found = changed(fine, ("stealth.least", 0.002), ("stealth.least_of_controls", 0.001))
+    line = judged(found)["the file by itself"]
+    assert (line.word, line.beside) == ("fine", "0.00100, between plain models")
+    assert line.value.startswith("p = 0.00200 (")
+    guessed = judged(changed(fine))["guessing the secret"]
+    assert guessed.value == "p = 0.0400 (candidate: 0.02)"
+
+
 def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
-    parts = ("images", "wrong_key", "leaks", "parameters", "stegexpose", "robustness", "speed")
+    parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
     assert judged(changed(fine, *((part, None) for part in parts))) == {}
     for each in fine["parameters"]["distances"].values():
         each["ratio"] = None
@@ -178,6 +199,7 @@ def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
         ("robustness.changes", rows),
         ("images.cover_baseline", None),
         ("parameters.two_sample.stego", []),
+        ("stealth.statistics", []),
         ("wrong_key.chance_level", []),
         ("leaks.secrets", [[], []]),
         ("speed.readers", [{"reader": "gsply", "file": "stego", "loads": None}]),
@@ -193,11 +215,11 @@ def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
 def test_the_headline(fine: Data) -> None:
     assert headline([]) == "Nothing was measured that could be judged."
     lines = verdicts(changed(fine))
-    assert headline(lines) == "All 10 measures are within their limits."
+    assert headline(lines) == "All 12 measures are within their limits."
     assert headline(lines[:1]) == "The one measure is within its limit."
     changes = (("parameters.distances.opacity.ratio", 9.0), (IMAGES.format("secrets.1"), 25.5))
     assert headline(verdicts(changed(fine, *changes))) == (
-        "8 of 10 measures are within their limits. Visible: attributes of the Gaussians. "
+        "10 of 12 measures are within their limits. Visible: attributes of the Gaussians. "
         "Missed: secret 2 on test photos."
     )
 

@@ -27,6 +27,7 @@ from keyss.measure.sealwatch_detectors import sealwatch_roc
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import SpeedResult
 from keyss.measure.speed import speed as measure_speed
+from keyss.measure.stealth.judging import StealthResult, judge
 from keyss.measure.two_sample import two_sample_against_controls
 from keyss.methods import registry
 from keyss.runs.audit_record import (
@@ -108,6 +109,17 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
     return PartResult(ParametersResult(sinkhorn, distances, two_sample, histograms(stego, controls)))
 
 
+def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[StealthResult]:
+    """What the file shows by itself to somebody who knows the program, beside what plain models show.
+
+    And whether a plain model of a secret, in the hands of somebody who guesses, confirms the guess.
+    """
+    progress(0, 1)
+    return PartResult(
+        judge(subject.stego, subject.controls, original=subject.original, candidates=subject.baselines)
+    )
+
+
 def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RendersResult]:
     """Whether detectors of hidden bits tell pictures of the stego model from those of a plain one.
 
@@ -183,7 +195,7 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
 
 # By the names of their fields in `Audit`.
 PARTS: dict[str, AuditPart] = {
-    part.__name__: part for part in (images, parameters, stegexpose, leaks, robustness, speed)
+    part.__name__: part for part in (images, parameters, stealth, stegexpose, leaks, robustness, speed)
 }
 
 

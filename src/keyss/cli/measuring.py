@@ -12,7 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import Device, KeyFiles, Overwrite, Resume, checked_seed, optional
 
-PartName = Literal["images", "parameters", "stegexpose", "leaks", "robustness", "speed"]
+PartName = Literal["images", "parameters", "stealth", "stegexpose", "leaks", "robustness", "speed"]
 
 
 def evaluate(

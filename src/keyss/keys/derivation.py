@@ -32,6 +32,7 @@ MAX_KEY_BYTES = 4096
 
 TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4
 MOST = 4  # times the memory, and times the work, that this program asks for: a file may come from anybody
+MOST_PASSES = 4
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,11 @@ class KeyDerivation:
     def __post_init__(self) -> None:
         if len(self.salt) != SALT_BYTES:
             raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(self.salt)}")
-        ranges = (("time_cost", 1, 16), ("memory_kib", 8 * 1024, MOST * MEMORY_KIB), ("parallelism", 1, 16))
+        ranges = (
+            ("time_cost", 1, MOST_PASSES),
+            ("memory_kib", 8 * 1024, MOST * MEMORY_KIB),
+            ("parallelism", 1, 16),
+        )
         for name, low, high in ranges:
             value = getattr(self, name)
             if not (type(value) is int and low <= value <= high):

@@ -17,7 +17,7 @@ from keyss.measure.leaks.looking import AttackResult
 from keyss.measure.leaks.scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT
 from keyss.measure.robustness.survival import mean_over_draws
 from keyss.measure.roc import Roc
-from keyss.report.numbers import decibel, difference, number, numbered, times
+from keyss.report.numbers import decibel, difference, number, numbered, significant, times
 from keyss.runs.audit_record import Audit, RenderDetection
 
 QUALITY_LOSS = 1.0  # dB that cover or secret may be below the plain model of the same scene
@@ -26,6 +26,7 @@ IDENTICAL = 119.9  # dB; 120, the most, is what a given model has against its ow
 DISTANCE_RATIO = 1.5  # of a distance from a control, to the one between two controls
 TWO_SAMPLE_AUC = 0.6  # of a classifier that tells the Gaussians of two models apart
 AS_THE_PLAIN_MODEL = 0.01  # more than that of the cover's own plain model an AUC may be
+UNUSUAL = 0.01  # probability that a plain model is as unusual as the file, corrected for the number of tries
 IMAGE_AUC = 0.1  # distance from 0.5 of a detector's AUC on renders
 WRONG_KEY = 1.0  # dB nearer to the secret than chance level
 PRUNING, PRUNED = "random pruning", 0.25  # the share of the Gaussians that is removed ...
@@ -73,6 +74,7 @@ def verdicts(audit: Audit) -> list[Verdict]:
         *_qualities(audit),
         *_wrong_keys(audit),
         *_leaks(audit),
+        *_stealth(audit),
         *_distances(audit),
         *_two_sample(audit),
         *_detectors(audit, "StegExpose"),
@@ -189,6 +191,27 @@ def _distances(audit: Audit) -> Iterator[Verdict]:
     limit = f"at most {DISTANCE_RATIO}×, or as the plain model's"
     word = _word(ratios[worst] <= max(DISTANCE_RATIO, 1.01 * plain.get(worst, 0.0)))
     yield Verdict("attributes of the Gaussians", value, beside, limit, word, "statistics")
+
+
+def _stealth(audit: Audit) -> Iterator[Verdict]:
+    """What the file shows by itself, and what of each secret can be confirmed."""
+    found = audit.stealth
+    if found is None or not found.statistics:
+        return
+    worst = found.statistics[0]
+    limit = f"at least {UNUSUAL}, or as between plain models"
+    beside = f"{significant(found.least_of_controls)}, between plain models"
+    word = _word(found.least >= min(UNUSUAL, found.least_of_controls))
+    value = f"p = {significant(found.least)} ({worst.name})"
+    yield Verdict("the file by itself", value, beside, limit, word, "stealth")
+    rows = [row for each in found.confirmations if each is not None for row in each.scores]
+    if rows:
+        likeliest = min(rows, key=lambda row: row.p)
+        value = f"p = {significant(found.least_confirmation)} ({likeliest.name})"
+        word = _word(found.least_confirmation >= UNUSUAL)
+        yield Verdict(
+            "guessing the secret", value, "plain models of the cover", f"at least {UNUSUAL}", word, "stealth"
+        )
 
 
 def _two_sample(audit: Audit) -> Iterator[Verdict]:

@@ -17,6 +17,7 @@ from keyss.measure.roc import StegExposeRoc
 from keyss.measure.sealwatch_detectors import SealwatchRocs
 from keyss.measure.sinkhorn import Sinkhorn3D
 from keyss.measure.speed import SpeedResult
+from keyss.measure.stealth.judging import StealthResult
 from keyss.measure.two_sample import TwoSample
 from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
@@ -148,6 +149,7 @@ class Audit:
     wrong_key: WrongKeyResult | None = None
     images: ImagesResult | None = None
     parameters: ParametersResult | None = None
+    stealth: StealthResult | None = None
     stegexpose: RendersResult | None = None
     leaks: LeaksResult | None = None
     robustness: RobustnessResult | None = None

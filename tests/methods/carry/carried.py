@@ -8,7 +8,13 @@ from keyss.channels.base import Records
 from keyss.channels.low_bits import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
-from keyss.methods.records.encoding import CarriedSecret, decode, encode_all
+from keyss.methods.records.encoding import (
+    CarriedSecret,
+    decode,
+    encode_all,
+    most_visible,
+    subsampled_counts,
+)
 
 
 def embed(
@@ -28,6 +34,12 @@ def embed_derived(
     records = encode_all(prepared, [model for _, model in secrets], "carry")
     keyed = list(zip((keys for keys, _ in secrets), records, strict=True))
     return prepared.embed_derived(keyed, entropy=entropy)
+
+
+def pruned_to_fit(cover: Gaussians, secret: Gaussians) -> Gaussians:
+    """As much of `secret` as `cover` carries."""
+    (count,) = subsampled_counts(LOW_BITS.prepare(cover), [secret])
+    return most_visible(secret, count)
 
 
 def extract(stego: Gaussians, key: str) -> CarriedSecret:

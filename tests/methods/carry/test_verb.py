@@ -91,13 +91,13 @@ def test_too_large_secrets_are_refused_or_pruned(
     hide = (*hide, "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out")
     assert status == 2
-    assert "4,414 would fit; --prune-to-fit" in err
+    assert "4,342 would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
     assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
-    assert metrics["secret_gaussians"] == [4414]
+    assert metrics["secret_gaussians"] == [4342]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
-    assert metrics["details"]["share_kept_by_pruning"] == [round(4414 / 6000, 4)]
+    assert metrics["details"]["share_kept_by_pruning"] == [round(4342 / 6000, 4)]
     assert 10 < metrics["details"]["pruned_secret_psnr_against_the_whole"][0] < 60
 
 

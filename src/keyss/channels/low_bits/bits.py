@@ -50,7 +50,7 @@ class Layout:
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
         """Without quaternions where half of them or more have unit length."""
-        lengths = [coarse_lengths(used_words(part)) for part in blocks(gaussians)]
+        lengths = [coarse_lengths(_words(part.quats)) for part in blocks(gaussians)]
         deviation = np.abs(np.concatenate(lengths) - 1)
         return Layout(gaussians.sh_degree, not len(deviation) or float(np.median(deviation)) > UNIT_TOLERANCE)
 
@@ -80,12 +80,12 @@ def bytes_per_gaussian(sh_degree: int) -> int:
     return Layout(sh_degree).width
 
 
-def coarse_lengths(used: Words) -> npt.NDArray[np.float64]:
-    """[N] of quaternions, in words [N, F], with the middle of all low bits that they could have."""
+def coarse_lengths(quats: Words) -> npt.NDArray[np.float64]:
+    """[N] of quaternions [N, 4] with the middle of all low bits that they could have."""
     low = np.uint32((1 << UNUSED_BITS + GEOMETRY_BITS) - 1)
-    quats = (used[:, QUATS] & ~low | (low + 1) >> 1).view(np.float32).astype(np.float64)
+    middle = (quats & ~low | (low + 1) >> 1).view(np.float32).astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        lengths: npt.NDArray[np.float64] = np.sqrt((quats * quats).sum(axis=1))
+        lengths: npt.NDArray[np.float64] = np.sqrt((middle * middle).sum(axis=1))
     return lengths
 
 

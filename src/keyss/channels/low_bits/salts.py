@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from keyss.channels.low_bits.bits import (
     GEOMETRY,
+    QUATS,
     UNIT_TOLERANCE,
     Bytes,
     Flags,
@@ -54,7 +55,7 @@ def _ranks(used: Words, layout: Layout) -> npt.NDArray[np.uint64]:
     doubtful: Flags = near_equal(used, layout) | (exponents(chosen) == 0).any(axis=1)
     doubtful |= (chosen & _MANTISSA & ~layout.mask[layout.columns] & ~np.uint32(1) == 0).any(axis=1)
     if layout.quats:
-        doubtful |= np.abs(coarse_lengths(used) - 1) < UNIT_TOLERANCE
+        doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
     harmonics = used[:, GEOMETRY:] if used.shape[1] > GEOMETRY else chosen
     least = 255 - exponents(harmonics).min(axis=1).astype(np.uint64)
     ranks: npt.NDArray[np.uint64] = doubtful.astype(np.uint64) << np.uint64(8) | least

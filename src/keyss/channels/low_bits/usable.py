@@ -19,6 +19,7 @@ twice as many as expected would be seen.
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from keyss.channels.low_bits.bits import (
     FIELDS,
     GEOMETRY,
     QUATS,
+    UNIT_TOLERANCE,
     UNUSED_BITS,
     Flags,
     Layout,
@@ -165,7 +167,8 @@ def near_equal(used: Words, layout: Layout) -> Flags:
     if layout.quats:
         together.append(high[:, None, QUATS])
     for values in together:
-        found |= (np.diff(np.sort(values, axis=2), axis=2) <= 1).any(axis=(1, 2))
+        for a, b in combinations(range(values.shape[2]), 2):
+            found |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
     return found
 
 
@@ -187,9 +190,10 @@ def _are_measured(used: Words, layout: Layout, frequent: list[Words]) -> Flags:
 
 def _have_unit_length(used: Words) -> Flags:
     """[N] whether a quaternion has it, and whatever its low bits are could have it."""
-    near = np.abs(coarse_lengths(used) - 1) < 1e-4
-    quats = used[:, QUATS].view(np.float32).astype(np.float64)
-    unit: Flags = near & (np.abs(np.linalg.norm(np.where(near[:, None], quats, 0), axis=1) - 1) < _EXACT)
+    words = np.ascontiguousarray(used[:, QUATS])
+    near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
+    lengths = np.linalg.norm(np.where(near[:, None], words.view(np.float32).astype(np.float64), 0), axis=1)
+    unit: Flags = near & (np.abs(lengths - 1) < _EXACT)
     return unit
 
 

@@ -1,0 +1,294 @@
+"""How well the attacks of `keyss.measure.stealth` tell files that hide something, on models that you have.
+
+    python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
+    python benchmarks/stealth.py ... --learned bonsai=stego.ply:secret.ply  # stego files, secrets' own models
+    python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # files made by something else
+    python benchmarks/stealth.py ... --rounded   # models as trainers leave them that round steps
+
+From each plain model are made a carried one, which holds as much of a model of the next scene as fits, and
+one with a sealed payload. Statistics are taken of whole models and of parts of 2,000 to 5,000 Gaussians,
+random ones and pieces of space. Detectors learn from all scenes but one and are tried on that one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from channels.low_bits.payloads import embed_derived
+from channels.low_bits.trained_like import keys, rounded
+from keyss.core import Gaussians, UsageError
+from keyss.files.models import read_model
+from keyss.measure.stealth.confirmation import candidate_scores, confirmed
+from keyss.measure.stealth.detection import Detection, Examples, learned_detectors, single_detectors
+from keyss.measure.stealth.predictor import BitPredictor, sample
+from keyss.measure.stealth.suite import stealth_statistics
+from methods.carry import carried
+
+PART_SIZES = (2000, 5000)
+PAYLOAD_BYTES = 4000
+TRAINING_ROWS, MOST_TRAINED_ON = 20_000, 20  # of the predictor
+CANDIDATES = 24
+SHOWN = 8  # single statistics in the table
+
+
+@dataclass(frozen=True)
+class File:
+    """One file to be judged; `pair` names the plain model that it was made from."""
+
+    kind: str  # "plain", "carried", "sealed", "learned" or "given"
+    scene: str
+    pair: str
+    model: Gaussians
+    secret: str = ""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A plain model and what is to be made of it."""
+
+    index: int
+    scene: str
+    path: str
+    secret: str
+    rounded: bool
+    given: str = ""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = _arguments(arguments)
+    started = time.monotonic()
+    with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
+        files = [file for made in pool.map(_make, _jobs(options)) for file in made]
+        print(f"{len(files)} files after {time.monotonic() - started:.0f} s", file=sys.stderr)
+        for scene, path, secret in map(_named, options.learned):
+            files.append(File("learned", scene, path, read_model(path), secret))
+        pieces = [(file, name, piece) for file in files for name, piece in _pieces(file)]
+        rows = list(pool.map(_statistics, [piece for _, _, piece in pieces], chunksize=4))
+        print(f"{len(rows)} pieces after {time.monotonic() - started:.0f} s", file=sys.stderr)
+        for row, more in zip(rows, _predicted(pool, files, pieces), strict=True):
+            row |= more
+        print(f"predicted after {time.monotonic() - started:.0f} s", file=sys.stderr)
+        found = _detections(files, pieces, rows)
+        confirmations = _confirmations(pool, files)
+    seconds = round(time.monotonic() - started)
+    print(_table(found, confirmations, files, seconds))
+    if options.json:
+        named = [[file.kind, file.scene, file.pair, piece] for file, piece, _ in pieces]
+        record = {
+            "pieces": [[*name, row] for name, row in zip(named, rows, strict=True)],
+            "seconds": seconds,
+            "detections": found,
+            "confirmations": confirmations,
+        }
+        Path(options.json).write_text(json.dumps(record, indent=1, default=asdict))
+
+
+def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("plain", nargs="*", metavar="SCENE=FILE")
+    parser.add_argument("--learned", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
+    parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
+    parser.add_argument("--rounded", action="store_true")
+    parser.add_argument("--json", metavar="FILE")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    return parser.parse_args(arguments)
+
+
+def _named(text: str) -> tuple[str, str, str]:
+    """Scene, file, and the file after a colon."""
+    scene, _, paths = text.partition("=")
+    first, _, second = paths.partition(":")
+    return scene, first, second
+
+
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    plain = [_named(text)[:2] for text in options.plain]
+    jobs = []
+    for index, (scene, path) in enumerate(plain):
+        others = [each for named, each in plain if named != scene]
+        # The secret: of another scene, and each time another model as far as there are some.
+        jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)], options.rounded))
+    pairs = [_named(text) for text in options.pairs]
+    return jobs + [
+        Job(len(plain) + index, scene, path, "", False, given)
+        for index, (scene, path, given) in enumerate(pairs)
+    ]
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def _make(job: Job) -> list[File]:
+    """The plain model, and what something is hidden in."""
+    cover = read_model(job.path)
+    if job.given:
+        return [
+            File("plain", job.scene, job.path, cover),
+            File("given", job.scene, job.path, read_model(job.given)),
+        ]
+    if job.rounded:
+        cover = rounded(cover, job.index)
+    made = [File("plain", job.scene, job.path, cover)]
+    secret = carried.pruned_to_fit(cover, read_model(job.secret))
+    stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
+    made.append(File("carried", job.scene, job.path, stego, job.secret))
+    with suppress(UsageError):  # a small model has no room for a payload
+        sealed = embed_derived(cover, [(keys(2 * job.index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
+        made.append(File("sealed", job.scene, job.path, sealed))
+    return made
+
+
+def _pieces(file: File) -> Iterable[tuple[str, Gaussians]]:
+    """The whole model and disjoint parts of it, two to four, the same ones of all files of one pair."""
+    yield "whole", file.model
+    count = len(file.model)
+    random = np.random.default_rng([ord(letter) for letter in file.pair])
+    parts = min(int(random.integers(2, 5)), count // PART_SIZES[0])
+    if parts < 2:
+        return
+    for rows in np.array_split(random.permutation(count), parts):
+        yield "random", file.model[torch.from_numpy(np.sort(rows)[: PART_SIZES[1]])]
+    axis = int((file.model.means.quantile(0.9, 0) - file.model.means.quantile(0.1, 0)).argmax())
+    for rows in np.array_split(file.model.means[:, axis].numpy().argsort(kind="stable"), parts):
+        yield "space", file.model[torch.from_numpy(np.sort(rows)[: PART_SIZES[1]])]
+
+
+def _statistics(piece: Gaussians) -> dict[str, float]:
+    return {name: each.value for name, each in stealth_statistics(piece).items()}
+
+
+def _predicted(
+    pool: ProcessPoolExecutor, files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]]
+) -> list[dict[str, float]]:
+    """Of each piece, what trees that learned from plain models of the other scenes say of its bits."""
+    plain = [file for file in files if file.kind == "plain"]
+    samples = list(pool.map(_sample, [file.model for file in plain], chunksize=2))
+    found: list[dict[str, float]] = [{} for _ in pieces]
+    for scene in dict.fromkeys(file.scene for file in plain):
+        others = [each for file, each in zip(plain, samples, strict=True) if file.scene != scene]
+        predictor = BitPredictor.of_samples(others[:: -(-len(others) // MOST_TRAINED_ON)])
+        own = [index for index, (file, _, _) in enumerate(pieces) if file.scene == scene]
+        judge: Callable[[Gaussians], dict[str, float]] = partial(_judged, predictor)
+        for index, row in zip(
+            own, pool.map(judge, [pieces[each][2] for each in own], chunksize=4), strict=True
+        ):
+            found[index] = row
+    return found
+
+
+def _sample(model: Gaussians) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    return sample(model, TRAINING_ROWS, 0)
+
+
+def _judged(predictor: BitPredictor, piece: Gaussians) -> dict[str, float]:
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "openmp"):
+        return {f"predictor: {name}": each.value for name, each in predictor.statistics(piece).items()}
+
+
+def _detections(
+    files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]], rows: Sequence[dict[str, float]]
+) -> dict[str, dict[str, Any]]:
+    """By kind and piece: the worst statistics, what chance makes of the worst, and classifiers."""
+    found = {}
+    for kind in dict.fromkeys(file.kind for file in files if file.kind != "plain"):
+        for piece in ("whole", "random", "space"):
+            paired = {file.pair for file in files if file.kind == kind}
+            own = [
+                (file, row)
+                for (file, name, _), row in zip(pieces, rows, strict=True)
+                if name == piece
+                and (
+                    file.kind == kind or (file.kind == "plain" and (kind == "learned" or file.pair in paired))
+                )
+            ]
+            if len({file.scene for file, _ in own}) < 3 or len({file.kind for file, _ in own}) < 2:
+                continue
+            examples = Examples.of(
+                [row for _, row in own],
+                [int(file.kind == kind) for file, _ in own],
+                [file.scene for file, _ in own],
+                [file.pair for file, _ in own],
+            )
+            single, chance = single_detectors(examples)
+            found[f"{kind}, {piece}"] = {
+                "files": len(paired),
+                "single": single,
+                "chance": chance,
+                "learned": learned_detectors(examples),
+            }
+    return found
+
+
+def _confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> dict[str, dict[str, float]]:
+    """By kind and score, how often the true candidate is ranked above another one."""
+    found = {}
+    for kind in ("carried", "learned"):
+        own = [file for file in files if file.kind == kind and file.secret]
+        own = own[:: max(1, -(-len(own) // CANDIDATES))]
+        paths = list(dict.fromkeys(file.secret for file in own))
+        if len(paths) < 2:
+            continue
+        candidates = [read_model(path) for path in paths]
+        cases = [(file.model, candidate) for file in own for candidate in candidates]
+        scores = list(pool.map(_scores, cases, chunksize=4))
+        true = [paths.index(file.secret) for file in own]
+        found[f"{kind}, {len(own)} files, {len(paths)} candidates"] = {
+            name: confirmed(np.array([each[name] for each in scores]).reshape(len(own), len(paths)), true)
+            for name in scores[0]
+            if all(name in each for each in scores)
+        }
+    return found
+
+
+def _scores(case: tuple[Gaussians, Gaussians]) -> dict[str, float]:
+    return candidate_scores(*case)
+
+
+def _table(
+    found: dict[str, dict[str, Any]],
+    confirmations: dict[str, dict[str, float]],
+    files: Sequence[File],
+    seconds: float,
+) -> str:
+    scenes = {file.scene for file in files}
+    plain = sum(file.kind == "plain" for file in files)
+    lines = [f"{plain} plain models of {len(scenes)} scenes, {seconds} s", ""]
+    lines += [
+        "| files | detector | AUC | standard error | largest by chance |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name, each in found.items():
+        rows: list[Detection] = [*each["learned"], *each["single"][:SHOWN]]
+        for row in rows:
+            chance = "" if row in each["learned"] else f"{each['chance']:.2f}"
+            lines.append(f"| {name} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance} |")
+    lines += ["", "| confirmation | score | true above another |", "| --- | --- | --- |"]
+    for kind, scores in confirmations.items():
+        ordered = sorted(scores.items(), key=lambda pair: -abs(pair[1] - 0.5))
+        lines += [f"| {kind} | {name} | {value:.3f} |" for name, value in ordered]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Numbers that lie close together for a reason: do their low bits know of each other, as they should?
+
+Channels of a grey Gaussian, axes of a round one, neighbours in space that were one Gaussian before it was
+split, Gaussians that share whole rows: where the high bits are the same, the low ones of such numbers are
+close or the same too, until something replaces them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
+from keyss.measure.stealth.words import Bits, Floats, Ints, Words, ulps
+
+_LOW = 13  # bits that may have been replaced
+_CLOSE = 1 << 5  # steps of the last bit
+_NEIGHBOURS = 3
+# What embedding replaces moves a number by at most this many steps of its last bit.
+_MOVED, _AROUND = 1 << _LOW, 1 << (_LOW + 3)
+_GROUPS = {"axes": (1,), "quaternion": (2,), "channels": (5, 6, 7), "constant colour": (4,)}
+
+
+def agreement(words: Words, positions: Floats) -> dict[str, Statistic]:
+    """Of pairs with the same high bits, how many have close low bits; exact null: independent low bits.
+
+    And of pairs that were equal before: how many more there are a little apart than a smooth density gives.
+    """
+    found: dict[str, Statistic] = {}
+    for name, attributes in _GROUPS.items():
+        pairs = list(_within(words, attributes))
+        if pairs:
+            one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
+            found |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+    harmless = words.attribute > 0
+    for name, rows in (("neighbours", _neighbours(positions)), ("sharers", _sharers(words))):
+        one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
+        found |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+    return found
+
+
+def _of_pairs(one: Bits, other: Bits) -> dict[str, Statistic]:
+    apart = ulps(one, other)
+    same_high = (one >> _LOW) == (other >> _LOW)
+    equal = apart == 0
+    size = 1 << _LOW
+    near = (2 * _CLOSE - 1) * size - _CLOSE * (_CLOSE - 1)  # ordered pairs closer than _CLOSE
+    return {
+        "close low bits": excess(
+            int((apart[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2
+        ),
+        "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
+        "near misses": _misses(apart),
+        "equal": portion(float(equal.sum()), len(equal)),
+    }
+
+
+def _misses(apart: Ints) -> Statistic:
+    """Pairs less than _MOVED apart, but not equal, beyond those expected from how many are further apart."""
+    inside = int(((apart > 0) & (apart < _MOVED)).sum())
+    around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
+    return more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart))
+
+
+def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, Bits]]:
+    """Pairs of numbers of one Gaussian, one coefficient's channels or one attribute; signs left out."""
+    for attribute in attributes:
+        own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
+        if not own.size:
+            continue
+        width = 4 if attribute == 2 else 3
+        groups = own.reshape(len(own), -1, width)
+        for first in range(width):
+            for second in range(first + 1, width):
+                yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
+
+
+def _neighbours(positions: Floats) -> Ints:
+    """[P, 2] each Gaussian and those nearest to it."""
+    count = min(_NEIGHBOURS + 1, len(positions))
+    _, near = cKDTree(positions).query(positions, k=count)
+    near = near.reshape(len(positions), -1)
+    pairs = np.stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()], axis=1)
+    pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
+    return np.unique(pairs, axis=0)
+
+
+def _sharers(words: Words) -> Ints:
+    """[P, 2] Gaussians that have a number in common, in one field; neighbours in the order of that field."""
+    found = [np.zeros((0, 2), np.int64)]
+    for field in range(3, words.bits.shape[1]):
+        own = words.bits[:, field]
+        rows = np.flatnonzero(words.trained[:, field])
+        rows = rows[np.argsort(own[rows], kind="stable")]
+        same = np.flatnonzero(own[rows[1:]] == own[rows[:-1]])
+        found.append(np.stack([rows[same], rows[same + 1]], axis=1))
+    return np.unique(np.sort(np.concatenate(found), axis=1), axis=0)

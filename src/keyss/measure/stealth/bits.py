@@ -1,0 +1,115 @@
+"""Are the bits of mantissas what chance gives, whatever else an attacker sees beside them?
+
+By attribute, magnitude and position of the bit; given the bit below; and whether a number contradicts
+itself: training that leaves a zero in the last bit leaves zeros above it too, and embedding does not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from keyss.measure.stealth.statistic import NOTHING, Statistic, dispersion, normal, share
+from keyss.measure.stealth.words import ATTRIBUTES, MAGNITUDES, MANTISSA, Bits, Flags, Words
+
+RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9), "9-12": (9, 13)}
+_BITS = 14  # from the last one on
+_HARMONICS = ATTRIBUTES.index("sh1")
+_LEAST = 64  # numbers of a stratum
+
+
+def bits(words: Words) -> dict[str, Statistic]:
+    """Statistics of single numbers, by attribute and magnitude; nulls are exact: fair, independent bits."""
+    found: dict[str, Statistic] = {}
+    for index, attribute in enumerate(ATTRIBUTES):
+        columns = words.of_attribute(index)
+        own = words.bits[:, columns][words.trained[:, columns]]
+        if len(own):
+            found |= {f"{name}, {attribute}": each for name, each in _of_values(own).items()}
+            found[f"strata of {attribute}"] = _strata(own)
+            found[f"bytes of {attribute}"] = _bytes(own)
+    harmonics = words.attribute >= _HARMONICS
+    own, trained = words.bits[:, harmonics], words.trained[:, harmonics]
+    exponent = words.exponent[:, harmonics]
+    for magnitude, (low, high) in MAGNITUDES.items():
+        values = own[trained & (exponent >= low) & (exponent < high)]
+        found |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
+    small = trained & (exponent < MAGNITUDES["middling"][1])
+    found["zeros together in a Gaussian"] = _together(own, small)
+    found |= {f"Gaussians with tiny harmonics, {name}": each for name, each in _beside_tiny(words).items()}
+    return found
+
+
+def _of_values(values: Bits) -> dict[str, Statistic]:
+    """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 above a zero against above a one."""
+    found = {}
+    for name, (low, high) in RANGES.items():
+        ones = sum(int((values >> bit & 1).sum()) for bit in range(low, high))
+        found[f"ones in bits {name}"] = share(ones, len(values) * (high - low))
+    for count in (4, 8):
+        zeros = int((values & np.uint32((1 << count) - 1) == 0).sum())
+        found[f"{count} zeros at the end"] = share(
+            zeros, len(values) if len(values) >> count > 5 else 0, 2.0**-count
+        )
+    even = values & 1 == 0
+    clear = values & np.uint32(14) == 0
+    found["zeros above a zero"] = _difference(clear[even], clear[~even], 1 / 8)
+    return found
+
+
+def _difference(one: Flags, other: Flags, expected: float) -> Statistic:
+    """How much more often in `one` than in `other`, where both are by chance `expected`."""
+    if min(len(one), len(other)) < _LEAST:
+        return NOTHING
+    error = (expected * (1 - expected) * (1 / len(one) + 1 / len(other))) ** 0.5
+    return normal(float(one.mean() - other.mean()), error)
+
+
+def _strata(values: Bits) -> Statistic:
+    """Chi-square of the ones by exponent, position of the bit and the bit below."""
+    total, degrees = 0.0, 0
+    exponent = (values >> MANTISSA & 255).astype(np.int64)
+    for bit in range(1, _BITS):
+        stratum = exponent * 2 + (values >> (bit - 1) & 1)
+        count = np.bincount(stratum)
+        ones = np.bincount(stratum, weights=values >> bit & 1)
+        enough = count >= _LEAST
+        total += float(((ones - count / 2) ** 2 / np.maximum(count / 4, 1))[enough].sum())
+        degrees += int(enough.sum())
+    return dispersion(total, degrees)
+
+
+def _bytes(values: Bits) -> Statistic:
+    """Chi-square of the bytes from bit 1 and from bit 5 on."""
+    if len(values) < 1024:
+        return NOTHING
+    total = 0.0
+    for shift in (1, 5):
+        counts = np.bincount(values >> shift & 255, minlength=256)
+        total += float(((counts - len(values) / 256) ** 2).sum() * 256 / len(values))
+    return dispersion(total, 2 * 255)
+
+
+def _together(values: Bits, chosen: Flags) -> Statistic:
+    """Variance over Gaussians of how many of their small harmonics end in three zeros above the last bit."""
+    zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
+    trials = chosen.sum(axis=1)
+    rows = trials > 1
+    if rows.sum() < _LEAST:
+        return NOTHING
+    z2 = (zeros[rows] - trials[rows] / 8) ** 2 / (trials[rows] * 7 / 64)
+    # The kurtosis of a binomial number: 1 / variance - 6 / n beyond that of a normal one.
+    variance = 2 + 1 / (trials[rows] * 7 / 64) - 6 / trials[rows]
+    error = float(np.sqrt(variance.sum()) / rows.sum())
+    return normal(float(z2.mean() - 1), error)
+
+
+def _beside_tiny(words: Words) -> dict[str, Statistic]:
+    """Bits of the other numbers of those Gaussians that have a tiny harmonic: are they treated otherwise?"""
+    harmonics = words.attribute >= _HARMONICS
+    tiny = (words.trained & (words.exponent < MAGNITUDES["tiny"][1]))[:, harmonics].any(axis=1)
+    found = {}
+    for name, rows in (("with", tiny), ("without", ~tiny)):
+        values = words.bits[rows][:, harmonics][words.trained[rows][:, harmonics]]
+        ones = sum(int((values >> bit & 1).sum()) for bit in range(1, 4))
+        found[f"ones in bits 1-3 {name}"] = share(ones, 3 * len(values))
+    return found

@@ -1,0 +1,89 @@
+"""What some tools keep exactly; whoever moves low bits makes of it what is nearly so."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from keyss.core.gaussians import Gaussians
+from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
+from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Ints, Words
+
+_UNIT = 5e-7  # of a length that was normalised in float32
+_MOVED, _AROUND = 2e-4, 2e-3  # as far as embedding moves a length; what a smooth density is judged by
+_CELLS = 4  # along each axis
+_BLOCKS = 16  # of rows
+_LEAST = 30  # Gaussians of a part
+_CLUSTERED = 0.01  # of the usual gap between neighbouring values
+_WINDOW = 32
+
+
+def invariants(model: Gaussians, words: Words) -> dict[str, Statistic]:
+    """Unit quaternions in the whole file and in parts of it, repeated values, clusters, short numbers."""
+    found = _lengths(model)
+    for index, attribute in enumerate(ATTRIBUTES):
+        own = words.bits[:, words.of_attribute(index)]
+        if not own.size:
+            continue
+        trained = words.trained[:, words.of_attribute(index)]
+        found[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
+        repeated = sum(_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
+        found[f"repeated values, {attribute}"] = portion(repeated, own.size)
+        clusters = [
+            _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
+        ]
+        hits, trials = (sum(each) for each in zip(*clusters, strict=True))
+        found[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
+    return found
+
+
+def _lengths(model: Gaussians) -> dict[str, Statistic]:
+    """Of quaternions: how many are of unit length, in all and in parts, and how many nearly."""
+    error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
+    unit = error < _UNIT
+    nearly = int((~unit & (error < _MOVED)).sum())
+    around = int(((error >= _MOVED) & (error < _AROUND)).sum())
+    found = {
+        "quaternions of unit length": portion(float(unit.sum()), len(unit)),
+        "quaternions of nearly unit length": more_than_smooth(
+            nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
+        ),
+        "distance of quaternions from unit length, median": Statistic(
+            float(np.log10(np.median(error) + 1e-9))
+        ),
+    }
+    positions = model.means.detach().cpu().double().numpy()
+    for name, part in (("space", _cells(positions)), ("rows", np.arange(len(unit)) * _BLOCKS // len(unit))):
+        count, hits = np.bincount(part), np.bincount(part, weights=unit)
+        shares = (hits / np.maximum(count, 1))[count >= _LEAST]
+        spread = float(shares.max() - shares.min()) if len(shares) else 0.0
+        found[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
+    return found
+
+
+def _cells(positions: Floats) -> Ints:
+    """[N] index of the cell of space, cut at quantiles of each coordinate."""
+    cuts = np.quantile(positions, np.arange(1, _CELLS) / _CELLS, axis=0)
+    index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
+    found: Ints = np.ravel_multi_index(index, (_CELLS,) * 3)
+    return found
+
+
+def _repeated(values: Bits) -> int:
+    """How many values occur more than once."""
+    _, counts = np.unique(values, return_counts=True)
+    return int(counts[counts > 1].sum())
+
+
+def _clusters(values: Floats) -> tuple[int, int]:
+    """How many gaps between neighbouring values are far smaller than those around, and how many there are.
+
+    Between values of a smooth density gaps over their mean are exponential: one in a hundred is below 0.01.
+    """
+    ordered = np.unique(values)
+    if len(ordered) < 4 * _WINDOW:
+        return 0, 0
+    gaps = np.diff(ordered)
+    sums = np.concatenate([[0.0], gaps.cumsum()])
+    starts = np.clip(np.arange(len(gaps)) - _WINDOW // 2, 0, len(gaps) - _WINDOW)
+    around = (sums[starts + _WINDOW] - sums[starts] - gaps) / (_WINDOW - 1)
+    return int((gaps < _CLUSTERED * around).sum()), len(gaps)

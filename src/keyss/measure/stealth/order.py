@@ -1,0 +1,58 @@
+"""The order of rows: what comes first and last, and whether neighbouring rows belong together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import ks_2samp, rankdata
+
+from keyss.core.gaussians import Gaussians
+from keyss.measure.stealth.statistic import Statistic, normal, portion
+from keyss.measure.stealth.words import Floats
+
+_KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
+_NEAR = 1e-5  # of the model's size
+
+
+def order(model: Gaussians) -> dict[str, Statistic]:
+    """Correlation of what a row holds with its number, first half against second; null: any order.
+
+    Plain models have an order too, that in which density control appended, so that controls tell what is
+    usual: a shuffled file is as odd as one with a second model at its end.
+    """
+    found: dict[str, Statistic] = {}
+    count = len(model)
+    if count < 100:
+        return found
+    rows = np.arange(count)
+    for name, values in columns(model).items():
+        ranks = rankdata(values)
+        correlation = float(np.corrcoef(rows, ranks)[0, 1]) if np.ptp(values) > 0 else 0.0
+        found[f"row and {name}, correlation"] = normal(correlation, 1 / math.sqrt(count - 1))
+        half = ks_2samp(values[: count // 2], values[count // 2 :], method="asymp")
+        found[f"halves of rows, {name}"] = Statistic(
+            float(half.statistic), _KS_SPREAD * math.sqrt(4 / count), float(half.pvalue)
+        )
+        jumps = np.abs(np.diff(ranks)).mean() / count
+        found[f"neighbouring rows, {name}"] = normal(float(jumps), 0.2236 / math.sqrt(count), 1 / 3)
+    positions = model.means.detach().cpu().double().numpy()
+    size = float(np.linalg.norm(np.subtract(*np.quantile(positions, (0.9, 0.1), axis=0)))) or 1.0
+    pairs = len(cKDTree(positions).query_pairs(_NEAR * size, output_type="ndarray"))
+    found["near duplicates"] = portion(pairs, count)
+    return found
+
+
+def columns(model: Gaussians) -> dict[str, Floats]:
+    """[N] numbers of a Gaussian by which orders are compared."""
+    positions = model.means.detach().cpu().double()
+    found = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}
+    found["distance"] = (positions - positions.median(0).values).norm(dim=1)
+    found["size"] = model.log_scales.detach().cpu().double().mean(1)
+    found["opacity"] = model.opacity_logits.detach().cpu().double()
+    found["brightness"] = model.sh[:, 0].detach().cpu().double().mean(1)
+    found["length of quaternion"] = model.quats.detach().cpu().double().norm(dim=1)
+    if model.sh_degree:
+        found["harmonics"] = model.sh[:, 1:].detach().cpu().double().square().sum((1, 2))
+    return {name: np.nan_to_num(values.numpy()) for name, values in found.items()}
