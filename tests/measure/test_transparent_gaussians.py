@@ -10,12 +10,13 @@ import torch
 from scipy.stats import mannwhitneyu, spearmanr
 
 import keyss
+from keyss.channels.low_bits.bits import identities
 from keyss.core import Gaussians, Scene
 from keyss.core.gaussians import DRAWN_OPACITY
 from keyss.methods.learned.attacks import known_remaps
 from methods.learned.hiding import hide_scenes
 from methods.learned.test_joint import CONFIG, _psnr, _scenes
-from tiny_scenes import random_gaussians
+from tiny_scenes import random_gaussians, tiny_scene
 
 
 def _without_a_key(stego: Gaussians) -> Gaussians:
@@ -81,3 +82,18 @@ def test_with_a_sidecar_the_order_of_the_rows_says_nothing(
     own = torch.cdist(hidden, models[1].sh.flatten(1)).argmin(1).numpy()
     assert len(set(own)) > 50
     assert spearmanr(np.arange(len(own)), own).pvalue > 1e-3
+
+
+def test_what_the_cover_becomes_does_not_depend_on_the_secret_or_the_key(
+    pair: tuple[list[Scene], list[Gaussians]],
+) -> None:
+    """But for low bits: whoever asks what the file says of the secret asks of those only."""
+    scenes, models = pair
+    config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=30, max_gaussians=2000))
+    others = [scenes[0], tiny_scene(5, views=11, distance=3.0)]
+    one = hide_scenes(scenes, ["a key"], config, plains=models).stego
+    two = hide_scenes(others, ["k"], config, plains=[models[0], random_gaussians(900, seed=5)]).stego
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.sh[:, 0], two.sh[:, 0])
+    assert [row.tobytes() for row in identities(one)] == [row.tobytes() for row in identities(two)]
+    assert not torch.equal(one.quats, two.quats)

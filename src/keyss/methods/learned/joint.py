@@ -51,7 +51,14 @@ class JointRun:
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
         self.owners = chosen_scenes(config.poses, len(scenes))
         self.owner_order = Shuffle(len(self.owners), self.generator)
-        self.shuffles = [Shuffle(len(placed.scene.train), self.generator) for placed in scenes]
+        # Each scene's order of views is its own: what a cover becomes must not depend on the secrets.
+        self.orders = [
+            torch.Generator().manual_seed(config.fit.seed_of(f"views of scene {index}"))
+            for index in range(len(scenes))
+        ]
+        self.shuffles = [
+            Shuffle(len(placed.scene.train), order) for placed, order in zip(scenes, self.orders, strict=True)
+        ]
         self.extent = scenes[0].scene.extent
 
         self.warm = config.start == "warm"
@@ -139,7 +146,8 @@ class JointRun:
     def _draw_poses(self) -> list[tuple[int, int]]:
         """For each scene whose training pose it is drawn from, and which one."""
         count = len(self.scenes)
-        if float(torch.rand((), generator=self.generator)) < self.config.common_poses:
+        common = 0.0 if self.config.in_records else self.config.common_poses
+        if float(torch.rand((), generator=self.generator)) < common:
             owner = self.owners[self.owner_order.draw()]
             return [(owner, self.shuffles[owner].draw())] * count
         return [(scene, self.shuffles[scene].draw()) for scene in range(count)]
@@ -203,6 +211,7 @@ class JointRun:
             tensors |= {f"decoder_adam.{index}.{name}": value for name, value in moments.items()}
         tensors |= {"owners": self.owner_order.state(), "generator": self.generator.get_state()}
         tensors |= {f"order.{i}": shuffle.state() for i, shuffle in enumerate(self.shuffles)}
+        tensors |= {f"order_generator.{i}": order.get_state() for i, order in enumerate(self.orders)}
         return tensors, {"iteration": self.iteration}
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None:
@@ -221,6 +230,7 @@ class JointRun:
         self.owner_order.load(tensors["owners"])
         for i, shuffle in enumerate(self.shuffles):
             shuffle.load(tensors[f"order.{i}"])
+            self.orders[i].set_state(tensors[f"order_generator.{i}"])
         self.generator.set_state(tensors["generator"])
         self.iteration = int(meta["iteration"])
 
