@@ -157,8 +157,8 @@ def test_buckets_waste_at_most_a_quarter_and_are_few() -> None:
 
 
 def test_a_bomb_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    sealed = encrypt(bytes(32), bytes(2_000_000))
+    sealed = encrypt(bytes(32), bytes(1_000_000))
     assert len(sealed) == 4096
-    monkeypatch.setattr("keyss.keys.encryption.MAX_PAYLOAD_BYTES", 1_000_000)
+    monkeypatch.setattr("keyss.keys.encryption.MAX_PAYLOAD_BYTES", 500_000)
     with pytest.raises(InputError, match="larger"):
         decrypt(bytes(32), sealed)

@@ -98,7 +98,8 @@ class PreparedCover(Protocol):
         """The cover with one (key, content) for each secret in it; all contents are of one service.
 
         `entropy`: at least 32 bytes that nobody else can know, from which all that is random is derived; by
-        default the system's. Raises UsageError for equal keys and for what does not fit.
+        default the system's. Raises UsageError for equal keys and for what does not fit. Warns (KeyssWarning)
+        where the holder of one key can notice that there are other secrets.
         """
 
 
@@ -112,4 +113,7 @@ class Channel(Protocol):
         """Find the carriers. Raises InputError for a cover that cannot carry anything unseen."""
 
     def extract(self, stego: Gaussians, key: str) -> Content:
-        """What `key` opens. Raises WrongKeyError when it opens nothing, InputError for what is damaged."""
+        """What `key` opens. Raises WrongKeyError when it opens nothing, InputError for what is damaged.
+
+        Warns (KeyssWarning) where the key opens something else too.
+        """
