@@ -275,14 +275,16 @@ def _table(
     plain = sum(file.kind == "plain" for file in files)
     lines = [f"{plain} plain models of {len(scenes)} scenes, {seconds} s", ""]
     lines += [
-        "| files | detector | AUC | standard error | largest by chance |",
-        "| --- | --- | --- | --- | --- |",
+        "| files | detector | AUC | standard error | pooled | largest by chance |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for name, each in found.items():
         rows: list[Detection] = [*each["learned"], *each["single"][:SHOWN]]
         for row in rows:
             chance = "" if row in each["learned"] else f"{each['chance']:.2f}"
-            lines.append(f"| {name} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance} |")
+            lines.append(
+                f"| {name} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {row.pooled:.3f} | {chance} |"
+            )
     lines += ["", "| confirmation | score | true above another |", "| --- | --- | --- |"]
     for kind, scores in confirmations.items():
         ordered = sorted(scores.items(), key=lambda pair: -abs(pair[1] - 0.5))

@@ -28,6 +28,7 @@ class Detection:
     name: str
     auc: float
     error: float  # standard error
+    pooled: float  # area over the files of all scenes together, as for one threshold
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,8 @@ def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detecti
     worst = np.argsort(-found)[:MOST_NAMED]
     errors = _errors(scores[:, worst], examples)
     named = [
-        Detection(examples.names[index], float(found[index]), float(error))
-        for index, error in zip(worst, errors, strict=True)
+        Detection(examples.names[index], float(found[index]), float(error), float(pooled))
+        for index, error, pooled in zip(worst, errors, _pooled(scores[:, worst], examples), strict=True)
     ]
     return named, float(np.quantile(largest, 0.95))
 
@@ -105,7 +106,8 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
             scores[held] = machine.fit(train, examples.hidden[~held]).decision_function(test)
         (area,) = areas(scores[:, None], examples.hidden, examples.scene)
         (error,) = _errors(scores[:, None], examples)
-        found.append(Detection(f"{name} over all", float(area), float(error)))
+        (pooled,) = _pooled(scores[:, None], examples)
+        found.append(Detection(f"{name} over all", float(area), float(error), float(pooled)))
     return found
 
 
@@ -128,6 +130,10 @@ def areas(scores: Floats, hidden: Ints, scene: Ints) -> Floats:
             weights += len(own)
     found: Floats = total / max(weights, 1)
     return found
+
+
+def _pooled(scores: Floats, examples: Examples) -> Floats:
+    return areas(scores, examples.hidden, np.zeros_like(examples.scene))
 
 
 def _ranks(values: Floats) -> Floats:
