@@ -88,6 +88,10 @@ def cost(before: Gaussians, after: Gaussians) -> float:
 
 
 def _is_natural(values: Floats) -> bool:
+    """Whether values are random to the last bit, but for a few zeros, which training leaves, too."""
+    measured = values[values != 0]
+    if len(measured) > _FEW * len(values):
+        values = measured
     if len(np.unique(values)) <= _FEW * len(values) or not is_uniform(values):
         return False
     words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)

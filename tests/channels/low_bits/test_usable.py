@@ -141,3 +141,25 @@ def test_quaternions_of_unit_length_stay_so() -> None:
     stego = embed_derived(half, [(own, b"secret")])
     assert_same_bits(stego[:1500], half[:1500])
     assert usable_carriers(half)[1500:].mean() > 0.92
+
+
+def test_harmonics_of_one_colour_that_agree_several_times_stay_as_they_are() -> None:
+    """A Gaussian that few views show gets equal steps for all of them; by chance one pair may be equal."""
+    model = trained_like(2000)
+    for row in range(100):
+        for pair in range(1 + row % 2):
+            model.sh[row, 2 + 2 * pair, row % 3] = model.sh[row, 1 + 2 * pair, row % 3] * (1 + 2.0**-20)
+    usable = usable_carriers(model)
+    assert not usable[:100][1::2].any()
+    assert usable[:100][0::2].mean() > 0.9
+    assert usable[100:].mean() > 0.94
+
+
+def test_short_values_count_only_where_there_are_more_than_by_chance() -> None:
+    """Else those that are left alone and those that embedding makes would be twice as many."""
+    one, many = trained_like(2000), trained_like(2000)
+    one.sh[0, 1, 0] = 0.25
+    many.sh[:40, 1, 0] = (1 + torch.arange(40) % 8 / 8) * 0.5 ** (torch.arange(40) // 8)
+    assert usable_carriers(trained_like(2000))[0]
+    assert usable_carriers(one)[0]
+    assert not usable_carriers(many)[:40].any()

@@ -15,7 +15,7 @@ from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, LearnedOptions, Secret
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.usable import usable_carriers
-from keyss.core import InputError, UsageError
+from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.fitting.config import FitConfig
 from keyss.measure.hiding import mean_psnr
 from keyss.methods import registry
@@ -122,6 +122,20 @@ def test_low_bits_that_are_not_random_after_all_get_new_ones(monkeypatch: pytest
     assert len(seen) == 2
     assert "dithered_cover_psnr_against_the_one_before" in result.metrics.details
     assert [len(keyss.reveal(result.stego, KEY))] == result.metrics.details["gaussians_before_pruning"]
+
+
+def test_zeros_that_training_left_stay() -> None:
+    """Small random numbers in their place would be known by their size."""
+    model = trained_like(2000)
+    model.sh[:150, 4:] = 0
+    assert torch.equal(with_low_bits(model, 3, os.urandom(32)).sh, model.sh)
+
+
+def test_secrets_that_get_less_because_of_others_are_warned_of() -> None:
+    cover, large, small = trained_like(4000), trained_like(4000, 1), trained_like(900, 2)
+    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
+        _prepare(LearnedOptions(), cover, large, small)
+    _prepare(LearnedOptions(), cover, small, small)
 
 
 @pytest.mark.parametrize(("degree", "expected"), [(0, None), (1, 0), (2, 2), (3, 3)])

@@ -6,7 +6,8 @@ not all of them. A Gaussian is left alone, as a whole, so that none contradicts 
 - *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
   occur too often (after a few steps of training many are the same small multiple of the learning rate).
 - *Coincidences*: numbers that agree in all bits above the written ones would agree in nothing else
-  afterwards. These are near-equal components (grey colours, round Gaussians), Gaussians that share whole
+  afterwards. These are near-equal components (grey colours, round Gaussians), harmonics of one colour that
+  are equal several times (a Gaussian that few views show gets equal steps), Gaussians that share whole
   triples of numbers (clones that training hardly moved apart), unit quaternions, and Gaussians that occur
   twice.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
@@ -53,13 +54,17 @@ GIVEN_AWAY = 0.03
 _GROUPS = (slice(0, 3), QUATS, slice(7, 8), slice(8, None))  # scales, quaternions, opacity, harmonics
 _GROUP_NAMES = ("log scales", "quaternions", "opacity logits", "harmonics")
 
-# A value is not random, but a short number or zero, when at least this many low bits of its mantissa are
-# zero; by chance that happens to one value in a million.
-_SHORT = np.uint32((1 << 20) - 1)
+# A value is not random, but a short number, when at least this many low bits of its mantissa are zero. By
+# chance that happens to one value in a million; where there are no more of them than that, it is chance.
+_SHORT_BITS = 20
+_SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # Nor is a Gaussian, when so many of its values have so many zeros; by chance one in three million is that.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 
+_EQUAL_HARMONICS = 2  # pairs; in 1 % of the Gaussians by chance
 _EXACT = 1e-6  # of the length of a unit quaternion in single precision
+# Sets of equal values that there may be by chance: those are left alone, and embedding makes as many again.
+_SETS_BY_CHANCE = 0.1
 _SAMPLE = 20_000
 _SHIFTS = (UNUSED_BITS, UNUSED_BITS + 4)  # two overlapping bytes
 _LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in trained models, above 50 in others
@@ -70,12 +75,12 @@ def usable_carriers(gaussians: Gaussians) -> Flags:
     """[N] which Gaussians have low bits that look like those of trained values, and can be replaced."""
     layout = Layout.of(gaussians)
     usable = ~_occur_together(gaussians, layout)
-    frequent = _frequent_values(gaussians)
+    frequent, short = _frequent_values(gaussians), _has_short_values(gaussians, layout)
     counts = [np.zeros_like(count_trailing_zeros(np.zeros(0, np.uint32))) for _ in _GROUPS]
     start = 0
     for part in blocks(gaussians):
         used, rows = used_words(part), slice(start, start + len(part))
-        usable[rows] &= _are_measured(used, layout, frequent) & ~near_equal(used, layout)
+        usable[rows] &= _are_measured(used, layout, frequent, short) & ~near_equal(used, layout)
         if layout.quats:
             usable[rows] &= ~_have_unit_length(used)
         for group, count in zip(_GROUPS, counts, strict=True):
@@ -157,8 +162,9 @@ def chance_of_bits(words: Words, bits: int) -> float:
 def near_equal(used: Words, layout: Layout) -> Flags:
     """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
 
-    Decided by the bits that embedding leaves, which by chance are the same, or neighbours, in some 3 % of all
-    Gaussians. `used`: [N, F] of `used_words`.
+    Or _EQUAL_HARMONICS pairs of one colour's harmonics, next to each other by size, equal. Decided by the
+    bits that embedding leaves, which by chance are so in some 4 % of all Gaussians. `used`: [N, F] of
+    `used_words`.
     """
     shifts = [int(mask).bit_length() for mask in layout.mask]
     high = ((used & np.uint32(0x7FFFFFFF)) >> np.array(shifts, np.uint32)).astype(np.int32)
@@ -169,6 +175,8 @@ def near_equal(used: Words, layout: Layout) -> Flags:
     for values in together:
         for a, b in combinations(range(values.shape[2]), 2):
             found |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
+    harmonics = np.sort(high[:, GEOMETRY:].reshape(len(used), -1, 3), axis=1)
+    found |= (np.diff(harmonics, axis=1) == 0).sum(axis=(1, 2)) >= _EQUAL_HARMONICS
     return found
 
 
@@ -177,10 +185,23 @@ def exponents(words: Words) -> npt.NDArray[np.uint8]:
     return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
 
 
-def _are_measured(used: Words, layout: Layout, frequent: list[Words]) -> Flags:
-    """[N] whether no number in use is short, subnormal or frequent, and few have many zeros."""
+def _has_short_values(gaussians: Gaussians, layout: Layout) -> bool:
+    """Whether there are more short values than by chance."""
+    found = total = 0
+    for part in blocks(gaussians):
+        used = used_words(part)[:, layout.columns]
+        found += int((((used & _SHORT) == 0) & (exponents(used) > 0)).sum())
+        total += used.size
+    expected = total / 2.0**_SHORT_BITS
+    return bool(found > expected + 5 * (expected + 1) ** 0.5)
+
+
+def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: bool) -> Flags:
+    """[N] whether no number in use is subnormal or frequent, and few have many zeros; if `short`, none is."""
     large = exponents(used)
-    fine = ((used & _SHORT) != 0) & (large > 0) & (large < 254)
+    fine = (large > 0) & (large < 254)
+    if short:
+        fine &= (used & _SHORT) != 0
     for group, values in zip(_GROUPS, frequent, strict=True):
         fine[:, group] &= ~np.isin(used[:, group], values)
     zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
@@ -243,12 +264,12 @@ def _frequent_values(gaussians: Gaussians) -> list[Words]:
 
 
 def _unlikely_copies(count: int) -> int:
-    """The least c from 3 on so that sets of c equal ones are rare among `count` values: 3 up to a million.
+    """The least c from 3 on so that sets of c equal ones are rare among `count` values.
 
-    For 2^26 equally likely values there would be count^c / c! / 2^(26 (c - 1)) such sets, here at most 30.
+    For 2^26 equally likely values there would be count^c / c! / 2^(26 (c - 1)) such sets.
     """
     copies = 3
-    while count**copies / math.factorial(copies) > 30 * 2 ** (26 * (copies - 1)):
+    while count**copies / math.factorial(copies) > _SETS_BY_CHANCE * 2 ** (26 * (copies - 1)):
         copies += 1
     return copies
 

@@ -41,8 +41,8 @@ class LearnedOptions(MethodOptions):
     poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
     densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
     # Steps at which all scenes are drawn from one pose, photo or plain model's render; at the others each is
-    # drawn from a pose of its own and compared with its photo. The paper has the first kind only. Where scenes
-    # share no Gaussians in the end (`in_records`), each is drawn from its own poses only.
+    # drawn from a pose of its own and compared with its photo. The paper has the first kind only. Scenes
+    # that share no Gaussians (`in_records`) have the second kind only.
     common_poses: float = 0.1
 
     mask: Annotated[  # theta

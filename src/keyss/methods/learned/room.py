@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -12,7 +13,7 @@ from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.layout import Room, record_capacity
 from keyss.channels.low_bits.spread import TYPICAL_SHARE, check_payload_fits
 from keyss.channels.low_bits.usable import usable_carriers
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import expand
@@ -27,6 +28,10 @@ from keyss.methods.records.table import Table
 # Of the Gaussians before training, which brings those that it reaches, about half and more, to 0.72.
 LEAST_USABLE_AT_START = 0.28
 LEAST_SECRET = 16  # Gaussians
+_SMALLER = (
+    "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
+    "keys can notice that there are other secrets"
+)
 _SIDECAR = "`sidecar=True` writes a file beside it instead"
 
 
@@ -122,7 +127,11 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
         )
     cap = min(cap, cap if cover is None else len(cover))
     sizes = [cap if each is None else len(each) for each in models[1:]]
-    if min(_secret_sizes(sizes, cap, options, usable)) < min(LEAST_SECRET, *sizes):
+    counts = _secret_sizes(sizes, cap, options, usable)
+    alone = [_secret_sizes([each], cap, options, usable)[0] for each in sizes]
+    if counts != alone:
+        warnings.warn(_SMALLER, KeyssWarning, stacklevel=2)
+    if min(counts) < min(LEAST_SECRET, *sizes):
         raise UsageError(
             f"a cover of {cap:,} Gaussians is too small to hide {len(sizes)} secret"
             f"{'s' if len(sizes) > 1 else ''} in its low bits; a larger one has room, {_SIDECAR}"
