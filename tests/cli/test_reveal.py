@@ -218,7 +218,10 @@ class TestSidecars:
         (tmp_path / "greedy.sealed").write_bytes(data)
         said = reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed")
         assert_refused(said, 4, "memory_kib")
-        data[25:30] = bytes([16]) + (128 * 1024).to_bytes(4, "little")
+        data[25:30] = bytes([5]) + (64 * 1024).to_bytes(4, "little")
+        (tmp_path / "greedy.sealed").write_bytes(data)
+        assert_refused(reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed"), 4, "time_cost")
+        data[25:30] = bytes([4]) + (256 * 1024).to_bytes(4, "little")
         (tmp_path / "greedy.sealed").write_bytes(data)
         assert_refused(reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed"), 4, "passes times KiB")
 

@@ -133,6 +133,8 @@ def print_verdicts(run: Path) -> None:
 
     lines = verdicts(read_audit(run))
     table = _table("measure", "measured", "baseline or control", "limit", "verdict", texts=5)
+    for column in (table.columns[0], table.columns[-1]):  # what is judged, and how; the rest may be long
+        column.no_wrap = True
     for line in lines:
         table.add_row(line.measure, line.value, line.beside, line.limit, line.word)
     Console().print(table)
