@@ -152,7 +152,7 @@ def test_from_the_command_line(
     assert "--limit N" in said
     assert "--most N" in said
     assert "{small,large}" in said
-    assert "whole: embed the floats themselves" in said
+    assert "whole: embed the floats themselves" in " ".join(said.split())
     hide = ["hide", "--method", "whole", "--cover", str(models[0]), "--secret", str(models[1])]
     run = str(tmp_path / "run")
     assert main([*hide, "--width", "24", "--limit", "59", "-o", run]) == 2

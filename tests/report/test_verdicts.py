@@ -262,7 +262,8 @@ def test_a_reader_that_was_not_there_is_not_measured(fine: Data) -> None:
     )
     assert lines["reading by splat-transform"].word == "not measured"
     assert headline(verdicts(found)) == (
-        "All 10 measures are within their limits. Not measured: reading by splat-transform."
+        f"All {sum(each.word == 'fine' for each in lines.values())} measures are within their limits. "
+        "Not measured: reading by splat-transform."
     )
     without = changed(fine, ("stegexpose.sealwatch_missing", "get it with pip"))
     assert judged(without)["sealwatch on renders"].word == "not measured"

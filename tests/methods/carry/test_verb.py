@@ -13,11 +13,12 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
+from keyss.channels.low_bits import LOW_BITS
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.ply import read_ply, write_ply
-from keyss.methods.records.encoding import most_visible
+from keyss.methods.records.encoding import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -91,13 +92,16 @@ def test_too_large_secrets_are_refused_or_pruned(
     hide = (*hide, "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out")
     assert status == 2
-    assert "4,342 would fit; --prune-to-fit" in err
+    cover = LOW_BITS.prepare(read_ply("cover.ply"))
+    fits = cover.record_capacity([record_request(6000, 3)])
+    assert 4000 < fits < 4800
+    assert f"{fits:,} would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
     assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
-    assert metrics["secret_gaussians"] == [4342]
+    assert metrics["secret_gaussians"] == [fits]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
-    assert metrics["details"]["share_kept_by_pruning"] == [round(4342 / 6000, 4)]
+    assert metrics["details"]["share_kept_by_pruning"] == [round(fits / 6000, 4)]
     assert 10 < metrics["details"]["pruned_secret_psnr_against_the_whole"][0] < 60
 
 

@@ -28,7 +28,7 @@ from keyss.methods.records.encoding import (
 )
 from keyss.methods.records.quantise import out_of_range
 
-_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned"` has no such limit'
+_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned", sidecar=True` has room'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
 _SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
 _DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
