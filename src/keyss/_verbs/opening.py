@@ -1,4 +1,4 @@
-"""`reveal` and `verify`: what a key opens."""
+"""`reveal` and `verify`: from a stego model and a key to the secret."""
 
 from __future__ import annotations
 
