@@ -198,6 +198,8 @@ def row(result: dict[str, Any]) -> list[str]:
 
     def against(which: str) -> str:
         shown = near[which]
+        if shown is None:
+            return "no decoder"
         mean = metrics["cover"]["psnr"] - shown["vs_cover"]["mean"]
         worst = metrics["cover"]["psnr"] - shown["vs_cover"]["min"]
         above = max(

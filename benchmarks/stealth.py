@@ -4,6 +4,7 @@
     python benchmarks/stealth.py ... --learned bonsai=stego.ply:secret.ply  # stego files, secrets' own models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # files made by something else
     python benchmarks/stealth.py ... --rounded   # models as trainers leave them that round steps
+    python benchmarks/stealth.py ... --quick     # two random parts of each model, no predictor, no candidates
 
 From each plain model are made a carried one, which holds as much of a model of the next scene as fits, and
 one with a sealed payload. Statistics are taken of whole models and of parts of 2,000 to 5,000 Gaussians,
@@ -80,14 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{len(files)} files after {time.monotonic() - started:.0f} s", file=sys.stderr)
         for scene, path, secret in map(_named, options.learned):
             files.append(File("learned", scene, path, read_model(path), secret))
-        pieces = [(file, name, piece) for file in files for name, piece in _pieces(file)]
+        pieces = [(file, name, piece) for file in files for name, piece in _pieces(file, options.quick)]
         rows = list(pool.map(_statistics, [piece for _, _, piece in pieces], chunksize=4))
         print(f"{len(rows)} pieces after {time.monotonic() - started:.0f} s", file=sys.stderr)
-        for row, more in zip(rows, _predicted(pool, files, pieces), strict=True):
-            row |= more
-        print(f"predicted after {time.monotonic() - started:.0f} s", file=sys.stderr)
+        if not options.quick:
+            for row, more in zip(rows, _predicted(pool, files, pieces), strict=True):
+                row |= more
+            print(f"predicted after {time.monotonic() - started:.0f} s", file=sys.stderr)
         found = _detections(files, pieces, rows)
-        confirmations = _confirmations(pool, files)
+        confirmations = {} if options.quick else _confirmations(pool, files)
     seconds = round(time.monotonic() - started)
     print(_table(found, confirmations, files, seconds))
     if options.json:
@@ -107,6 +109,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--learned", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
     parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
     parser.add_argument("--rounded", action="store_true")
+    parser.add_argument("--quick", action="store_true")
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     return parser.parse_args(arguments)
@@ -157,16 +160,21 @@ def _make(job: Job) -> list[File]:
     return made
 
 
-def _pieces(file: File) -> Iterable[tuple[str, Gaussians]]:
-    """The whole model and disjoint parts of it, two to four, the same ones of all files of one pair."""
+def _pieces(file: File, quick: bool) -> Iterable[tuple[str, Gaussians]]:
+    """The whole model and disjoint parts of it, two to four, the same ones of all files of one pair.
+
+    With `quick`, of the parts only the first two random ones.
+    """
     yield "whole", file.model
     count = len(file.model)
     random = np.random.default_rng([ord(letter) for letter in file.pair])
     parts = min(int(random.integers(2, 5)), count // PART_SIZES[0])
     if parts < 2:
         return
-    for rows in np.array_split(random.permutation(count), parts):
+    for rows in np.array_split(random.permutation(count), parts)[: 2 if quick else None]:
         yield "random", file.model[torch.from_numpy(np.sort(rows)[: PART_SIZES[1]])]
+    if quick:
+        return
     axis = int((file.model.means.quantile(0.9, 0) - file.model.means.quantile(0.1, 0)).argmax())
     for rows in np.array_split(file.model.means[:, axis].numpy().argsort(kind="stable"), parts):
         yield "space", file.model[torch.from_numpy(np.sort(rows)[: PART_SIZES[1]])]

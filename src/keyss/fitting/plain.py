@@ -123,10 +123,10 @@ def fit_scene(
         evaluate_every=config.evaluate_every,
         reporter=reporter,
     )
-    return FitResult(_pruned(run.gaussians().to("cpu"), config.prune_opacity), replace(config), seconds)
+    return FitResult(without_faint(run.gaussians().to("cpu"), config.prune_opacity), replace(config), seconds)
 
 
-def _pruned(model: Gaussians, least: float) -> Gaussians:
+def without_faint(model: Gaussians, least: float) -> Gaussians:
     """`model` without what fell below the limit of pruning after density control had stopped.
 
     Files of the original trainer have nothing there either, and what hides something must not be known by

@@ -6,9 +6,8 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
-from keyss.channels.base import Content, RecordRequest, Records
+from keyss.channels.base import Content, RecordRequest
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.core.errors import InputError, UsageError
@@ -16,17 +15,14 @@ from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import cost, dither, sampled
+from keyss.methods.records.embedding import embed_models, unpack_records
 from keyss.methods.records.encoding import (
     CarriedSecret,
     check_degrees,
-    decode,
-    encode_all,
-    most_visible,
     record_request,
     record_requests,
     subsampled_counts,
 )
-from keyss.methods.records.quantise import out_of_range
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned", sidecar=True` has room'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
@@ -106,39 +102,14 @@ class CarryMethod:
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
         with advising(InputError, _LEARNED if options.dither else _DITHER):
             prepared = _prepared(cover.model, options)
-        details: dict[str, Any] = {
-            "carriers": prepared.carriers,
-            "capacity": prepared.record_capacity(record_requests(models)),
-            "gaussians_before_pruning": [len(model) for model in models],
-        }
-        whole, counts = models, _counts(prepared, models, options)
-        models = [most_visible(model, count) for model, count in zip(whole, counts, strict=True)]
-        records = encode_all(prepared, models, NAME)
-        stego = prepared.embed(list(zip(keys, records, strict=True)))
-        opened = [self.unpack(LOW_BITS.extract(stego, key)) for key in keys]
+        counts = _counts(prepared, models, options)
+        found = embed_models(prepared, keys, models, counts, NAME)
         seconds = time.monotonic() - start
-        if [len(each.gaussians) for each in opened] != [len(model) for model in models]:
-            raise RuntimeError("what was written does not open again as it should")
-        details["bits_per_gaussian"] = [each.bits for each in opened]
-        if any(clamped := [out_of_range(model) for model in models]):
-            details["gaussians_with_clamped_numbers"] = clamped
-        if any(kept is not model for model, kept in zip(whole, models, strict=True)):
-            pairs = list(zip(whole, models, strict=True))
-            details["share_kept_by_pruning"] = [round(len(kept) / len(model), 4) for model, kept in pairs]
-            details["pruned_secret_psnr_against_the_whole"] = [
-                None if kept is model else round(cost(model, kept), 1) for model, kept in pairs
-            ]
-        if prepared.cover is not cover.model:
-            details["dithered_cover_psnr_against_the_one_before"] = round(
-                cost(cover.model, prepared.cover), 1
-            )
-        return Stego(stego, None, tuple(opened), seconds, details=details)
+        return Stego(found.stego, None, found.opened, seconds, details=found.details(cover.model))
 
     def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""
-        if not isinstance(content, Records):
-            raise InputError("the hidden secret is damaged: expected records, got one payload")
-        return decode(content)
+        return unpack_records(content)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """None: without a key, low bits that carry something are as random as any."""

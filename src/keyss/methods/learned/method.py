@@ -33,7 +33,7 @@ from keyss.methods.learned.payload import unpack_secret
 from keyss.methods.learned.publication import NAME, publish
 from keyss.methods.learned.room import check_room, record_degree, shares, usable_share, with_low_bits
 from keyss.methods.learned.targets import PlacedScene
-from keyss.methods.records.encoding import decode
+from keyss.methods.records.embedding import unpack_records
 
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
@@ -149,7 +149,7 @@ class LearnedMethod:
     def unpack(self, content: Content) -> Opened:
         """The Gaussians themselves, or a decoder and where the secret lies. Raises InputError for damage."""
         if isinstance(content, Records):
-            return decode(content)
+            return unpack_records(content)
         return replace(unpack_secret(content.data), chunks=content.chunks)
 
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:

@@ -18,20 +18,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from keyss.channels.base import Payload, Records
+from keyss.channels.base import Payload
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.errors import InputError, KeyssError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
+from keyss.fitting.plain import without_faint
 from keyss.keys.derivation import expand, stream
 from keyss.methods.base import Opened
-from keyss.methods.dither import cost, dither
+from keyss.methods.dither import dither
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret, unpack_secret
 from keyss.methods.learned.room import record_degree
-from keyss.methods.records.encoding import CarriedSecret, decode, encode_all, most_visible, subsampled_counts
+from keyss.methods.records.embedding import embed_models
+from keyss.methods.records.encoding import subsampled_counts
 
 NAME = "learned"
 
@@ -68,7 +70,7 @@ def _in_records(
 ) -> Published:
     """The cover's Gaussians in the order of its plain model, with the secrets' in their low bits."""
     cover, secrets = run.separated()
-    cover = _without_faint(cover.to("cpu"), options.fit.prune_opacity)
+    cover = without_faint(cover.to("cpu"), options.fit.prune_opacity)
     degree = record_degree(cover.sh_degree)
     if degree is None:
         raise ValueError(f"a model of SH degree {cover.sh_degree} has no room for records")
@@ -76,34 +78,10 @@ def _in_records(
         frame.inverse().apply_gaussians(secret.to("cpu")).with_sh_degree(degree)
         for secret, frame in zip(secrets, frames, strict=True)
     ]
-    details: dict[str, Any] = {}
     prepared = _prepared(cover, discarded)
-    if prepared.cover is not cover:
-        details["dithered_cover_psnr_against_the_one_before"] = round(cost(cover, prepared.cover), 1)
     counts = subsampled_counts(prepared, models)
-    details |= {
-        "carriers": prepared.carriers,
-        "gaussians_before_pruning": [len(model) for model in models],
-    }
-    models = [most_visible(model, count) for model, count in zip(models, counts, strict=True)]
-    records = encode_all(prepared, models, NAME)
-    stego = prepared.embed(list(zip(keys, records, strict=True)), entropy=discarded)
-    opened = tuple(_opened(stego, key) for key in keys)
-    return Published(stego, None, opened, details | {"bits_per_gaussian": [each.bits for each in opened]})
-
-
-def _opened(stego: Gaussians, key: str) -> CarriedSecret:
-    """As its reader gets it."""
-    content = LOW_BITS.extract(stego, key)
-    if not isinstance(content, Records):
-        raise TypeError(f"expected records, got {type(content).__name__}")
-    return decode(content)
-
-
-def _without_faint(cover: Gaussians, least: float) -> Gaussians:
-    """As at the end of a plain fit."""
-    kept = cover.opacities >= least
-    return cover[kept] if kept.any() else cover
+    found = embed_models(prepared, keys, models, counts, NAME, entropy=discarded)
+    return Published(found.stego, None, found.opened, found.details(cover))
 
 
 def _prepared(cover: Gaussians, entropy: bytes) -> LowBitsCover:

@@ -125,7 +125,8 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
             f"only {usable:.0%} of the cover's Gaussians could have random low bits, the others hold equal "
             f"values; {_SIDECAR}"
         )
-    cap = min(cap, cap if cover is None else len(cover))
+    if cover is not None:
+        cap = min(cap, len(cover))
     sizes = [cap if each is None else len(each) for each in models[1:]]
     counts = _secret_sizes(sizes, cap, options, usable)
     alone = [_secret_sizes([each], cap, options, usable)[0] for each in sizes]
