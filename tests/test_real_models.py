@@ -63,8 +63,8 @@ def test_every_pair_is_accepted_or_shown_a_way(models: dict[str, Gaussians], met
         assert ways, said
         assert registry.of_options(ways[-1]).name == "learned"
         if models[cover].sh_degree > 0 and method == "carry":
-            # By its defaults, unless the secret is too large for any low bits.
-            assert ways[-1] == LearnedOptions(sidecar="prune_to_fit" in said)
+            # By its defaults, unless low bits that do as they are have too little room.
+            assert ways[-1] == LearnedOptions(sidecar="sidecar=True" in said)
         for way in ways:
             then = refusal(way, models[cover], secret)
             # A cover of degree 0 that 'method="learned"' hides in has a further choice to make.
