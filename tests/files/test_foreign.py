@@ -31,14 +31,16 @@ def pictured(kind: str) -> bytes:
 
 
 FILES = {  # name and content, and what they are
-    "a.spz": (gzip.compress(b"NGSP" + bytes(12)), f"an SPZ model, which keyss does not read yet; {CONVERT}"),
+    "a.spz": (gzip.compress(b"NGSP" + bytes(12)), "an SPZ model; give it where a model is asked for"),
     "A.SPZ": (b"NGSP" + bytes(12), "an SPZ model"),
-    "a.sog": (zipped(), f"an SOG model, which keyss does not read yet; {CONVERT}"),
-    "a.splat": (bytes(64), f"a .splat model, which keyss does not read yet; {CONVERT}"),
+    "a.sog": (zipped(), "an SOG model; give it where a model is asked for"),
+    "a.splat": (bytes(64), "a .splat model; give it where a model is asked for"),
     "a.ksplat": (bytes(64), "a .ksplat model"),
+    "a.glb": (b"glTF", "a glTF file"),
+    "a.lcc": (b"{}", f"an LCC model, which keyss does not read yet; {CONVERT}"),
     "a.csv": (b"x,y,z\n1,2,3\n", "a table; export a .ply"),
     "a.zip": (zipped(), "a ZIP archive; unpack it"),
-    "a": (gzip.compress(b"1"), "gzip data, perhaps an SPZ model"),
+    "a": (gzip.compress(b"1"), "gzip data; unpack it"),
     "b": (b"NGSP" + bytes(12), "an SPZ model"),
     "c": (zipped(), "a ZIP archive"),
     "d": (pictured("PNG"), "a picture"),
@@ -51,6 +53,9 @@ FILES = {  # name and content, and what they are
 }
 
 
+READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.ksplat", "a.glb", "a.zip", "a", "b", "c", "f"}
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
     content, found = FILES[name]
@@ -60,10 +65,12 @@ def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError) as refused:
         load_scene(tmp_path / name)
     assert f"{tmp_path / name}: expected a scene folder, found {found}" in str(refused.value)
-    if name != "f":  # which is read as what it is, whatever its name
-        with pytest.raises(InputError) as refused:
-            read_model(tmp_path / name)
-        assert f"{tmp_path / name}: expected a 3DGS model (.ply), found {found}" in str(refused.value)
+    if name in READ:  # as what it is, whatever its name, and then found damaged
+        return
+    with pytest.raises(InputError) as refused:
+        read_model(tmp_path / name)
+    assert f"{tmp_path / name}: expected a 3DGS model (.compressed.ply, .ply, " in str(refused.value)
+    assert f"), found {found}" in str(refused.value)
 
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from keyss.core import Gaussians, InputError, OutputError, UsageError
 from keyss.files import models, read_model, write_model
-from keyss.files.models import ModelFormat, check_model_output, is_model_path
+from keyss.files.models import ModelFormat, check_model_output, is_model_path, keeps_low_bits
 from tiny_scenes import random_gaussians
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -30,7 +30,7 @@ def read_toy(path: Path) -> Gaussians:
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
     """A second format, entered as a new one would be: by one more item of the list."""
-    entry = ModelFormat("toy", (".toy", ".toy.bin"), b"TOY!", read_toy, write_toy)
+    entry = ModelFormat("toy", (".toy", ".toy.bin"), (b"TOY!",), read_toy, write_toy)
     monkeypatch.setattr(models, "FORMATS", [*models.FORMATS, entry])
 
 
@@ -76,24 +76,29 @@ def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
 )
 def test_unknown_content_is_told_what_is_supported(tmp_path: Path, data: bytes, found: str) -> None:
     (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(InputError, match=rf"expected a 3DGS model \(\.ply\), found {found}"):
+    with pytest.raises(
+        InputError, match=rf"expected a 3DGS model \(\.compressed\.ply, \.ply, .*\), found {found}"
+    ):
         read_model(tmp_path / "a.ply")
 
 
 def test_what_is_no_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"expected a 3DGS model \(\.ply\), but there is no such file"):
+    with pytest.raises(InputError, match=r"expected a 3DGS model \(.*\), but there is no such file"):
         read_model(tmp_path / "missing.ply")
     (tmp_path / "folder.ply").mkdir()
     for path in (tmp_path, tmp_path / "folder.ply"):
-        with pytest.raises(InputError, match=r"expected the file of a 3DGS model \(\.ply\), found a folder"):
+        with pytest.raises(InputError, match=r"expected the file of a 3DGS model \(.*\), found a folder"):
             read_model(path)
 
 
-@pytest.mark.parametrize("name", ["a.splat", "a", "ply", "a.ply.txt"])
+@pytest.mark.parametrize("name", ["a.lcc", "a", "ply", "a.ply.txt"])
 def test_unknown_names_are_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
     assert not is_model_path(name)
     for write in (lambda path: write_model(path, random_gaussians(5)), lambda p: check_model_output(p, True)):
-        with pytest.raises(UsageError, match=rf"{name}: expected a name that ends in \.ply$"):
+        with pytest.raises(
+            UsageError,
+            match=rf"{name}: expected .* ends in \.compressed\.ply, \.ply, \.spz, \.sog, \.glb, \.splat$",
+        ):
             write(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
@@ -105,3 +110,43 @@ def test_outputs_are_not_overwritten_unasked(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="exists"):
         check_model_output(path, False)
     assert check_model_output(str(path), True) == path
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
+def test_every_format_comes_and_goes(tmp_path: Path, suffix: str) -> None:
+    model = random_gaussians(40, sh_degree=1)
+    path = tmp_path / f"a{suffix}"
+    write_model(path, model)
+    assert is_model_path(path)
+    assert not keeps_low_bits(path)
+    assert len(read_model(path)) == 40
+    if suffix != ".splat":  # which has no first bytes of its own
+        assert same(read_model(path), read_model(path.rename(tmp_path / "download")))
+
+
+def test_compressed_ply_may_be_called_ply(tmp_path: Path) -> None:
+    write_model(tmp_path / "a.compressed.ply", random_gaussians(40))
+    found = read_model(tmp_path / "a.compressed.ply")
+    assert same(read_model((tmp_path / "a.compressed.ply").rename(tmp_path / "a.ply")), found)
+    assert keeps_low_bits(tmp_path / "a.ply")
+
+
+def test_formats_that_are_only_read_are_not_written(tmp_path: Path) -> None:
+    for name in ("a.ksplat", "meta.json"):
+        assert is_model_path(name)
+        with pytest.raises(UsageError, match="expected a name that ends in"):
+            write_model(tmp_path / name, random_gaussians(5))
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
+def test_what_cannot_be_read_is_not_written(tmp_path: Path, suffix: str) -> None:
+    model = random_gaussians(40)
+    with pytest.raises(OutputError, match="holds no Gaussians"):
+        write_model(tmp_path / f"a{suffix}", model[:0])
+    model.means[3] = torch.nan
+    with pytest.raises(OutputError, match="NaN or infinite values in means"):
+        write_model(tmp_path / f"a{suffix}", model)
+    model.means[3] = 0
+    model.opacity_logits[4] = torch.inf
+    write_model(tmp_path / f"a{suffix}", model)
+    assert float(read_model(tmp_path / f"a{suffix}").opacity_logits.max()) > 15

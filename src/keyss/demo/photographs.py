@@ -179,7 +179,7 @@ class _Studio:
             vertices["xyz"][view::views] = points.T
             vertices["rgb"][view::views] = images[view, rows, columns]
         properties = [*(f"float {axis}" for axis in "xyz"), *(f"uchar {name}" for name in _COLORS)]
-        return ply_header(_POINTS, properties) + vertices.tobytes()
+        return ply_header({"vertex": (_POINTS, properties)}) + vertices.tobytes()
 
     def transforms(self, names: list[str]) -> bytes:
         """The cameras as JSON, each with the name of its photo."""

@@ -9,8 +9,9 @@ from keyss.core.errors import InputError
 from keyss.files.streams import StandardInput
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
+_MODEL = "give it where a model is asked for"
 _EXPORT = "export a .ply from the program that made it"
-_UNPACK = "unpack it, and give the folder or the .ply that is in it"
+_UNPACK = "unpack it, and give the folder or the model that is in it"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
 
 
@@ -24,17 +25,18 @@ class _Kind:
 
 # The first whose suffix fits, else the first whose magic does: some are gzip data or ZIP archives inside.
 _KINDS = (
-    _Kind("an SPZ model", CONVERT, (".spz",), (b"NGSP",)),
-    _Kind("an SOG model", CONVERT, (".sog",)),
-    _Kind("a .splat model", CONVERT, (".splat",)),
-    _Kind("a .ksplat model", CONVERT, (".ksplat",)),
+    _Kind("an SPZ model", _MODEL, (".spz",), (b"NGSP",)),
+    _Kind("an SOG model", _MODEL, (".sog",)),
+    _Kind("a .splat model", _MODEL, (".splat",)),
+    _Kind("a .ksplat model", _MODEL, (".ksplat",)),
+    _Kind("a glTF file", _MODEL, (".glb",), (b"glTF",)),
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
-    _Kind("a glTF model", _EXPORT, (".glb", ".gltf"), (b"glTF",)),
+    _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),
     _Kind("a table", _EXPORT, (".csv", ".tsv")),
     _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),
     _Kind("a JSON file", "give the folder that it lies in", (".json",)),
     _Kind("a PLY file under another name", "rename it to end in .ply", magic=(b"ply\n", b"ply\r")),
-    _Kind("gzip data, perhaps an SPZ model", CONVERT, (".gz",), (b"\x1f\x8b",)),
+    _Kind("gzip data", _UNPACK, (".gz",), (b"\x1f\x8b",)),
     _Kind("a ZIP archive", _UNPACK, (".zip",), (b"PK\x03\x04",)),
     _Kind("an archive", _UNPACK, (".tar", ".tgz", ".7z", ".rar"), (b"7z\xbc\xaf\x27\x1c", b"Rar!")),
     _Kind(

@@ -9,11 +9,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import atomic_write
 from keyss.files.foreign import what_it_is
+from keyss.files.formats.common import read_whole, writable
+from keyss.files.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
+from keyss.files.formats.glb import read_glb, write_glb
+from keyss.files.formats.ksplat import read_ksplat
+from keyss.files.formats.sog import read_sog, read_sog_folder, write_sog
+from keyss.files.formats.splat import read_splat, write_splat
+from keyss.files.formats.spz import read_spz, write_spz
 from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.ply import read_ply, write_ply
+from keyss.files.ply_table import MAX_HEADER_BYTES
 from keyss.files.streams import StandardInput, StandardOutput, is_standard
 
 
@@ -23,14 +32,57 @@ class ModelFormat:
 
     name: str
     suffixes: tuple[str, ...]  # in lower case and with the dot; the first is the usual one
-    magic: bytes  # the first bytes of every file
+    magic: tuple[bytes, ...]  # of which one begins every file; none: only the name tells
     read: Callable[[Path | StandardInput], Gaussians]  # on the CPU; raises InputError
-    write: Callable[[Path | StandardOutput, Gaussians], None]  # atomically; raises OutputError
+    write: Callable[[Path | StandardOutput, Gaussians], None] | None  # atomically; raises OutputError
+    exact: bool = False  # whether all numbers come back to the last bit
 
 
-_COMPRESSED = ".compressed.ply"  # another format, which programs know by this name
+def _reader(decode: Callable[[bytes], Gaussians]) -> Callable[[Path | StandardInput], Gaussians]:
+    def read(source: Path | StandardInput) -> Gaussians:
+        try:
+            return decode(read_whole(source))
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from error
+        except OSError as error:
+            raise InputError(f"cannot read {source}: {error.strerror or error}") from error
 
-FORMATS = [ModelFormat("PLY", (".ply",), b"ply", read_ply, write_ply)]
+    return read
+
+
+def _writer(encode: Callable[[Gaussians], bytes]) -> Callable[[Path | StandardOutput, Gaussians], None]:
+    def write(target: Path | StandardOutput, model: Gaussians) -> None:
+        try:
+            data = encode(writable(model))
+        except OutputError as error:
+            raise OutputError(f"cannot write {target}: {error}") from error
+        with atomic_write(target) as file:
+            file.write(data)
+
+    return write
+
+
+def _read_any_ply(source: Path | StandardInput) -> Gaussians:
+    """Compressed files end in .ply, too."""
+    with source.open("rb") as file:
+        start = file.read(MAX_HEADER_BYTES)
+    return _reader(read_compressed_ply)(source) if is_compressed(start) else read_ply(source)
+
+
+# The first whose suffix fits a name is its format.
+FORMATS = [
+    ModelFormat(
+        "compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer(write_compressed_ply)
+    ),
+    ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, exact=True),
+    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader(read_spz), _writer(write_spz)),
+    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader(read_sog), _writer(write_sog)),
+    ModelFormat("SOG", ("meta.json",), (), read_sog_folder, None),
+    ModelFormat("glTF", (".glb",), (b"glTF",), _reader(read_glb), _writer(write_glb)),
+    ModelFormat(".splat", (".splat",), (), _reader(read_splat), _writer(write_splat)),
+    ModelFormat(".ksplat", (".ksplat",), (), _reader(read_ksplat), None),
+]
+_PLY = FORMATS[1]
 
 
 def is_model_path(path: Path | str) -> bool:
@@ -51,10 +103,20 @@ def read_model(path: Path | str) -> Gaussians:
 def write_model(path: Path | str, model: Gaussians) -> None:
     """Atomically write `model` in the format that the suffix of `path` names; as PLY to "-", standard output.
 
-    Raises UsageError for an unknown suffix, OutputError for a model that is empty or not finite and when the
-    system refuses.
+    PLY keeps every number, the others round, and most of them sort; docs/formats.md has by how much. Raises
+    UsageError for an unknown suffix, OutputError for a model that is empty, not finite or beyond what the
+    format holds, and when the system refuses.
     """
-    _for_writing(path).write(StandardOutput() if is_standard(path) else Path(path), model)
+    _, write = _for_writing(path)
+    write(StandardOutput() if is_standard(path) else Path(path), model)
+
+
+def keeps_low_bits(path: Path | str) -> bool:
+    """Whether `write_model` keeps all numbers to the last bit in the format that `path` names.
+
+    Raises UsageError for an unknown suffix.
+    """
+    return _for_writing(path)[0].exact
 
 
 def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path] = ()) -> Path:
@@ -75,11 +137,13 @@ def _by_suffix(path: Path | str) -> ModelFormat | None:
     return next((each for each in FORMATS if name.endswith(each.suffixes)), None)
 
 
-def _for_writing(path: Path | str) -> ModelFormat:
-    found = FORMATS[0] if is_standard(path) else _by_suffix(path)
-    if found is None or Path(path).name.lower().endswith(_COMPRESSED):
-        raise UsageError(f"cannot write a model as {path}: expected a name that ends in {_known()}")
-    return found
+def _for_writing(path: Path | str) -> tuple[ModelFormat, Callable[[Path | StandardOutput, Gaussians], None]]:
+    """The format that a name means, and what writes it. Raises UsageError."""
+    found = _PLY if is_standard(path) else _by_suffix(path)
+    if found is None or found.write is None:
+        known = ", ".join(suffix for each in FORMATS if each.write for suffix in each.suffixes)
+        raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known}")
+    return found, found.write
 
 
 def _by_content(path: Path | StandardInput) -> ModelFormat:
@@ -89,14 +153,17 @@ def _by_content(path: Path | StandardInput) -> ModelFormat:
         if not path.is_file():
             raise InputError(f"{path}: expected a 3DGS model ({_known()}), but there is no such file")
         with path.open("rb") as file:
-            start = file.read(max(len(each.magic) for each in FORMATS))
+            start = file.read(max(len(magic) for each in FORMATS for magic in each.magic))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    found = next((each for each in FORMATS if start.startswith(each.magic)), None)
-    if found is None:
+    fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
+    named = _by_suffix(str(path))
+    if named in fitting or (named and start and not named.magic and not fitting):
+        return named
+    if not fitting:
         raise InputError(f"{path}: expected a 3DGS model ({_known()}), found {what_it_is(path)}")
-    named = _by_suffix(str(path)) or found
-    if named is not found:
+    found = fitting[-1]
+    if named is not None:
         raise InputError(
             f"{path}: the name says {named.name}, but the content is {found.name}; "
             f"rename it to end in {found.suffixes[0]}"

@@ -46,7 +46,7 @@ def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
     if problem:
         raise OutputError(f"cannot write {path}: {problem}")
     with atomic_write(path) as file:
-        file.write(ply_header(n, (f"float {name}" for name in names)))
+        file.write(ply_header({"vertex": (n, (f"float {name}" for name in names))}))
         file.write(rows.data)
 
 
@@ -86,7 +86,7 @@ def _model_properties(found: Set[str], path: Path | str | StandardInput) -> list
     if not missing:
         return names
     if "packed_position" in found:
-        why = "this is a compressed .ply; convert it to a plain 3DGS .ply first (splat-transform does)"
+        why = "this is a compressed .ply, which `read_model` reads"
     elif missing == names[3:]:
         why = "this is a point cloud, not a 3DGS model"
     else:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -21,7 +21,7 @@ from keyss.core.errors import InputError
 from keyss.files.layout import PointCloud
 from keyss.files.streams import StandardInput
 
-_MAX_HEADER_BYTES = 64 * 1024
+MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
 _GREY = 128  # for points without colours
@@ -50,17 +50,42 @@ def read_vertices(
         raise InputError(f"{path}: expected a .ply file, but there is no such file")
     try:
         with path.open("rb") as file:
-            byte_order, before, vertex = _read_header(file, path)
+            byte_order, elements = _read_header(file, path)
+            *before, vertex = elements[: [each.name for each in elements].index("vertex") + 1]
+            _check_no_list([*before, vertex], path)
             names = choose(vertex.properties)
             return names, _read_rows(file, byte_order, before, vertex, names, path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def ply_header(count: int, properties: Iterable[str]) -> bytes:
-    """The header of a little-endian file of `count` vertices with `properties` such as "float x"."""
-    lines = "".join(f"property {each}\n" for each in properties)
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{lines}end_header\n".encode()
+def read_tables(file: BinaryIO, path: Path | StandardInput) -> dict[str, npt.NDArray[np.void]]:
+    """All elements of a binary PLY, by name, with the properties as fields of their own types.
+
+    Raises InputError for ascii, for list properties and for a file that is damaged or too short.
+    """
+    byte_order, elements = _read_header(file, path)
+    if byte_order is None:
+        raise InputError(f"{path}: expected a binary .ply file, found one in ascii")
+    _check_no_list(elements, path)
+    start = file.tell()
+    left = file.seek(0, os.SEEK_END) - start
+    file.seek(start)
+    _check_size(sum(element.count * element.stride for element in elements), left, elements[-1], path)
+    tables = {}
+    for element in elements:
+        dtype = np.dtype([(name, byte_order + code) for name, code in element.properties.items()])
+        data = file.read(element.count * element.stride)
+        tables[element.name] = np.frombuffer(data, dtype) if element.stride else np.empty(0, dtype)
+    return tables
+
+
+def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]]) -> bytes:
+    """The header of a little-endian file of elements: how many, and properties such as "float x"."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for name, (count, properties) in elements.items():
+        lines += [f"element {name} {count}", *(f"property {each}" for each in properties)]
+    return "\n".join([*lines, "end_header\n"]).encode()
 
 
 @dataclass
@@ -76,8 +101,8 @@ class _Element:
         return sum(int(code[1]) for code in self.properties.values())
 
 
-def _read_header(file: BinaryIO, path: Path | StandardInput) -> tuple[str | None, list[_Element], _Element]:
-    """(byte order or None for ascii, elements before the vertices, the vertices); the data come next."""
+def _read_header(file: BinaryIO, path: Path | StandardInput) -> tuple[str | None, list[_Element]]:
+    """(byte order or None for ascii, the elements, one of them the vertices); the data come next."""
     lines = _header_lines(file, path)
     if lines[0] != "ply":
         raise InputError(f"{path}: expected a .ply file, but it does not begin with a line 'ply'")
@@ -105,17 +130,27 @@ def _read_header(file: BinaryIO, path: Path | StandardInput) -> tuple[str | None
             f"{path}: expected one 'format' line and one 'element vertex' in the PLY header, "
             f"got {len(formats)} and {names.count('vertex')}"
         )
-    *before, vertex = elements[: names.index("vertex") + 1]
-    for element in [*before, vertex]:
+    return formats[0], elements
+
+
+def _check_no_list(elements: Iterable[_Element], path: Path | StandardInput) -> None:
+    for element in elements:
         if element.has_list:
             raise InputError(f"{path}: element {element.name!r} has a list property: it cannot be read")
-    return formats[0], before, vertex
+
+
+def _check_size(needed: int, left: int, vertex: _Element, path: Path | StandardInput) -> None:
+    if needed > left:
+        raise InputError(
+            f"{path}: not a whole .ply file: the header announces {vertex.count:,} vertices, which take at "
+            f"least {needed:,} bytes, but only {left:,} follow it"
+        )
 
 
 def _header_lines(file: BinaryIO, path: Path | StandardInput) -> list[str]:
     """The header's lines without their ends, end_header left out."""
     lines: list[str] = []
-    left = _MAX_HEADER_BYTES
+    left = MAX_HEADER_BYTES
     while left > 0 and len(lines) < _MAX_HEADER_LINES:
         raw = file.readline(left)
         left -= len(raw)
@@ -127,7 +162,7 @@ def _header_lines(file: BinaryIO, path: Path | StandardInput) -> list[str]:
         lines.append(line)
         if lines[0] != "ply":
             return lines
-    raise InputError(f"{path}: header is longer than {_MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines")
+    raise InputError(f"{path}: header is longer than {MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines")
 
 
 def _read_rows(
@@ -149,11 +184,7 @@ def _read_rows(
     else:
         skipped = sum(element.count * element.stride for element in before)
         needed = skipped + vertex.count * vertex.stride
-    if needed > left:
-        raise InputError(
-            f"{path}: not a whole .ply file: the header announces {vertex.count:,} vertices, which take at "
-            f"least {needed:,} bytes, but only {left:,} follow it"
-        )
+    _check_size(needed, left, vertex, path)
     if byte_order is None:
         return _read_ascii(file, skipped, vertex, names, path)
     file.seek(skipped, os.SEEK_CUR)

@@ -1,0 +1,229 @@
+"""What several formats share: bytes for opacities, quaternions without their largest part, spatial order."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from keyss.core.errors import InputError, OutputError
+from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.files.ply import OPACITY_LOGIT_BOUND
+from keyss.files.streams import MOST_BYTES, StandardInput
+
+Bytes = npt.NDArray[np.uint8]
+Shorts = npt.NDArray[np.uint16]
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+
+# Files that unpack to more than this are believed only if they are large themselves: published models take
+# 7 bytes per Gaussian at the very least, and positions, which differ, do not pack to less than one.
+SMALL_COUNT = 1 << 18
+_MORTON_BITS = 21  # per axis
+
+
+class Codes:
+    """Base of the codes of a format: dataclasses of numbers and arrays, equal when all of these are."""
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        names = [each.name for each in fields(self)]  # type: ignore[arg-type]
+        return all(_same(getattr(self, name), getattr(other, name)) for name in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b)
+    return bool(a == b)
+
+
+def read_whole(source: Path | StandardInput) -> bytes:
+    """All bytes of a model's file. Raises InputError for more than 4 GiB, and OSError."""
+    with source.open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise InputError(f"{source}: expected at most {MOST_BYTES:,} bytes, found more")
+    return data
+
+
+def check_count(count: int, size: int) -> None:
+    """Raise InputError where a packed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
+    if count < 1:
+        raise InputError("it holds no Gaussians")
+    if count > max(SMALL_COUNT, size):
+        raise InputError(f"it announces {count:,} Gaussians, more than {size:,} bytes hold")
+
+
+def check_sh_degree(degree: int) -> int:
+    """Number of SH coefficients per channel beyond the constant one. Raises InputError above degree 3."""
+    if not 0 <= degree <= 3:
+        raise InputError(f"expected spherical harmonics of degree 0 to 3, found {degree}")
+    return (degree + 1) ** 2 - 1
+
+
+def gaussians_of(
+    means: npt.NDArray[Any],
+    quats: npt.NDArray[Any],
+    log_scales: npt.NDArray[Any],
+    opacity_logits: npt.NDArray[Any],
+    colors: npt.NDArray[Any],
+    rest: npt.NDArray[Any],
+) -> Gaussians:
+    """A model of arrays: `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the other harmonics.
+
+    Raises InputError for values that are not finite in single precision.
+    """
+    parts = (means, quats, log_scales, opacity_logits, np.concatenate([colors[:, None], rest], axis=1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        model = Gaussians(*(torch.from_numpy(np.ascontiguousarray(each, dtype=np.float32)) for each in parts))
+    wrong = [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
+    if wrong:
+        raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
+    return model
+
+
+def writable(model: Gaussians) -> Gaussians:
+    """`model` on the CPU with finite opacity logits. Raises OutputError if it is empty or not finite."""
+    flat = model.detach().to("cpu")
+    if len(flat) == 0:
+        raise OutputError("it holds no Gaussians")
+    bound = OPACITY_LOGIT_BOUND
+    opacity_logits = flat.opacity_logits.where(
+        ~flat.opacity_logits.isinf(), flat.opacity_logits.clamp(-bound, bound)
+    )
+    flat = replace(flat, opacity_logits=opacity_logits)
+    wrong = [each.name for each in fields(flat) if not bool(getattr(flat, each.name).isfinite().all())]
+    if wrong:
+        raise OutputError(f"NaN or infinite values in {', '.join(wrong)}")
+    return flat
+
+
+def arrays_of(model: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """The arrays that `gaussians_of` takes, of a model anywhere."""
+    flat = model.detach().to("cpu")
+    sh = flat.sh.numpy()
+    parts = (flat.means, flat.quats, flat.log_scales, flat.opacity_logits)
+    means, quats, log_scales, opacity_logits = (each.numpy() for each in parts)
+    return means, quats, log_scales, opacity_logits, sh[:, 0], sh[:, 1:]
+
+
+def logits(opacities: npt.NDArray[Any]) -> Doubles:
+    """Opacity logits of opacities from 0 to 1, which themselves become -+OPACITY_LOGIT_BOUND."""
+    values = np.asarray(opacities, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        found: Doubles = np.log(values) - np.log1p(-values)
+    bounded: Doubles = found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
+    return bounded
+
+
+def opacities(opacity_logits: Floats) -> Doubles:
+    """[N] opacities, 0 to 1."""
+    with np.errstate(over="ignore"):
+        found: Doubles = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
+    return found
+
+
+def rounded(values: npt.NDArray[Any]) -> Doubles:
+    """`values` to the nearest integers, halves away from 0, as C's `round` does."""
+    found: Doubles = np.copysign(np.floor(np.abs(values) + 0.5), values)
+    return found
+
+
+def to_bytes(values: npt.NDArray[Any], most: int = 255) -> npt.NDArray[Any]:
+    """`values` rounded and cut to 0 to `most`, as uint8 or, above 255, uint16."""
+    found: npt.NDArray[Any] = rounded(values).clip(0, most).astype(np.uint8 if most < 256 else np.uint16)
+    return found
+
+
+def colour_bytes(f_dc: Floats) -> Bytes:
+    """[..., 3] 8-bit colours seen where there are no other harmonics; cut to what bytes hold."""
+    return to_bytes((0.5 + SH_C0 * f_dc.astype(np.float64)) * 255)
+
+
+def f_dc_of(colors: npt.NDArray[Any]) -> Doubles:
+    """f_dc of colours, 0 to 1 where they can be seen."""
+    found: Doubles = (np.asarray(colors, dtype=np.float64) - 0.5) / SH_C0
+    return found
+
+
+def log_scales_of(scales: npt.NDArray[Any]) -> Doubles:
+    """Logarithms of scales, those of 0 that of the smallest normal number; NaN of negative ones."""
+    with np.errstate(invalid="ignore"):
+        values = np.asarray(scales, dtype=np.float64)
+        found: Doubles = np.log(np.where(values == 0, np.finfo(np.float32).tiny, values))
+    return found
+
+
+def scales_of(log_scales: Floats) -> Floats:
+    """Scales, none beyond single precision."""
+    found: Floats = np.exp(log_scales.astype(np.float64)).clip(0, np.finfo(np.float32).max).astype(np.float32)
+    return found
+
+
+def unit(quats: npt.NDArray[Any]) -> Doubles:
+    """[N, 4] quaternions of length 1; those of length 0 become (1, 0, 0, 0), as renderers take them."""
+    values = quats.astype(np.float64)
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found: Doubles = np.where(length > 0, values / length, [1.0, 0.0, 0.0, 0.0])
+    return found
+
+
+def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:
+    """Of unit quaternions [N, 4]: which part is the largest [N], and the others [N, 3], in order.
+
+    Signs are such that the largest is positive; the others then lie within +-sqrt(1/2).
+    """
+    largest = np.abs(quats).argmax(axis=1)
+    sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    return largest.astype(np.uint8), np.take_along_axis(quats * sign, _OTHERS[largest], axis=1)
+
+
+def from_smallest_three(largest: Bytes, others: Doubles) -> Doubles:
+    """[N, 4] unit quaternions: the inverse of `smallest_three`; too long `others` leave 0 for the largest."""
+    quats = np.empty((len(largest), 4))
+    np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
+    rest = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
+    np.put_along_axis(quats, largest[:, None].astype(np.intp), rest[:, None], axis=1)
+    return quats
+
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices without 0, 1, 2, 3
+
+
+def in_morton_order(model: Gaussians) -> Gaussians:
+    """`model` on the CPU, sorted by `morton_order`."""
+    model = model.detach().to("cpu")
+    return model[torch.from_numpy(morton_order(model.means.numpy()))]
+
+
+def morton_order(means: Floats) -> npt.NDArray[np.intp]:
+    """[N] indices that sort positions along a Z-order curve: neighbours in space follow each other."""
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    extent = np.where(high > low, high - low, 1.0)
+    cells = ((means - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    key = np.zeros(len(means), dtype=np.uint64)
+    for axis in range(3):
+        key |= _spread(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(key, kind="stable")
+
+
+def _spread(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """The lowest 21 bits of `values`, with two zeros between any two of them."""
+    values = values & np.uint64(0x1FFFFF)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
+    return values

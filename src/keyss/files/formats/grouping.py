@@ -1,0 +1,70 @@
+"""Points in groups: a tree that splits the worst group first, at the mean of its widest axis."""
+
+from __future__ import annotations
+
+import heapq
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from keyss.files.formats.common import Doubles
+
+Integers = npt.NDArray[np.int64]
+
+
+def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:
+    """At most `size` groups of `points` [N, D]: their indices in order of groups, and where each begins."""
+    order = np.arange(len(points))
+    heap = [(0.0, 0, len(points), *_widest(points, order, 0, len(points)))]
+    heap[0] = (-heap[0][5], *heap[0][1:])
+    done: list[int] = []
+    while heap and len(heap) + len(done) < size:
+        _, start, end, axis, mean, error = heapq.heappop(heap)
+        if error <= 0:
+            done.append(start)
+            continue
+        middle = _split(points, order, start, end, axis, mean)
+        for a, b in ((start, middle), (middle, end)):
+            axis, mean, error = _widest(points, order, a, b)
+            heapq.heappush(heap, (-error, a, b, axis, mean, error))
+    return order, np.sort(np.array(done + [each[1] for each in heap]))
+
+
+def _compiled(function: Any) -> Any:
+    """Compiled at its first call, and kept where there is a folder to keep it in."""
+    jit: Any = numba.njit  # typed in some versions only
+    try:
+        return jit(function, cache=True, nogil=True)
+    except RuntimeError:
+        return jit(function, nogil=True)
+
+
+@_compiled
+def _widest(points: Any, order: Any, start: int, end: int) -> Any:
+    """(axis of the largest spread of a group, its mean there, squared error of the whole group)."""
+    dimensions = points.shape[1]
+    sums, squares = np.zeros(dimensions), np.zeros(dimensions)
+    for i in range(start, end):
+        for d in range(dimensions):
+            value = points[order[i], d]
+            sums[d] += value
+            squares[d] += value * value
+    spread = squares - sums * sums / (end - start)
+    axis = int(np.argmax(spread))
+    error = spread.sum() if end - start > 1 and spread[axis] > 1e-12 * squares[axis] else 0.0
+    return axis, sums[axis] / (end - start), error
+
+
+@_compiled
+def _split(points: Any, order: Any, start: int, end: int, axis: int, mean: float) -> int:
+    """Sort a group into those at most `mean` and the others; where the others begin."""
+    low, high = start, end - 1
+    while low <= high:
+        if points[order[low], axis] <= mean:
+            low += 1
+        else:
+            order[low], order[high] = order[high], order[low]
+            high -= 1
+    return min(max(low, start + 1), end - 1)

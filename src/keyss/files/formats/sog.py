@@ -1,0 +1,257 @@
+"""SOG, PlayCanvas's format of images: version 2 is read and written.
+
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/. `parse` and `serialise` turn
+files into codes and back; the archive and its images lie in `sog_bundle`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats import sog_bundle as bundle
+from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
+from keyss.files.formats.common import (
+    Bytes,
+    Codes,
+    Doubles,
+    Floats,
+    Shorts,
+    arrays_of,
+    check_count,
+    check_sh_degree,
+    from_smallest_three,
+    gaussians_of,
+    in_morton_order,
+    logits,
+    opacities,
+    smallest_three,
+    to_bytes,
+    unit,
+)
+from keyss.files.streams import StandardInput
+
+_FINEST = 65535  # a position's largest code
+_LARGEST = 252  # of the fourth byte of a quaternion: w, x, y or z is not stored
+_ROW = 64  # vectors of the palette in a row of pixels
+_MOST_LABELS = 65536
+
+
+@dataclass(frozen=True, eq=False)
+class SogCodes(Codes):
+    """All numbers of a file; see `dequantise` for their meaning."""
+
+    mins: Doubles  # [3] smallest positions, as sign(x) ln(|x| + 1)
+    maxs: Doubles  # [3] largest positions, likewise
+    positions: Shorts  # [N, 3] in 65535ths between them
+    largest: Bytes  # [N] which of w, x, y, z (0 to 3) is not stored
+    rotations: Bytes  # [N, 3] the others, from -sqrt(1/2) to sqrt(1/2)
+    scale_codebook: Floats  # [256] log scales
+    scales: Bytes  # [N, 3] indices into it
+    color_codebook: Floats  # [256] f_dc
+    colors: Bytes  # [N, 3] indices into it
+    alphas: Bytes  # [N] opacities in 255ths
+    sh_codebook: Floats  # [256] harmonics; of a model without any [0]
+    palette: Bytes  # [P, K - 1, 3] indices into it
+    labels: Shorts  # [N] indices into the palette; of a model without harmonics 0
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def parse(data: bytes) -> SogCodes:
+    """The codes of a .sog. Raises InputError for anything that is not a whole one of version 2."""
+    with bundle.opened(data) as archive:
+        return parse_files(bundle.member(archive), len(data))
+
+
+def parse_files(file: Callable[[str], bytes], size: int) -> SogCodes:
+    """The codes of a meta.json and the images that it names; `file` gives their bytes, `size` in all."""
+    meta = bundle.read_meta(file("meta.json"))
+    n = meta.count
+    check_count(n, size)
+
+    def image(names: list[str], index: int = 0) -> Bytes:
+        """[N, 4] RGBA of the first pixels."""
+        return bundle.pixels(file(names[index]), n)
+
+    low, high = image(meta.means.files), image(meta.means.files, 1)
+    quats, colors = image(meta.quats.files), image(meta.sh0.files)
+    if (quats[:, 3] < _LARGEST).any():
+        raise InputError("damaged SOG: expected 252 to 255 in the fourth channel of its quaternions")
+    sh_codebook, palette, labels = (
+        np.empty(0, np.float32),
+        np.empty((1, 0, 3), np.uint8),
+        np.zeros(n, np.uint16),
+    )
+    if meta.shN is not None and meta.shN.bands:
+        k = check_sh_degree(meta.shN.bands)
+        sh_codebook = _codebook(meta.shN.codebook)
+        pair = image(meta.shN.files, 1)
+        labels = _joined(pair[:, 0], pair[:, 1])
+        if not int(labels.max()) < meta.shN.count <= _MOST_LABELS:
+            raise InputError("damaged SOG: labels beyond the end of its palette")
+        size = -(-meta.shN.count // _ROW) * _ROW
+        rows = bundle.pixels(file(meta.shN.files[0]), size * k, width=_ROW * k)
+        palette = rows[: meta.shN.count * k, :3].reshape(-1, k, 3).copy()
+    return SogCodes(
+        mins=np.array(meta.means.mins, np.float64),
+        maxs=np.array(meta.means.maxs, np.float64),
+        positions=_joined(low[:, :3], high[:, :3]),
+        largest=quats[:, 3] - np.uint8(_LARGEST),
+        rotations=quats[:, :3].copy(),
+        scale_codebook=_codebook(meta.scales.codebook),
+        scales=image(meta.scales.files)[:, :3].copy(),
+        color_codebook=_codebook(meta.sh0.codebook),
+        colors=colors[:, :3].copy(),
+        alphas=colors[:, 3].copy(),
+        sh_codebook=sh_codebook,
+        palette=palette,
+        labels=labels,
+    )
+
+
+def serialise(codes: SogCodes) -> bytes:
+    """A .sog of the codes."""
+    n, (p, k) = len(codes), codes.palette.shape[:2]
+    images = {
+        "means_l.webp": _rgba(codes.positions & 255),
+        "means_u.webp": _rgba(codes.positions >> 8),
+        "quats.webp": _rgba(codes.rotations, codes.largest + np.uint8(_LARGEST)),
+        "scales.webp": _rgba(codes.scales),
+        "sh0.webp": _rgba(codes.colors, codes.alphas),
+    }
+    width = math.ceil(math.sqrt(n) / 4) * 4
+    files = {
+        name: bundle.webp(pixels, width, math.ceil(n / width / 4) * 4) for name, pixels in images.items()
+    }
+    harmonics = None
+    if k:
+        labels = np.stack([codes.labels & 255, codes.labels >> 8, np.zeros_like(codes.labels)], axis=1)
+        files["shN_labels.webp"] = bundle.webp(_rgba(labels), width, math.ceil(n / width / 4) * 4)
+        palette = _rgba(codes.palette.reshape(-1, 3))
+        files["shN_centroids.webp"] = bundle.webp(palette, _ROW * k, -(-p // _ROW))
+        degree = {3: 1, 8: 2, 15: 3}[k]
+        names = ["shN_centroids.webp", "shN_labels.webp"]
+        harmonics = bundle.Harmonics(p, degree, codes.sh_codebook.tolist(), names)
+    meta = bundle.Meta(
+        version=2,
+        count=n,
+        means=bundle.Means(codes.mins.tolist(), codes.maxs.tolist(), ["means_l.webp", "means_u.webp"]),
+        scales=bundle.Book(codes.scale_codebook.tolist(), ["scales.webp"]),
+        quats=bundle.Images(["quats.webp"]),
+        sh0=bundle.Book(codes.color_codebook.tolist(), ["sh0.webp"]),
+        shN=harmonics,
+    )
+    return bundle.packed({**files, "meta.json": msgspec.json.encode(meta)})
+
+
+def dequantise(codes: SogCodes) -> Gaussians:
+    """The model that codes stand for. Raises InputError where it is not finite."""
+    extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
+    logs = codes.mins + extent * (codes.positions / _FINEST)
+    with np.errstate(over="ignore"):
+        means = np.copysign(np.expm1(np.abs(logs)), logs)
+    rotations = (codes.rotations / 255 * 2 - 1) * np.sqrt(0.5)
+    palette = codes.sh_codebook[codes.palette] if codes.palette.size else np.empty((1, 0, 3), np.float32)
+    return gaussians_of(
+        means,
+        from_smallest_three(codes.largest, rotations),
+        codes.scale_codebook[codes.scales],
+        logits(codes.alphas / 255),
+        codes.color_codebook[codes.colors],
+        palette[codes.labels],
+    )
+
+
+def quantise(model: Gaussians) -> SogCodes:
+    """The codes of a model in its order, with half as many palette vectors or more, up to 65,536."""
+    means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
+    n, k = rest.shape[:2]
+    logs = np.copysign(np.log1p(np.abs(means.astype(np.float64))), means)
+    mins, maxs = logs.min(axis=0), logs.max(axis=0)
+    largest, others = smallest_three(unit(quats))
+    scale_codebook, color_codebook = codebook_of(log_scales), codebook_of(f_dc)
+    sh_codebook, palette, labels = (
+        np.empty(0, np.float32),
+        np.empty((1, 0, 3), np.uint8),
+        np.zeros(n, np.uint16),
+    )
+    if k:
+        size = min(_MOST_LABELS, 2 ** int(math.log2(n)))
+        vectors, labels = palette_of(rest.reshape(n, 3 * k), size)
+        sh_codebook = codebook_of(vectors)
+        palette = nearest(sh_codebook, vectors).reshape(-1, k, 3)
+    return SogCodes(
+        mins=mins,
+        maxs=maxs,
+        positions=to_bytes((logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _FINEST, _FINEST),
+        largest=largest,
+        rotations=to_bytes((others * np.sqrt(2) + 1) / 2 * 255),
+        scale_codebook=scale_codebook,
+        scales=nearest(scale_codebook, log_scales),
+        color_codebook=color_codebook,
+        colors=nearest(color_codebook, f_dc),
+        alphas=to_bytes(opacities(opacity_logits) * 255),
+        sh_codebook=sh_codebook,
+        palette=palette,
+        labels=labels,
+    )
+
+
+def read_sog(data: bytes) -> Gaussians:
+    """The model in a .sog. Raises InputError."""
+    return dequantise(parse(data))
+
+
+def read_sog_folder(meta: Path | StandardInput) -> Gaussians:
+    """The model of a meta.json and the images beside it. Raises InputError."""
+    try:
+        if not isinstance(meta, Path):
+            raise InputError("expected a meta.json with its images beside it")
+        size = sum(each.stat().st_size for each in meta.parent.glob("*.webp"))
+        return dequantise(parse_files(bundle.beside(meta), size))
+    except InputError as error:
+        raise InputError(f"{meta}: {error}") from error
+    except OSError as error:
+        raise InputError(f"cannot read {meta}: {error.strerror or error}") from error
+
+
+def write_sog(model: Gaussians) -> bytes:
+    """A model as a .sog, sorted so that its images pack well."""
+    return serialise(quantise(in_morton_order(model)))
+
+
+def _codebook(values: list[float]) -> Floats:
+    """[256] numbers. Raises InputError for more, and for what is not finite; fewer are followed by 0."""
+    if len(values) > SIZE:
+        raise InputError(f"damaged SOG: expected codebooks of at most {SIZE} numbers, found {len(values):,}")
+    with np.errstate(over="ignore"):
+        numbers = np.pad(np.array(values, np.float64), (0, SIZE - len(values))).astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise InputError("damaged SOG: a codebook is not finite")
+    return numbers
+
+
+def _joined(low: Bytes, high: Bytes) -> Shorts:
+    """16-bit integers of their bytes."""
+    found: Shorts = low.astype(np.uint16) | (high.astype(np.uint16) << np.uint16(8))
+    return found
+
+
+def _rgba(colors: npt.NDArray[Any], alpha: Bytes | None = None) -> Bytes:
+    """[M, 4] pixels of colours [M, 3], 0 to 255, and an alpha [M], by default 255."""
+    found = np.full((len(colors), 4), 255, np.uint8)
+    found[:, :3] = colors
+    if alpha is not None:
+        found[:, 3] = alpha
+    return found

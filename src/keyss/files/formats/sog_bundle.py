@@ -1,0 +1,200 @@
+"""The archive of a SOG: meta.json and lossless WebP images in a ZIP archive, all of it from strangers."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from PIL import Image
+
+from keyss.core.errors import InputError
+from keyss.files.formats.common import Bytes
+from keyss.files.reading import read_file
+from keyss.files.streams import MOST_BYTES
+
+_MOST_META_BYTES = 1 << 20
+_MOST_MEMBERS = 64
+_SMALL_IMAGE = 1 << 16  # pixels; larger ones may have four times the pixels that are needed
+_DATE = (1980, 1, 1, 0, 0, 0)  # so that equal models make equal files
+
+
+class Images(msgspec.Struct):
+    """Names of images."""
+
+    files: list[str]
+
+
+class Book(msgspec.Struct):
+    """Images of indices into numbers."""
+
+    codebook: list[float]
+    files: list[str]
+
+
+class Means(msgspec.Struct):
+    """Positions: bounds [3], and images of their low and their high bytes."""
+
+    mins: list[float]
+    maxs: list[float]
+    files: list[str]
+
+
+class Harmonics(msgspec.Struct):
+    """A palette of `count` vectors, and which one each Gaussian has."""
+
+    count: int
+    bands: int
+    codebook: list[float]
+    files: list[str]
+
+
+class Meta(msgspec.Struct, omit_defaults=True):
+    """The meta.json of version 2."""
+
+    version: int
+    count: int
+    means: Means
+    scales: Book
+    quats: Images
+    sh0: Book
+    shN: Harmonics | None = None
+
+
+class _Version(msgspec.Struct):
+    version: int = 1  # which had no such field
+
+
+def read_meta(data: bytes) -> Meta:
+    """A meta.json with as many names and bounds as are needed. Raises InputError."""
+    try:
+        version = msgspec.json.decode(data, type=_Version).version
+        if version != 2:
+            raise InputError(f"expected SOG of version 2, found {version}")
+        meta = msgspec.json.decode(data, type=Meta)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"the meta.json of a SOG makes no sense: {error}") from error
+    needed = [(meta.means.files, 2), (meta.scales.files, 1), (meta.quats.files, 1), (meta.sh0.files, 1)]
+    needed += [(meta.shN.files, 2)] if meta.shN else []
+    if any(len(files) < count for files, count in needed):
+        raise InputError("the meta.json of a SOG names fewer images than it needs")
+    if not len(meta.means.mins) == len(meta.means.maxs) == 3:
+        raise InputError("the meta.json of a SOG gives no bounds of three coordinates")
+    return meta
+
+
+def opened(data: bytes) -> zipfile.ZipFile:
+    """The archive. Raises InputError."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+    except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error, OverflowError) as error:
+        raise InputError(f"not a whole SOG: {error}") from error
+    if len(archive.infolist()) > _MOST_MEMBERS:
+        raise InputError(
+            f"expected a SOG of at most {_MOST_MEMBERS} files, found {len(archive.infolist()):,}"
+        )
+    return archive
+
+
+def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
+    """What gives a file of an archive by its name; images, which are packed already, no larger than it is."""
+    size = sum(info.compress_size for info in archive.infolist())
+
+    def read(name: str) -> bytes:
+        try:
+            info = archive.getinfo(name)
+            most = max(_MOST_META_BYTES, 2 * size)
+            if info.file_size > most:
+                raise InputError(f"damaged SOG: {name} unpacks to {info.file_size:,} bytes")
+            with archive.open(info) as file:
+                return file.read(most)
+        except KeyError as error:
+            raise InputError(
+                f"not a SOG: there is no {name[:80]!r} in the archive; unpack it if it is another"
+            ) from error
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            NotImplementedError,
+            RuntimeError,
+            OSError,
+        ) as error:
+            raise InputError(f"damaged SOG: {name[:80]!r}: {error}") from error
+
+    return read
+
+
+def beside(meta: Path) -> Callable[[str], bytes]:
+    """What gives the files beside a meta.json; names do not lead out of its folder."""
+
+    def read(name: str) -> bytes:
+        path = meta if name == "meta.json" else meta.parent / name
+        if Path(name).name != name or "\0" in name or not path.is_file():
+            raise InputError(f"not a whole SOG: there is no {name[:80]!r} beside it")
+        return read_file(path, _MOST_META_BYTES if path is meta else MOST_BYTES)
+
+    return read
+
+
+def packed(files: Mapping[str, bytes]) -> bytes:
+    """An archive of files, not compressed once more."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), content)
+    return data.getvalue()
+
+
+def pixels(data: bytes, count: int, width: int | None = None) -> Bytes:
+    """[count, 4] RGBA of the first pixels of a lossless WebP; `width`: what it has to have.
+
+    Its size is looked at before anything is decoded. Raises InputError.
+    """
+    found = _size(data)
+    if found[0] * found[1] < count or (width is not None and found[0] != width):
+        raise InputError(f"damaged SOG: expected an image of {count:,} pixels, found {found[0]} x {found[1]}")
+    if found[0] * found[1] > max(_SMALL_IMAGE, 4 * count):
+        raise InputError(f"damaged SOG: an image of {found[0]} x {found[1]} for {count:,} pixels")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+                if image.size != found:
+                    raise InputError("damaged SOG: an image of two sizes")
+                decoded = np.asarray(image.convert("RGBA")).reshape(-1, 4)
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
+        raise InputError(f"damaged SOG: an image cannot be read: {error}") from error
+    return decoded[:count]
+
+
+def webp(values: Bytes, width: int, height: int) -> bytes:
+    """[M, 4] RGBA as the first pixels of a lossless WebP; colours under an alpha of 0 are kept."""
+    canvas = np.zeros((height * width, 4), np.uint8)
+    canvas[: len(values)] = values
+    data = io.BytesIO()
+    image = Image.fromarray(canvas.reshape(height, width, 4), "RGBA")
+    image.save(data, "WEBP", lossless=True, exact=True, quality=50, method=1)
+    return data.getvalue()
+
+
+def _size(data: bytes) -> tuple[int, int]:
+    """Width and height in pixels, of the header of a lossless WebP.
+
+    https://developers.google.com/speed/webp/docs/riff_container. Pillow allocates a canvas when it opens
+    a file.
+    """
+    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+        raise InputError("damaged SOG: an image is not WebP")
+    if data[12:16] == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if data[12:16] == b"VP8X" and b"VP8L" in data[30:]:
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    raise InputError("damaged SOG: expected lossless WebP images, found others")

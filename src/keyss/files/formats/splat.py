@@ -1,0 +1,57 @@
+"""The .splat of antimatter15: 32 bytes for each Gaussian, no header, no harmonics.
+
+https://github.com/antimatter15/splat. Positions and scales are floats; colours, opacity and rotation are
+bytes. Colours outside of 0 to 1, which f_dc may stand for, are cut.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats.common import (
+    arrays_of,
+    colour_bytes,
+    f_dc_of,
+    gaussians_of,
+    log_scales_of,
+    logits,
+    opacities,
+    scales_of,
+    to_bytes,
+    unit,
+)
+
+_ROW = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgb", "u1", 3), ("alpha", "u1"), ("quat", "u1", 4)]
+)
+
+
+def read_splat(data: bytes) -> Gaussians:
+    """The model in a file, of SH degree 0. Raises InputError."""
+    if not data or len(data) % _ROW.itemsize:
+        raise InputError(
+            f"not a whole .splat: expected 32 bytes for each Gaussian, found {len(data):,} in all"
+        )
+    rows = np.frombuffer(data, _ROW)
+    return gaussians_of(
+        rows["mean"],
+        unit(rows["quat"].astype(np.float64) / 128 - 1),
+        log_scales_of(rows["scale"]),
+        logits(rows["alpha"] / 255),
+        f_dc_of(rows["rgb"] / 255),
+        np.empty((len(rows), 0, 3), np.float32),
+    )
+
+
+def write_splat(model: Gaussians) -> bytes:
+    """A model as a file, those first that cover most: viewers show what has been loaded."""
+    means, quats, log_scales, opacity_logits, f_dc, _ = arrays_of(model)
+    size = np.exp(log_scales.astype(np.float64).sum(axis=1))
+    order = np.argsort(-opacities(opacity_logits) * size, kind="stable")
+    rows = np.empty(len(model), _ROW)
+    rows["mean"], rows["scale"] = means, scales_of(log_scales)
+    rows["rgb"], rows["alpha"] = colour_bytes(f_dc), to_bytes(opacities(opacity_logits) * 255)
+    rows["quat"] = to_bytes(unit(quats) * 128 + 128)
+    return rows[order].tobytes()

@@ -1,0 +1,185 @@
+"""SPZ, Niantic's compressed format: versions 2, 3 and 4 are read, 3 and 4 written.
+
+https://github.com/nianticlabs/spz. `parse` and `serialise` turn bytes into codes and back; files lie in
+`spz_container`. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward (RDF): `quantise`
+and `dequantise` turn models by 180 degrees about x, as the format's own library does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from keyss.core.errors import OutputError
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats.common import (
+    Bytes,
+    Codes,
+    Floats,
+    Shorts,
+    arrays_of,
+    from_smallest_three,
+    gaussians_of,
+    logits,
+    opacities,
+    rounded,
+    smallest_three,
+    to_bytes,
+    unit,
+)
+from keyss.files.formats.spz_container import Header, pack, unpack
+
+VERSION = 3  # with 10-bit rotations, and read by more programs than the newer 4
+_FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as the format's own library writes
+_MOST = 2**23 - 1  # of a position's code
+_COLOR_SCALE = 0.15  # f_dc times this, plus 0.5, is 0 to 1
+_MAGNITUDE = 2**9 - 1  # a part of a rotation has a sign and 9 bits
+
+# Signs of the harmonics of degrees 1 to 3 where y and z change theirs.
+_SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
+_MEAN_SIGNS = np.array([1, -1, -1], dtype=np.float32)
+_QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
+
+
+@dataclass(frozen=True, eq=False)
+class SpzCodes(Codes):
+    """All integers of a file; see `dequantise` for their meaning."""
+
+    version: int  # 2, 3 or 4
+    fractional_bits: int  # 0 to 24: positions are multiples of 2^-fractional_bits world units
+    flags: int  # 1: trained antialiased; 2: `extensions` are there
+    positions: npt.NDArray[np.int32]  # [N, 3] -2^23 to 2^23 - 1
+    alphas: Bytes  # [N] opacities in 255ths
+    colors: Bytes  # [N, 3] f_dc in steps of 1/38.25; 127.5 is 0
+    scales: Bytes  # [N, 3] log scales in 16ths from -10 on
+    largest: Bytes  # [N] which of x, y, z, w (0 to 3) is not stored; 3 throughout in version 2
+    rotations: (
+        Shorts  # [N, 3] the others: 512 (negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
+    )
+    sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
+    extensions: bytes = b""  # kept as they are
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def parse(data: bytes) -> SpzCodes:
+    """The codes of a file. Raises InputError for anything that is not a whole SPZ of version 2, 3 or 4."""
+    header, sections = unpack(data)
+    n = header.count
+    triples = sections[0].reshape(n, 3, 3).astype(np.int32)
+    positions = triples[..., 0] | triples[..., 1] << 8 | triples[..., 2] << 16
+    positions -= (positions & 0x800000) << 1
+    if header.version == 2:
+        largest, rotations = np.full(n, 3, np.uint8), sections[4].reshape(n, 3).astype(np.uint16)
+    else:
+        packed = sections[4].reshape(n, 4).view("<u4")[:, 0]
+        largest = (packed >> 30).astype(np.uint8)
+        rotations = np.stack([packed >> 20 & 1023, packed >> 10 & 1023, packed & 1023], 1).astype(np.uint16)
+    return SpzCodes(
+        version=header.version,
+        fractional_bits=header.fractional_bits,
+        flags=header.flags,
+        positions=positions,
+        alphas=sections[1],
+        colors=sections[2].reshape(n, 3),
+        scales=sections[3].reshape(n, 3),
+        largest=largest,
+        rotations=rotations,
+        sh=sections[5].reshape(n, -1, 3),
+        extensions=header.extensions,
+    )
+
+
+def serialise(codes: SpzCodes) -> bytes:
+    """A file of the codes, of the version that they name."""
+    n = len(codes)
+    fixed = codes.positions.astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
+    if codes.version == 2:
+        rotations = codes.rotations.astype(np.uint8).tobytes()
+    else:
+        parts = codes.rotations.astype(np.uint32)
+        packed = codes.largest.astype(np.uint32) << 30 | parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
+        rotations = packed.astype("<u4").tobytes()
+    sections = [fixed.tobytes(), codes.alphas.tobytes(), codes.colors.tobytes(), codes.scales.tobytes()]
+    degree = {0: 0, 3: 1, 8: 2, 15: 3}[codes.sh.shape[1]]
+    header = Header(codes.version, n, degree, codes.fractional_bits, codes.flags, codes.extensions)
+    return pack(header, [*sections, rotations, codes.sh.tobytes()])
+
+
+def dequantise(codes: SpzCodes) -> Gaussians:
+    """The model that codes stand for, in the frame of a .ply."""
+    means = np.ldexp(codes.positions.astype(np.float64), -codes.fractional_bits) * _MEAN_SIGNS
+    if codes.version == 2:
+        xyz = codes.rotations / 127.5 - 1
+    else:
+        xyz = np.where(codes.rotations & 512, -1.0, 1.0) * (codes.rotations & _MAGNITUDE)
+        xyz *= np.sqrt(0.5) / _MAGNITUDE
+    quats = np.roll(from_smallest_three(codes.largest, xyz), 1, axis=1) * _QUAT_SIGNS
+    rest = (codes.sh.astype(np.float32) - 128) / 128 * _SH_SIGNS[: codes.sh.shape[1], None]
+    return gaussians_of(
+        means,
+        quats,
+        codes.scales / 16 - 10,
+        logits(codes.alphas / 255),
+        (codes.colors / 255 - 0.5) / _COLOR_SCALE,
+        rest,
+    )
+
+
+def quantise(
+    model: Gaussians, *, version: int = VERSION, sh1_bits: int = 5, sh_rest_bits: int = 4
+) -> SpzCodes:
+    """The codes nearest to a model, its order kept.
+
+    `sh1_bits`, `sh_rest_bits`: how many of the 8 bits of harmonics are used, of degree 1 and of the others,
+    1 to 8; the defaults are those of the format's own library. Raises OutputError for positions beyond
+    8 million world units.
+    """
+    means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
+    bits = _fractional_bits(means)
+    largest, xyz = smallest_three(np.roll(unit(quats) * _QUAT_SIGNS, -1, axis=1))
+    magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
+    return SpzCodes(
+        version=version,
+        fractional_bits=bits,
+        flags=0,
+        positions=rounded(np.ldexp(means.astype(np.float64), bits) * _MEAN_SIGNS).astype(np.int32),
+        alphas=to_bytes(opacities(opacity_logits) * 255),
+        colors=to_bytes(f_dc.astype(np.float64) * (_COLOR_SCALE * 255) + 127.5),
+        scales=to_bytes((log_scales.astype(np.float64) + 10) * 16),
+        largest=largest,
+        rotations=magnitudes.astype(np.uint16) | np.where(xyz < 0, 512, 0).astype(np.uint16),
+        sh=_quantised_harmonics(rest, sh1_bits, sh_rest_bits),
+    )
+
+
+def read_spz(data: bytes) -> Gaussians:
+    """The model in a file. Raises InputError."""
+    return dequantise(parse(data))
+
+
+def write_spz(model: Gaussians) -> bytes:
+    """A model as a file of version 3. Raises OutputError as `quantise` does."""
+    return serialise(quantise(model))
+
+
+def _fractional_bits(means: Floats) -> int:
+    """The usual number of them, or as many as positions leave room for."""
+    extent = float(np.abs(means).max())
+    if not extent < _MOST:
+        raise OutputError(
+            f"SPZ holds positions up to {_MOST:,} world units, and this model reaches {extent:.3g}"
+        )
+    return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < _MOST)
+
+
+def _quantised_harmonics(rest: Floats, sh1_bits: int, sh_rest_bits: int) -> Bytes:
+    """[N, K - 1, 3] codes on a lattice that leaves lower bits alike, which packs better."""
+    signed = rest * _SH_SIGNS[: rest.shape[1], None]
+    codes = rounded(signed.astype(np.float64) * 128) + 128
+    step = np.where(np.arange(rest.shape[1]) < 3, 2 ** (8 - sh1_bits), 2 ** (8 - sh_rest_bits))[:, None]
+    found: Bytes = (np.floor((codes + step // 2) / step) * step).clip(0, 255).astype(np.uint8)
+    return found

@@ -1,0 +1,240 @@
+"""Codes: what is parsed is what was serialised, and a model's codes are its nearest ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.cluster import KMeans
+
+from files.formats.examples import (
+    assert_close,
+    is_finite,
+    model_of,
+    random_compressed,
+    random_sog,
+    random_spz,
+)
+from keyss.core import Gaussians
+from keyss.core.errors import OutputError
+from keyss.core.similarity import Similarity
+from keyss.files.formats import compressed_ply, sog, spz
+from keyss.files.formats.codebooks import codebook_of, nearest, palette_of
+from keyss.files.formats.common import from_smallest_three, morton_order, smallest_three, unit
+
+SEEDS, COUNTS, DEGREES = st.integers(0, 2**32 - 1), st.integers(1, 300), st.sampled_from([0, 3, 8, 15])
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, st.sampled_from([2, 3, 4]), COUNTS, DEGREES)
+def test_spz_inverts(seed: int, version: int, count: int, k: int) -> None:
+    codes = random_spz(np.random.default_rng(seed), version, count, k)
+    again = spz.parse(spz.serialise(codes))
+    assert again == codes
+    assert is_finite(spz.dequantise(again))
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, COUNTS, DEGREES)
+def test_compressed_ply_inverts(seed: int, count: int, k: int) -> None:
+    codes = random_compressed(np.random.default_rng(seed), count, k)
+    again = compressed_ply.parse(compressed_ply.serialise(codes))
+    assert again == codes
+    assert is_finite(compressed_ply.dequantise(again))
+
+
+@settings(max_examples=40, deadline=None)
+@given(SEEDS, COUNTS, DEGREES)
+def test_sog_inverts(seed: int, count: int, k: int) -> None:
+    codes = random_sog(np.random.default_rng(seed), count, k)
+    again = sog.parse(sog.serialise(codes))
+    assert again == codes
+    assert is_finite(sog.dequantise(again))
+
+
+def test_codes_differ_in_a_single_bit() -> None:
+    codes = random_spz(np.random.default_rng(0), 3, 20, 3)
+    alphas = codes.alphas.copy()
+    alphas[7] ^= 1
+    assert codes != replace(codes, alphas=alphas)
+    assert codes != replace(codes, flags=codes.flags ^ 1)
+    assert codes == replace(codes, alphas=codes.alphas.copy())
+
+
+def test_extensions_of_an_spz_are_kept() -> None:
+    for version in (3, 4):
+        codes = replace(random_spz(np.random.default_rng(0), version, 9, 3), flags=2, extensions=b"\1\2\3")
+        assert spz.parse(spz.serialise(codes)) == codes
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_an_spz_that_is_read_and_written_stays_what_it_is(version: int) -> None:
+    """What `dequantise` gives is in the middle of the codes that `quantise` chooses."""
+    codes = spz.quantise(model_of(500, 3), version=version)
+    again = spz.quantise(spz.dequantise(codes), version=version)
+    # Which of two parts of a rotation is the larger one may change after rounding, and so may the sign of 0.
+    assert replace(again, largest=codes.largest, rotations=codes.rotations) == codes
+    assert np.mean(again.rotations != codes.rotations) < 0.02
+    assert angle(spz.dequantise(again), spz.dequantise(codes)) < 0.2
+
+
+def test_a_compressed_ply_that_is_read_and_written_stays_what_it_is() -> None:
+    codes = compressed_ply.quantise(model_of(700, 2))
+    again = compressed_ply.quantise(compressed_ply.dequantise(codes))
+    for name in ("positions", "scales", "colors", "alphas", "sh"):
+        assert np.array_equal(getattr(again, name), getattr(codes, name)), name
+
+
+def worst(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float((a.double() - b.double()).abs().max())
+
+
+def angle(a: Gaussians, b: Gaussians) -> float:
+    """The largest angle between rotations of two models, in degrees."""
+    both = [torch.nn.functional.normalize(each.quats.double()) for each in (a, b)]
+    return float(2 * torch.rad2deg(torch.acos((both[0] * both[1]).sum(1).abs().clamp_max(1)).max()))
+
+
+def rotation_bound(step: float) -> float:
+    """The largest angle in degrees that parts of a quaternion rounded to multiples of `step` can make.
+
+    Three errors of half a step and, where all parts are equal, the sum of them in the fourth.
+    """
+    return float(np.degrees(2 * np.sqrt(3 + 3**2) * step / 2)) * 1.001
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_errors_of_spz_are_half_a_step(degree: int) -> None:
+    model = model_of(400, degree)
+    found = spz.dequantise(spz.quantise(model, sh1_bits=8, sh_rest_bits=8))
+    assert worst(found.means, model.means) <= 0.5 / 4096 + 1e-6
+    assert worst(found.log_scales, model.log_scales) <= 0.5 / 16 + 1e-6
+    assert worst(found.opacities, model.opacities) <= 0.5 / 255 + 1e-6
+    assert worst(found.sh[:, 0], model.sh[:, 0]) <= 0.5 / 38.25 + 1e-6
+    if degree:
+        assert worst(found.sh[:, 1:], model.sh[:, 1:].clamp(-1, 127 / 128)) <= 0.5 / 128 + 1e-6
+    assert angle(found, model) <= rotation_bound(0.5**0.5 / 511)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_errors_of_compressed_ply_are_half_a_step_of_its_chunk(degree: int) -> None:
+    model = model_of(600, degree)
+    found = compressed_ply.dequantise(compressed_ply.quantise(model))
+    for start in range(0, 600, 256):
+        part, near = model[start : start + 256], found[start : start + 256]
+        for name, bits in (("means", (11, 10, 11)), ("log_scales", (11, 10, 11))):
+            values = getattr(part, name)
+            step = (values.amax(0) - values.amin(0)) / (2.0 ** torch.tensor(bits) - 1)
+            assert bool(((getattr(near, name) - values).abs() <= 0.5 * step + 1e-5).all())
+        colors = part.sh[:, 0]
+        step = (colors.amax(0) - colors.amin(0)) / 255
+        assert bool(((near.sh[:, 0] - colors).abs() <= 0.5 * step + 1e-5).all())
+    assert worst(found.opacities, model.opacities) <= 0.5 / 255 + 1e-6
+    if degree:
+        assert worst(found.sh[:, 1:], model.sh[:, 1:]) <= 0.5 / 32 + 1e-6
+    assert angle(found, model) <= rotation_bound(2**0.5 / 1023)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_errors_of_sog(degree: int) -> None:
+    model = model_of(400, degree)
+    codes = sog.quantise(model)
+    found = sog.dequantise(codes)
+    logs = torch.log1p(model.means.double().abs())
+    step = (torch.from_numpy(codes.maxs) - torch.from_numpy(codes.mins)) / 65535
+    assert bool(((found.means - model.means).abs() <= 0.5 * step * logs.exp() * 1.01 + 1e-5).all())
+    assert worst(found.opacities, model.opacities) <= 0.5 / 255 + 1e-6
+    assert angle(found, model) <= rotation_bound(2**0.5 / 255)
+    # 256 numbers for 1,200 values: not worse than as many in equal steps would be.
+    for found_values, values in ((found.log_scales, model.log_scales), (found.sh[:, 0], model.sh[:, 0])):
+        step_of_256 = float(values.max() - values.min()) / 256
+        assert float((found_values - values).square().mean()) ** 0.5 <= step_of_256 / 12**0.5
+
+
+def test_a_model_keeps_its_pictures_in_spz() -> None:
+    """y and z change signs in the file: harmonics have to follow as they do when a model is turned."""
+    model = model_of(50, 3)
+    codes = spz.quantise(model, sh1_bits=8, sh_rest_bits=8)
+    turned = Similarity(rotation=torch.diag(torch.tensor([1.0, -1.0, -1.0]))).apply_gaussians(model)
+    assert worst(torch.from_numpy(codes.positions) / 4096, turned.means) < 2e-4
+    assert (
+        worst((torch.from_numpy(codes.sh).double() - 128) / 128, turned.sh[:, 1:].clamp(-1, 127 / 128)) < 4e-3
+    )
+
+
+@pytest.mark.parametrize("reach", [1.0, 3000.0, 100_000.0, 8_000_000.0])
+def test_spz_makes_room_for_large_models(reach: float) -> None:
+    model = model_of(30, 0)
+    model = replace(model, means=model.means / model.means.abs().max() * reach)
+    codes = spz.quantise(model)
+    assert worst(spz.dequantise(codes).means, model.means) <= 0.51 * 2.0**-codes.fractional_bits
+    assert reach > 2048 or codes.fractional_bits == 12
+
+
+def test_spz_refuses_models_beyond_all_measure() -> None:
+    model = model_of(3, 0)
+    with pytest.raises(OutputError, match="up to 8,388,607 world units"):
+        spz.quantise(replace(model, means=model.means * 1e9))
+
+
+def test_equal_gaussians_and_zero_quaternions() -> None:
+    model = model_of(2, 3)[torch.ones(300, dtype=torch.long)]
+    model = replace(model, quats=torch.zeros(300, 4))
+    for module in (spz, compressed_ply, sog):
+        found = module.dequantise(module.quantise(model))
+        assert_close(found, replace(model, quats=torch.tensor([[1.0, 0, 0, 0]]).expand(300, 4)), 0.07)
+
+
+# --- what they share ------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS)
+def test_smallest_three(seed: int) -> None:
+    quats = unit(np.random.default_rng(seed).normal(size=(20, 4)))
+    largest, others = smallest_three(quats)
+    assert np.abs(others).max() <= np.sqrt(0.5) + 1e-12
+    again = from_smallest_three(largest, others)
+    assert np.abs(np.abs((again * quats).sum(axis=1)) - 1).max() < 1e-12
+
+
+def test_morton_order_brings_neighbours_together() -> None:
+    means = np.random.default_rng(0).random((4096, 3)).astype(np.float32)
+    order = morton_order(means)
+    assert sorted(order.tolist()) == list(range(4096))
+    chunks = means[order].reshape(16, 256, 3)
+    # Sixteen boxes share the volume of one: their sides are about 0.4 long.
+    assert float((chunks.max(axis=1) - chunks.min(axis=1)).mean()) < 0.6
+
+
+def test_codebooks_are_good() -> None:
+    values = np.random.default_rng(0).normal(size=50_000).astype(np.float32)
+    book = codebook_of(values)
+    assert (np.diff(book) >= 0).all()
+    error = float(np.square(book[nearest(book, values)] - values).mean())
+    # Panter and Dite (1951): sqrt(3) pi / 2 / 256^2 is the least that is possible for normal values.
+    assert error < 1.03 * np.sqrt(3) * np.pi / 2 / 256**2
+    few = np.array([3, 1, 2, 1], np.float32)
+    assert np.array_equal(codebook_of(few)[nearest(codebook_of(few), few)], few)
+
+
+def test_palettes_are_nearly_as_good_as_k_means() -> None:
+    rng = np.random.default_rng(0)
+    vectors = (rng.normal(size=(3000, 45)) / np.arange(1, 46)).astype(np.float32)
+    palette, labels = palette_of(vectors, 256)
+    assert (len(palette), int(labels.max())) == (256, 255)
+    error = float(np.square(palette[labels] - vectors).sum())
+    assert error < 1.25 * KMeans(256, n_init=1, max_iter=20, random_state=0).fit(vectors).inertia_
+
+
+def test_palettes_of_few_vectors() -> None:
+    vectors = np.random.default_rng(0).normal(size=(100, 9)).astype(np.float32)
+    palette, labels = palette_of(vectors, 128)
+    assert np.allclose(palette[labels], vectors)
+    palette, labels = palette_of(np.full((9, 9), 1e30, np.float32), 8)
+    assert len(palette) == 1
+    assert np.allclose(palette[labels], 1e30)

@@ -1,0 +1,230 @@
+"""Other people's programs read what we write, and we read what they write, to the same values."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+
+from files.formats.examples import assert_close, model_of
+from keyss.core import Gaussians
+from keyss.core.gaussians import SH_C0
+from keyss.files import read_model, write_model
+from keyss.files.formats import compressed_ply, glb, spz
+from keyss.files.ply import write_ply
+
+Transform = Callable[..., Path]
+DEGREES = pytest.mark.parametrize("degree", [0, 1, 2, 3])
+SOME_DEGREES = pytest.mark.parametrize("degree", [0, 3])
+
+
+@SOME_DEGREES
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "splat"])
+def test_splat_transform_reads_ours(
+    splat_transform: Transform, tmp_path: Path, suffix: str, degree: int
+) -> None:
+    ours = tmp_path / f"ours.{suffix}"
+    write_model(ours, model_of(600, degree))
+    found = read_model(ours)
+    back = read_model(splat_transform(ours, tmp_path / "back.ply"))
+    # A byte b of a rotation in a .splat is b / 127.5 - 1 to it, b / 128 - 1 to the format's own viewer.
+    assert_close(back, found, 1e-4 if suffix == "splat" else 1e-6)
+
+
+@SOME_DEGREES
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply"])
+def test_we_read_splat_transforms(
+    splat_transform: Transform, tmp_path: Path, suffix: str, degree: int
+) -> None:
+    write_ply(tmp_path / "in.ply", model_of(600, degree))
+    options = ["-i", "1"] if suffix == "sog" else []
+    theirs = splat_transform(tmp_path / "in.ply", tmp_path / f"theirs.{suffix}", *options)
+    back = read_model(splat_transform(theirs, tmp_path / "back.ply"))
+    assert_close(read_model(theirs), back, 1e-6)
+
+
+@DEGREES
+def test_spz_has_the_codes_of_splat_transforms(
+    splat_transform: Transform, tmp_path: Path, degree: int
+) -> None:
+    """It uses the format's own library."""
+    model = model_of(600, degree)
+    write_ply(tmp_path / "in.ply", model)
+    theirs = spz.parse(splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes())
+    assert spz.quantise(model, version=4) == theirs
+
+
+@DEGREES
+def test_compressed_ply_has_the_codes_of_splat_transforms(
+    splat_transform: Transform, tmp_path: Path, degree: int
+) -> None:
+    model = model_of(600, degree)
+    write_ply(tmp_path / "in.ply", model)
+    theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
+    codes = compressed_ply.parse(theirs)
+    order = torch.cdist(compressed_ply.dequantise(codes).means, model.means).argmin(dim=1)
+    assert len(order.unique()) == 600
+    assert compressed_ply.quantise(model[order]) == codes
+
+
+def test_the_order_in_chunks_is_as_good_as_splat_transforms(
+    splat_transform: Transform, tmp_path: Path
+) -> None:
+    model = model_of(5000, 0)
+    write_ply(tmp_path / "in.ply", model)
+    theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
+
+    def extent(data: bytes) -> float:
+        bounds = compressed_ply.parse(data).bounds
+        return float((bounds[:, 3:6] - bounds[:, :3]).mean())
+
+    assert extent(compressed_ply.write_compressed_ply(model)) < 1.02 * extent(theirs)
+
+
+@DEGREES
+def test_we_read_splat_transforms_glb(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
+    """It writes the values of a .ply turned by 180 degrees, and we bring them back."""
+    model = model_of(200, degree)
+    write_ply(tmp_path / "in.ply", model)
+    found = read_model(splat_transform(tmp_path / "in.ply", tmp_path / "a.glb"))
+    assert_close(found, model, 1e-6)
+
+
+def test_a_folder_of_sog(splat_transform: Transform, tmp_path: Path) -> None:
+    write_ply(tmp_path / "in.ply", model_of(300, 1))
+    (tmp_path / "sog").mkdir()
+    meta = splat_transform(tmp_path / "in.ply", tmp_path / "sog" / "meta.json", "-i", "1")
+    whole = splat_transform(tmp_path / "in.ply", tmp_path / "a.sog", "-i", "1")
+    found, expected = read_model(meta), read_model(whole)
+    assert_close(found.with_sh_degree(0), expected.with_sh_degree(0), 1e-6)
+    assert float((found.sh - expected.sh).abs().max()) < 0.2  # its search for a palette is random
+
+
+def of_gsply(data: gsply.GSData, *, turned: bool = False) -> Gaussians:
+    """A model of gsply's; `turned`: it does not turn .spz files into the frame of a .ply."""
+    n = len(data.means)
+    rest = np.empty((n, 0, 3), np.float32) if data.shN is None else data.shN.reshape(n, -1, 3)
+    means, quats = data.means.copy(), data.quats.copy()
+    if turned:
+        means[:, 1:] *= -1
+        quats[:, 2:] *= -1
+        signs = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+        rest = rest * signs[: rest.shape[1], None]
+    sh = np.concatenate([data.sh0[:, None], rest], axis=1)
+    arrays = (means, quats, data.scales, data.opacities, sh)
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(each, np.float32)) for each in arrays))
+
+
+GSPLY: dict[str, Callable[[Path], gsply.GSData]] = {
+    "spz": gsply.read_spz,
+    "sog": gsply.sogread,
+    "compressed.ply": gsply.plyread,
+}
+
+
+@DEGREES
+@pytest.mark.parametrize("suffix", GSPLY)
+def test_gsply_reads_ours(tmp_path: Path, suffix: str, degree: int) -> None:
+    path = tmp_path / f"ours.{suffix}"
+    write_model(path, model_of(300, degree))
+    # Of opacities of 0 and 1 it makes others that are finite, too.
+    assert_close(of_gsply(GSPLY[suffix](path), turned=suffix == "spz"), read_model(path), 1e-4)
+
+
+@DEGREES
+@pytest.mark.parametrize("version", [3, 4])
+def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
+    write_ply(tmp_path / "in.ply", model_of(300, degree))
+    gsply.write_spz(tmp_path / "a.spz", gsply.plyread(tmp_path / "in.ply"), version=version)
+    theirs = of_gsply(gsply.read_spz(tmp_path / "a.spz"), turned=True)
+    assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
+
+
+def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
+    """It reads this version and does not write it."""
+    codes = spz.quantise(model_of(300, 1))
+    codes = replace(codes, version=2, largest=np.full_like(codes.largest, 3), rotations=codes.rotations & 63)
+    codes = replace(codes, rotations=codes.rotations + np.uint16(100))
+    (tmp_path / "a.spz").write_bytes(spz.serialise(codes))
+    assert_close(
+        read_model(tmp_path / "a.spz"), of_gsply(gsply.read_spz(tmp_path / "a.spz"), turned=True), 1e-5
+    )
+
+
+@DEGREES
+def test_we_read_gsplys_compressed_ply(tmp_path: Path, degree: int) -> None:
+    write_ply(tmp_path / "in.ply", model_of(300, degree))
+    path = tmp_path / "a.compressed.ply"
+    gsply.plywrite(path, gsply.plyread(tmp_path / "in.ply"), compressed=True)
+    assert_close(read_model(path), of_gsply(gsply.plyread(path)), 1e-4)
+
+
+@DEGREES
+def test_glb_comes_back(degree: int) -> None:
+    model = model_of(150, degree)
+    found = glb.read_glb(glb.write_glb(model))
+    assert_close(found, model, 1e-6)
+    assert torch.equal(found.means, model.means)
+    assert torch.equal(found.sh, model.sh)
+
+
+# --- .ksplat: no program here writes its two smaller levels ----------------------------------------------
+
+
+def ksplat_of(model: Gaussians, level: int, *, bucket: int = 64) -> bytes:
+    """A file of a model: two sections, the first of full buckets and the second of partly filled ones."""
+    n, k = model.sh.shape[:2]
+    position, number, harmonic = [("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1")][level]
+    count = 3 * (k - 1)
+    row = np.dtype(
+        [("m", position, 3), ("s", number, 3), ("q", number, 4), ("c", "u1", 4), ("h", harmonic, count)]
+    )
+    sections, bodies = b"", b""
+    half = n // (2 * bucket) * bucket
+    block, finest = 5.0, 32767
+    for start, end in ((0, half), (half, n)):
+        part = model[start:end]
+        sizes = [bucket] * (half // bucket) if start == 0 else _uneven(end - start)
+        centres = np.stack([chunk.mean(0).numpy() for chunk in part.means.split(sizes)]).astype("<f4")
+        rows = np.zeros(len(part), row)
+        means = part.means.numpy()
+        if level:
+            offset = (means - np.repeat(centres, sizes, axis=0)) / (block / 2) * finest
+            means = np.rint(offset + finest).clip(0, 65535)
+        rows["m"], rows["s"], rows["q"] = means, part.scales.numpy(), part.quats.numpy()
+        rows["c"][:, :3] = ((part.sh[:, 0] * SH_C0 + 0.5) * 255).round().clamp(0, 255).numpy()
+        rows["c"][:, 3] = (part.opacities * 255).round().numpy()
+        bands = [part.sh[:, d * d : (d + 1) ** 2].transpose(1, 2).flatten(1) for d in range(1, int(k**0.5))]
+        if bands:
+            values = torch.cat(bands, dim=1).numpy()
+            rows["h"] = np.rint((values + 1.5) / 3 * 255).clip(0, 255) if level == 2 else values
+        partial = sizes if start else []
+        header = struct.pack("<IIIIfHxx", len(part), len(part), bucket, len(sizes), block, 12)
+        header += struct.pack("<IIIIH", finest, 0, 0 if start else len(sizes), len(partial), int(k**0.5) - 1)
+        sections += header.ljust(1024, b"\0")
+        bodies += np.array(partial, "<u4").tobytes() + centres.tobytes() + rows.tobytes()
+    start = struct.pack("<BBxxIIIIHxxfffff", 0, 1, 2, 2, n, n, level, 0, 0, 0, -1.5, 1.5)
+    return start.ljust(4096, b"\0") + sections + bodies
+
+
+def _uneven(count: int) -> list[int]:
+    sizes = [10, 1, 30]
+    return [*sizes, count - sum(sizes)]
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_ksplat_as_splat_transform_reads_it(
+    splat_transform: Transform, tmp_path: Path, level: int, degree: int
+) -> None:
+    model = model_of(300, degree)
+    (tmp_path / "a.ksplat").write_bytes(ksplat_of(model, level))
+    found = read_model(tmp_path / "a.ksplat")
+    assert_close(found, read_model(splat_transform(tmp_path / "a.ksplat", tmp_path / "back.ply")), 1e-5)
+    assert_close(found, model, 0.02)
