@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from keyss._verbs.asking import Secret
+    from keyss._verbs.converting import Conversion, convert
     from keyss._verbs.fitting import fit
     from keyss._verbs.hiding import HideResult, hide
     from keyss._verbs.looking import evaluate, render
@@ -17,13 +18,26 @@ if TYPE_CHECKING:
     from keyss.audit.run import audit
     from keyss.report.page import write_report
 
-__all__ = ["HideResult", "Secret", "audit", "evaluate", "fit", "hide", "plan", "render", "reveal"]
-__all__ += ["reveal_counted", "verify", "write_report"]
+__all__ = [
+    "Conversion",
+    "HideResult",
+    "Secret",
+    "audit",
+    "convert",
+    "evaluate",
+    "fit",
+    "hide",
+    "plan",
+    "render",
+]
+__all__ += ["reveal", "reveal_counted", "verify", "write_report"]
 
 _HOMES = {
+    "Conversion": "_verbs.converting",
     "HideResult": "_verbs.hiding",
     "Secret": "_verbs.asking",
     "audit": "audit.run",
+    "convert": "_verbs.converting",
     "evaluate": "_verbs.looking",
     "fit": "_verbs.fitting",
     "hide": "_verbs.hiding",

@@ -36,7 +36,7 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        making = ["keygen", "fit", "hide", "reveal", "verify", "render"]
+        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert"]
         judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "version"]
         assert making + judging == COMMANDS
 
@@ -51,7 +51,7 @@ class TestHelp:
     def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
         out = keyss(command, "--help").out
         assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "demo"})
-        computing = {"fit", "hide", "reveal", "verify", "render", "evaluate", "audit", "demo"}
+        computing = {"fit", "hide", "reveal", "verify", "render", "convert", "evaluate", "audit", "demo"}
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import torch
 
 from keyss._verbs.asking import Secret, inputs_of, method_for
-from keyss.core.errors import QualityError
+from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.models import read_model
+from keyss.files.models import is_model_path, read_model
 from keyss.fitting.loop import Reporter
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
@@ -76,6 +76,11 @@ def hide(
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
     is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
+    if out is not None and is_model_path(out):
+        raise UsageError(
+            f"{out}: expected the name of a folder; the model in it is a .ply, since secrets lie in "
+            "low bits, which no other format keeps"
+        )
     chosen, options = method_for(method, secrets)
     recorded = recorded_seed(Path(out), "options", "fit", "seed") if resume and out is not None else None
     options = replace(options, fit=options.fit.seeded(recorded))

@@ -14,7 +14,7 @@ from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
 from keyss.cli.hiding import hide, reveal, verify
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
-from keyss.cli.models import fit, info, render
+from keyss.cli.models import convert, fit, info, render
 
 
 def keygen(
@@ -91,4 +91,7 @@ def version() -> None:
     print(__version__)
 
 
-ALL = (keygen, fit, hide, reveal, verify, render, evaluate, audit, report, steganalyze, info, demo, version)
+ALL = (
+    *(keygen, fit, hide, reveal, verify, render, convert),
+    *(evaluate, audit, report, steganalyze, info, demo, version),
+)

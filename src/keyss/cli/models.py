@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import (
     Background,
@@ -23,6 +23,7 @@ from keyss.cli.arguments import (
     Seed,
     SkipMissing,
     Width,
+    optional,
     preset_sizes,
     schedule,
 )
@@ -91,7 +92,9 @@ def fit_with_presets() -> Callable[..., None]:
 
 
 def render(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
+    model: Annotated[
+        Positional[Path], arg(metavar="FILE", help="A 3DGS model (.ply, .spz, .sog, ...), or - for stdin.")
+    ],
     *,
     cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
     out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
@@ -122,10 +125,50 @@ def render(
     print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
 
 
+def convert(
+    model: Annotated[Positional[Path], arg(metavar="IN", help="A model of any format, or - for stdin.")],
+    out: Annotated[Positional[Path], arg(metavar="OUT", help="The model to write: .ply, .spz, .sog, ...")],
+    *,
+    key_file: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional(
+            "FILE", "File with a key whose secret must not be lost, once for each.", "none is looked for"
+        ),
+    ] = (),
+    force: Annotated[bool, arg(help="Write it even if what a key opens is lost.")] = False,
+    dry_run: Annotated[bool, arg(help="Say what it costs, and write nothing.")] = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+) -> None:
+    """Write a model in another format, and say what that costs.
+
+    The end of OUT names the format: .ply, .compressed.ply, .spz, .sog, .glb or .splat; .ksplat and the
+    meta.json of a SOG folder are read as well. All but .ply round, which loses what lies in low bits, and
+    most change the order. The cost is the PSNR of pictures after, against those before, from around it.
+
+    example: keyss convert cover.ply cover.spz
+
+    example: keyss convert stego.ply stego.sog --key-file key.txt --dry-run
+    """
+    import sys
+
+    from keyss import api
+    from keyss.cli.keys import hinting_at_white_space, key_of_file
+    from keyss.cli.tables import print_conversion
+    from keyss.files.streams import is_standard
+
+    chosen = [key_of_file(path) for path in key_file]
+    with hinting_at_white_space(chosen):
+        found = api.convert(
+            model, out, chosen, force=force, dry_run=dry_run, overwrite=overwrite, device=device
+        )
+    print_conversion(str(out), found, dry_run=dry_run, file=sys.stderr if is_standard(out) else sys.stdout)
+
+
 def info(
     path: Annotated[
         Positional[Path],
-        arg(metavar="FILE", help="A .ply (- for stdin), a scene folder, a sidecar or a result folder."),
+        arg(metavar="FILE", help="A model (- for stdin), a scene folder, a sidecar or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console as RichConsole
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from keyss._verbs.converting import Conversion
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
@@ -144,6 +145,29 @@ def print_verdicts(run: Path) -> None:
 def print_facts(facts: Mapping[str, Any]) -> None:
     """Names and values, a nested one per line: `points.count`."""
     _print_columns(_flat(facts))
+
+
+def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO) -> None:
+    """What a conversion costs: bytes, pictures, and what keys open."""
+    was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
+    pictures = (
+        "pictures as before" if found.psnr >= 120 else f"pictures at {found.psnr:.1f} dB PSNR from before"
+    )
+    print(
+        f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {pictures}", file=file
+    )
+    for number, secret in enumerate(found.secrets, 1):
+        which = "what the key opens" if len(found.secrets) == 1 else f"what key {number} opens"
+        state = "opens as before" if secret.kept else f"is lost: {secret.after:,} Gaussians of it open"
+        print(f"{which}, {secret.before:,} Gaussians, {state}", file=file)
+    if not found.secrets and not found.keeps_low_bits:
+        print("what may lie in low bits does not survive this format; with a key, keyss looks", file=file)
+    if dry_run:
+        print("nothing was written, as asked", file=file)
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:,.1f} kB"
 
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:

@@ -5,25 +5,20 @@ A new format is a module with a reader and a writer, and one entry in `FORMATS`.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write
 from keyss.files.foreign import what_it_is
-from keyss.files.formats.common import read_whole, writable
-from keyss.files.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
-from keyss.files.formats.glb import read_glb, write_glb
-from keyss.files.formats.ksplat import read_ksplat
-from keyss.files.formats.sog import read_sog, read_sog_folder, write_sog
-from keyss.files.formats.splat import read_splat, write_splat
-from keyss.files.formats.spz import read_spz, write_spz
 from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.ply import read_ply, write_ply
 from keyss.files.ply_table import MAX_HEADER_BYTES
-from keyss.files.streams import StandardInput, StandardOutput, is_standard
+from keyss.files.streams import MemoryInput, MemoryOutput, StandardInput, StandardOutput, is_standard
 
 
 @dataclass(frozen=True)
@@ -38,22 +33,34 @@ class ModelFormat:
     exact: bool = False  # whether all numbers come back to the last bit
 
 
-def _reader(decode: Callable[[bytes], Gaussians]) -> Callable[[Path | StandardInput], Gaussians]:
+def _format(module: str) -> Any:
+    """A module of `keyss.files.formats`, imported when it is needed: some take their time."""
+    return importlib.import_module(f"keyss.files.formats.{module}")
+
+
+def _reader(module: str) -> Callable[[Path | StandardInput], Gaussians]:
+    """What reads files by `read_MODULE`, which takes bytes."""
+
     def read(source: Path | StandardInput) -> Gaussians:
         try:
-            return decode(read_whole(source))
+            model: Gaussians = getattr(_format(module), f"read_{module}")(
+                _format("common").read_whole(source)
+            )
         except InputError as error:
             raise InputError(f"{source}: {error}") from error
         except OSError as error:
             raise InputError(f"cannot read {source}: {error.strerror or error}") from error
+        return model
 
     return read
 
 
-def _writer(encode: Callable[[Gaussians], bytes]) -> Callable[[Path | StandardOutput, Gaussians], None]:
+def _writer(module: str) -> Callable[[Path | StandardOutput, Gaussians], None]:
+    """What writes files by `write_MODULE`, which gives bytes."""
+
     def write(target: Path | StandardOutput, model: Gaussians) -> None:
         try:
-            data = encode(writable(model))
+            data = getattr(_format(module), f"write_{module}")(_format("common").writable(model))
         except OutputError as error:
             raise OutputError(f"cannot write {target}: {error}") from error
         with atomic_write(target) as file:
@@ -65,22 +72,25 @@ def _writer(encode: Callable[[Gaussians], bytes]) -> Callable[[Path | StandardOu
 def _read_any_ply(source: Path | StandardInput) -> Gaussians:
     """Compressed files end in .ply, too."""
     with source.open("rb") as file:
-        start = file.read(MAX_HEADER_BYTES)
-    return _reader(read_compressed_ply)(source) if is_compressed(start) else read_ply(source)
+        header = file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
+    return _reader("compressed_ply")(source) if b" packed_position" in header else read_ply(source)
+
+
+def _read_sog_folder(source: Path | StandardInput) -> Gaussians:
+    model: Gaussians = _format("sog").read_sog_folder(source)
+    return model
 
 
 # The first whose suffix fits a name is its format.
 FORMATS = [
-    ModelFormat(
-        "compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer(write_compressed_ply)
-    ),
+    ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer("compressed_ply")),
     ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, exact=True),
-    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader(read_spz), _writer(write_spz)),
-    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader(read_sog), _writer(write_sog)),
-    ModelFormat("SOG", ("meta.json",), (), read_sog_folder, None),
-    ModelFormat("glTF", (".glb",), (b"glTF",), _reader(read_glb), _writer(write_glb)),
-    ModelFormat(".splat", (".splat",), (), _reader(read_splat), _writer(write_splat)),
-    ModelFormat(".ksplat", (".ksplat",), (), _reader(read_ksplat), None),
+    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz"), _writer("spz")),
+    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog"), _writer("sog")),
+    ModelFormat("SOG", ("meta.json",), (), _read_sog_folder, None),
+    ModelFormat("glTF", (".glb",), (b"glTF",), _reader("glb"), _writer("glb")),
+    ModelFormat(".splat", (".splat",), (), _reader("splat"), _writer("splat")),
+    ModelFormat(".ksplat", (".ksplat",), (), _reader("ksplat"), None),
 ]
 _PLY = FORMATS[1]
 
@@ -109,6 +119,18 @@ def write_model(path: Path | str, model: Gaussians) -> None:
     """
     _, write = _for_writing(path)
     write(StandardOutput() if is_standard(path) else Path(path), model)
+
+
+def model_bytes(path: Path | str, model: Gaussians) -> bytes:
+    """What `write_model` would write to `path`. Raises as it does."""
+    memory = MemoryOutput(str(path))
+    _for_writing(path)[1](memory, model)
+    return memory.data
+
+
+def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
+    """What `read_model` would read from `path`, were `data` there; `write_model` has to know its suffix."""
+    return _for_writing(path)[0].read(MemoryInput(str(path), data))
 
 
 def keeps_low_bits(path: Path | str) -> bool:

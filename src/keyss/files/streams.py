@@ -79,3 +79,28 @@ class StandardOutput:
             raise
         except OSError as error:
             raise OutputError(f"cannot write to {self}: {error.strerror or error}") from error
+
+
+class MemoryInput(StandardInput):
+    """Bytes that are there already, under the name of a file."""
+
+    def __init__(self, name: str, data: bytes) -> None:
+        self.name = name
+        self._data = data
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class MemoryOutput(StandardOutput):
+    """Bytes that are not to be written yet, under the name of a file; `data` is what they are."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self.data = b""
+
+    def __str__(self) -> str:
+        return self._name
+
+    def write(self, data: memoryview) -> None:
+        self.data = bytes(data)

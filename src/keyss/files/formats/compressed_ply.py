@@ -68,11 +68,6 @@ class CompressedPlyCodes(Codes):
         return len(self.positions)
 
 
-def is_compressed(start: bytes) -> bool:
-    """Whether a .ply is a compressed one, by its first bytes."""
-    return b" packed_position" in start.partition(b"end_header")[0]
-
-
 def parse(data: bytes) -> CompressedPlyCodes:
     """The codes of a file; colours without bounds, as old ones have, get 0 and 1.
 

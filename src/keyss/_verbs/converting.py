@@ -1,0 +1,121 @@
+"""`convert`: a model in another format, and what that costs the model and what is hidden in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import write_bytes
+from keyss.files.models import (
+    check_model_output,
+    keeps_low_bits,
+    model_bytes,
+    model_of_bytes,
+)
+from keyss.files.streams import StandardOutput, is_standard
+from keyss.methods.dither import cost
+from keyss.rendering import Backend, resolve_device
+from keyss.runs.config import PathLike
+from keyss.runs.folder import check_not_published
+from keyss.runs.opening import as_model, sidecar_beside
+from keyss.runs.revealing import reveal_model
+
+# Below this share of a secret's Gaussians it counts as destroyed.
+_KEPT = 0.99
+
+
+@dataclass(frozen=True)
+class KeptSecret:
+    """What a key opens before and after."""
+
+    before: int  # Gaussians
+    after: int
+
+    @property
+    def kept(self) -> bool:
+        return self.after >= _KEPT * self.before
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A model in another format."""
+
+    gaussians: Gaussians  # as they are read from it
+    bytes_before: int | None  # None: from standard input, or from memory
+    bytes_after: int
+    psnr: float  # dB between pictures of the model before and after, from around it; 120: they are the same
+    keeps_low_bits: bool  # whether the format does
+    secrets: tuple[KeptSecret, ...]  # of the keys, in their order
+
+
+@torch.no_grad()
+def convert(
+    model: PathLike | Gaussians,
+    out: PathLike,
+    keys: Sequence[str] = (),
+    *,
+    force: bool = False,
+    dry_run: bool = False,
+    overwrite: bool = False,
+    device: Backend = "auto",
+) -> Conversion:
+    """Write a model in the format that the suffix of `out` names, and measure what that costs.
+
+    What each of `keys` opens in `model`, or in the sidecar beside it, has to open from what is to be written
+    as well: else QualityError is raised and nothing is written, unless with `force`. `dry_run` writes nothing
+    at all. Without keys nothing is looked for, and nothing that comes back says whether anything is hidden.
+    Raises WrongKeyError for a key that opens nothing, InputError, OutputError, and UsageError for an unknown
+    suffix.
+    """
+    target = resolve_device(device)
+    source = None if isinstance(model, Gaussians) else Path(model)
+    path = check_model_output(out, overwrite, [source] if source else [])
+    if not is_standard(path):
+        check_not_published(path)
+    before = as_model(model)
+    beside = None if source is None else sidecar_beside(source)
+    opened = [reveal_model(before, key, device=target, beside=beside).remains.found for key in keys]
+    data = model_bytes(path, before)
+    after = model_of_bytes(path, data)
+    secrets = tuple(
+        KeptSecret(count, _left(after, key, target, beside)) for key, count in zip(keys, opened, strict=True)
+    )
+    size = None if source is None or is_standard(source) else source.stat().st_size
+    psnr = cost(before.to(target), after.to(target))
+    result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
+    lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
+    if lost and not (force or dry_run):
+        raise QualityError(_refusal(path, result, lost))
+    if dry_run:
+        return result
+    if is_standard(path):
+        StandardOutput().write(memoryview(data))
+    else:
+        write_bytes(path, data)
+    return result
+
+
+def _left(model: Gaussians, key: str, device: torch.device, beside: Path | None) -> int:
+    """How many Gaussians of its secret a key opens in a converted model, with the sidecar that there was."""
+    try:
+        return reveal_model(model, key, device=device, beside=beside).remains.found
+    except (WrongKeyError, InputError, UsageError):
+        return 0
+
+
+def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
+    """Why nothing was written."""
+    first = result.secrets[lost[0] - 1]
+    which = "the secret that the key opens" if len(result.secrets) == 1 else f"what key {lost[0]} opens"
+    left = f"{first.after:,} of its {first.before:,} Gaussians would open from {path}"
+    why = (
+        ""
+        if result.keeps_low_bits
+        else ": low bits, which hold it, do not survive that format, and .ply keeps them"
+    )
+    return f"{which} would be lost: {left}{why}; nothing was written; `force=True` writes it all the same"

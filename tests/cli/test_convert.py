@@ -1,0 +1,121 @@
+"""`keyss convert`: other formats, what they cost, and what they would destroy."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+import keyss as package
+from cli.said import PROGRAM, Said, assert_refused
+from keyss import api
+from keyss.files import read_model, write_model
+from tiny_scenes import random_gaussians
+
+VECTORS = Path(__file__).parents[1] / "vectors"
+CARRIED = VECTORS / "carried.ply"
+COUNT = 400
+Run = Callable[..., Said]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`key`, which opens carried.ply, `other`, which does not, and a plain model in several formats."""
+    folder = tmp_path_factory.mktemp("convert")
+    (folder / "key").write_text(json.loads((VECTORS / "carried.json").read_text())["key"])
+    (folder / "other").write_text("q7Rv2LxT9bWm4KzD")
+    for name in ("key", "other"):
+        os.chmod(folder / name, 0o600)
+    for suffix in ("ply", "spz", "sog", "compressed.ply", "glb", "splat"):
+        write_model(folder / f"plain.{suffix}", random_gaussians(COUNT))
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "glb", "splat", "ply"])
+def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"out.{suffix}"
+    said = keyss("convert", files / "plain.ply", out)
+    assert said.status == 0
+    first, *others = said.out.splitlines()
+    assert first.startswith(f"{out}: {COUNT} Gaussians, {out.stat().st_size / 1e3:.1f} kB, ")
+    if suffix == "ply":
+        assert first.endswith("pictures as before")
+        assert not others
+    else:
+        if suffix == "glb":  # which has all numbers, in other units
+            assert first.endswith("pictures as before")
+        else:
+            assert 25 < float(first.split("pictures at ")[1].split()[0]) < 100
+        assert others == ["what may lie in low bits does not survive this format; with a key, keyss looks"]
+    assert len(read_model(out)) == COUNT
+
+
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "glb", "splat"])
+def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path, suffix: str) -> None:
+    path = files / f"plain.{suffix}"
+    assert f"{COUNT:,}" in keyss("info", path).out
+    assert keyss("verify", path).status == 0
+    assert keyss("reveal", path, "--key-file", files / "other", "-o", files / "none.ply").status == 3
+    out = files / f"{suffix}.pictures"
+    assert keyss("render", path, "--cameras", path, "--width", "20", "-o", out).status == 0
+    assert list(out.iterdir())
+
+
+def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
+    key = ("--key-file", files / "key")
+    out = tmp_path / "out.spz"
+    refused = keyss("convert", CARRIED, out, *key)
+    assert_refused(refused, 7, "Gaussians would open from")
+    assert "nothing was written; --force writes it all the same" in refused.err
+    assert not out.exists()
+    assert "is lost: 0 Gaussians of it open" in keyss("convert", CARRIED, out, *key, "--dry-run").out
+    assert not out.exists()
+    assert keyss("convert", CARRIED, out, *key, "--force").status == 0
+    assert out.exists()
+
+
+def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.ply"
+    said = keyss("convert", CARRIED, out, "--key-file", files / "key")
+    assert said.status == 0
+    assert "Gaussians, opens as before" in said.out
+    assert keyss("reveal", out, "--key-file", files / "key", "-o", tmp_path / "secret.ply").status == 0
+
+
+def test_a_key_that_opens_nothing(keyss: Run, files: Path, tmp_path: Path) -> None:
+    said = keyss("convert", CARRIED, tmp_path / "o.ply", "--key-file", files / "other")
+    assert_refused(said, 3, "opens nothing here")
+
+
+def test_what_is_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
+    plain = files / "plain.ply"
+    assert_refused(keyss("convert", plain, tmp_path / "a.lcc"), 2, "expected a name that ends in")
+    assert_refused(keyss("convert", plain, tmp_path / "a.ksplat"), 2, "expected a name that ends in")
+    assert_refused(keyss("convert", files / "key", tmp_path / "a.ply"), 4, "expected a 3DGS model")
+    (tmp_path / "there.spz").touch()
+    assert_refused(keyss("convert", plain, tmp_path / "there.spz"), 5, "exists")
+    assert keyss("convert", plain, tmp_path / "there.spz", "--overwrite").status == 0
+    arguments = ("--cover", plain, "--secret", plain, "--method", "carry", "--key-file", files / "key")
+    assert_refused(keyss("hide", *arguments, "-o", tmp_path / "a.spz"), 2, "expected the name of a folder")
+
+
+def test_pipes(files: Path, tmp_path: Path) -> None:
+    data = (files / "plain.spz").read_bytes()
+    done = subprocess.run([*PROGRAM, "convert", "-", "-"], input=data, capture_output=True, check=False)
+    assert done.returncode == 0
+    (tmp_path / "a.ply").write_bytes(done.stdout)
+    assert torch.equal(read_model(tmp_path / "a.ply").means, read_model(files / "plain.spz").means)
+    assert b"Gaussians" in done.stderr
+
+
+def test_from_python(files: Path, tmp_path: Path) -> None:
+    model = package.read_model(files / "plain.ply")
+    found = api.convert(model, tmp_path / "a.sog")
+    assert found.bytes_after == (tmp_path / "a.sog").stat().st_size
+    assert (found.bytes_before, found.secrets, found.keeps_low_bits) == (None, (), False)
+    assert torch.equal(found.gaussians.means, read_model(tmp_path / "a.sog").means)
