@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write
@@ -43,9 +45,9 @@ def _reader(module: str) -> Callable[[Path | StandardInput], Gaussians]:
 
     def read(source: Path | StandardInput) -> Gaussians:
         try:
-            model: Gaussians = getattr(_format(module), f"read_{module}")(
-                _format("common").read_whole(source)
-            )
+            data = _format("common").read_whole(source)
+            with np.errstate(all="ignore"):  # what is not finite is reported in the end
+                model: Gaussians = getattr(_format(module), f"read_{module}")(data)
         except InputError as error:
             raise InputError(f"{source}: {error}") from error
         except OSError as error:
@@ -106,7 +108,11 @@ def read_model(path: Path | str) -> Gaussians:
     Raises InputError for a file that is missing, of no known format, named as one of another format, or not
     a whole and finite model.
     """
-    source = StandardInput() if is_standard(path) else Path(path)
+    return read_source(StandardInput() if is_standard(path) else Path(path))
+
+
+def read_source(source: Path | StandardInput) -> Gaussians:
+    """`read_model` for what is open already."""
     return _by_content(source).read(source)
 
 

@@ -44,6 +44,11 @@ def _same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
+def reason(error: Exception) -> str:
+    """What an error of a library says, as far as one line holds it: it may quote the file at any length."""
+    return str(error)[:200]
+
+
 def read_whole(source: Path | StandardInput) -> bytes:
     """All bytes of a model's file. Raises InputError for more than 4 GiB, and OSError."""
     with source.open("rb") as file:
@@ -82,7 +87,7 @@ def gaussians_of(
     """
     parts = (means, quats, log_scales, opacity_logits, np.concatenate([colors[:, None], rest], axis=1))
     with np.errstate(over="ignore", invalid="ignore"):
-        model = Gaussians(*(torch.from_numpy(np.ascontiguousarray(each, dtype=np.float32)) for each in parts))
+        model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
     wrong = [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
     if wrong:
         raise InputError(f"NaN or infinite values in {', '.join(wrong)}")

@@ -28,6 +28,7 @@ from keyss.files.formats.common import (
     log_scales_of,
     logits,
     opacities,
+    reason,
     scales_of,
     to_bytes,
     unit,
@@ -40,6 +41,8 @@ _FLOAT, _BYTE, _ARRAY = 5126, 5121, 34962
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
 _COUNTS = (1, 3, 5, 7)  # coefficients of each degree
 _MOST_DEPTH = 64  # of nodes in nodes
+_MOST_PARTS = 64  # that show Gaussians
+_LEAST_BYTES = 16  # that a Gaussian takes
 
 
 def read_glb(data: bytes) -> Gaussians:
@@ -49,14 +52,14 @@ def read_glb(data: bytes) -> Gaussians:
     """
     document, binary = _chunks(data)
     parts: list[Gaussians] = []
-    room = len(data)  # Gaussians take more than a byte each; one that is shown twice counts twice
+    room = len(data) // _LEAST_BYTES  # Gaussians; one that is shown twice counts twice
     for placed, mesh in _placed(document):
         for primitive in mesh.primitives:
             if EXTENSION not in primitive.extensions:
                 continue
             model = _gaussians(document, primitive, binary)
             room -= len(model)
-            if room < 0:
+            if room < 0 or len(parts) == _MOST_PARTS:
                 raise InputError("damaged glTF: the same Gaussians over and over")
             parts.append(_moved(model, placed))
     if not parts:
@@ -134,7 +137,7 @@ def _chunks(data: bytes) -> tuple[Document, bytes]:
     try:
         return msgspec.json.decode(found[0], type=Document), found[1]
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"the JSON of the .glb makes no sense: {error}") from error
+        raise InputError(f"the JSON of the .glb makes no sense: {reason(error)}") from error
 
 
 def _placed(document: Document) -> Iterable[tuple[Doubles, Mesh]]:

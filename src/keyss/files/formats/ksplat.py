@@ -68,8 +68,7 @@ def read_ksplat(data: bytes) -> Gaussians:
     for index in range(room):
         section = _Section(*_SECTION.unpack_from(data, _HEADER_BYTES + index * _SECTION_BYTES))
         part, at = _read(data, at, section, level, limits)
-        if section.count:
-            parts.append(part)
+        parts += [part] if part is not None else []
     if sum(len(part) for part in parts) != count:
         raise InputError(f"damaged .ksplat: its sections do not have {count:,} Gaussians")
     degree = max(part.sh_degree for part in parts)
@@ -78,8 +77,8 @@ def read_ksplat(data: bytes) -> Gaussians:
 
 def _read(
     data: bytes, at: int, section: _Section, level: int, limits: tuple[float, float]
-) -> tuple[Gaussians, int]:
-    """The Gaussians of a section whose bytes begin at `at`, and where the next one's do."""
+) -> tuple[Gaussians | None, int]:
+    """The Gaussians of a section whose bytes begin at `at`, if it has any, and where the next one's do."""
     if section.degree >= len(_COEFFICIENTS):
         raise InputError(f"expected harmonics of degree 0 to 3 in a .ksplat, found {section.degree}")
     position, number, harmonic = _TYPES[level]
@@ -95,6 +94,8 @@ def _read(
     end = rows_at + section.room * row.itemsize
     if end > len(data) or section.count > section.room or (level and section.bucket_bytes != 12):
         raise InputError("not a whole .ksplat: a section lies outside of it")
+    if section.count == 0:
+        return None, end
     rows = np.frombuffer(data, row, section.count, rows_at)
     means = rows["mean"].astype(np.float64)
     if level:

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from keyss.core.errors import InputError
-from keyss.files.formats.common import Bytes
+from keyss.files.formats.common import Bytes, reason
 from keyss.files.reading import read_file
 from keyss.files.streams import MOST_BYTES
 
@@ -23,6 +23,13 @@ _MOST_META_BYTES = 1 << 20
 _MOST_MEMBERS = 64
 _SMALL_IMAGE = 1 << 16  # pixels; larger ones may have four times the pixels that are needed
 _DATE = (1980, 1, 1, 0, 0, 0)  # so that equal models make equal files
+
+
+# What zipfile raises for archives that are damaged, or packed in ways that it does not know.
+_BROKEN = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError),
+    *(ValueError, NotImplementedError, RuntimeError, OverflowError),
+)
 
 
 class Images(msgspec.Struct):
@@ -79,7 +86,7 @@ def read_meta(data: bytes) -> Meta:
             raise InputError(f"expected SOG of version 2, found {version}")
         meta = msgspec.json.decode(data, type=Meta)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"the meta.json of a SOG makes no sense: {error}") from error
+        raise InputError(f"the meta.json of a SOG makes no sense: {reason(error)}") from error
     needed = [(meta.means.files, 2), (meta.scales.files, 1), (meta.quats.files, 1), (meta.sh0.files, 1)]
     needed += [(meta.shN.files, 2)] if meta.shN else []
     if any(len(files) < count for files, count in needed):
@@ -93,8 +100,8 @@ def opened(data: bytes) -> zipfile.ZipFile:
     """The archive. Raises InputError."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error, OverflowError) as error:
-        raise InputError(f"not a whole SOG: {error}") from error
+    except _BROKEN as error:
+        raise InputError(f"not a whole SOG: {reason(error)}") from error
     if len(archive.infolist()) > _MOST_MEMBERS:
         raise InputError(
             f"expected a SOG of at most {_MOST_MEMBERS} files, found {len(archive.infolist()):,}"
@@ -111,22 +118,19 @@ def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
             info = archive.getinfo(name)
             most = max(_MOST_META_BYTES, 2 * size)
             if info.file_size > most:
-                raise InputError(f"damaged SOG: {name} unpacks to {info.file_size:,} bytes")
+                raise InputError(f"damaged SOG: {name[:80]!r} unpacks to {info.file_size:,} bytes")
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise InputError(
+                    f"damaged SOG: {name[:80]!r} is packed by neither of the ways that readers know"
+                )
             with archive.open(info) as file:
                 return file.read(most)
         except KeyError as error:
             raise InputError(
                 f"not a SOG: there is no {name[:80]!r} in the archive; unpack it if it is another"
             ) from error
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-        ) as error:
-            raise InputError(f"damaged SOG: {name[:80]!r}: {error}") from error
+        except _BROKEN as error:
+            raise InputError(f"damaged SOG: {name[:80]!r}: {reason(error)}") from error
 
     return read
 
@@ -170,7 +174,7 @@ def pixels(data: bytes, count: int, width: int | None = None) -> Bytes:
                     raise InputError("damaged SOG: an image of two sizes")
                 decoded = np.asarray(image.convert("RGBA")).reshape(-1, 4)
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
-        raise InputError(f"damaged SOG: an image cannot be read: {error}") from error
+        raise InputError(f"damaged SOG: an image cannot be read: {reason(error)}") from error
     return decoded[:count]
 
 

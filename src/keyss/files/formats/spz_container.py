@@ -13,7 +13,7 @@ import numpy as np
 import zstandard
 
 from keyss.core.errors import InputError
-from keyss.files.formats.common import Bytes, check_count, check_sh_degree
+from keyss.files.formats.common import Bytes, check_count, check_sh_degree, reason
 
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
 EXTENSIONS = 2  # the flag that there are some
@@ -83,7 +83,7 @@ def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
         if not stream.eof:  # gzip's checksum comes last, and is looked at then
             body += stream.decompress(stream.unconsumed_tail, 1)
     except zlib.error as error:
-        raise InputError(f"damaged SPZ: {error}") from error
+        raise InputError(f"damaged SPZ: {reason(error)}") from error
     size = sum(header.sizes)
     if len(body) < size or not stream.eof:
         found = "cut short" if len(body) < size or not stream.unconsumed_tail else "more than was announced"
@@ -124,7 +124,7 @@ def _zstd(packed: bytes, size: int) -> Bytes:
         with zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW).stream_reader(packed) as reader:
             body = reader.read(size)
     except zstandard.ZstdError as error:
-        raise InputError(f"damaged SPZ: {error}") from error
+        raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) != size:
         raise InputError(f"not a whole SPZ: expected a stream of {size:,} bytes, found {len(body):,}")
     return np.frombuffer(body, np.uint8)

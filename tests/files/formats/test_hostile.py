@@ -1,0 +1,300 @@
+"""Files from strangers: a model or an InputError, in time and memory that the file's own size bounds."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import time
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+from PIL import Image
+
+from files.formats.examples import model_of
+from keyss.core.errors import InputError
+from keyss.files import read_model, write_model
+from keyss.files.formats import glb, sog, spz
+from keyss.files.models import MemoryInput, model_bytes, read_source
+from mutations import attempt, damaged, examples
+
+MODEL = model_of(60, 1)
+MEGABYTE = 1 << 20
+
+
+def refused(name: str, data: bytes, words: str, *, most: int = 8 * MEGABYTE) -> None:
+    """That `data` end in an InputError with `words`, soon and without `most` bytes of memory."""
+    tracemalloc.start()
+    start = time.perf_counter()
+    with pytest.raises(InputError, match=words):
+        read_source(MemoryInput(name, data))
+    assert time.perf_counter() - start < 5
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < most, f"{peak:,} bytes"
+
+
+@pytest.mark.parametrize("name", examples())
+def test_damaged_files(name: str) -> None:
+    for data in examples()[name]:
+        assert attempt(name, data) is None
+        for number in range(150):
+            mutated = damaged(data, np.random.default_rng([7, number]))
+            assert attempt(name, mutated) is None, number
+
+
+@pytest.mark.parametrize("name", [name for name in examples() if name != "a.ply"])
+def test_truncated_files(name: str) -> None:
+    data = examples()[name][-1]
+    for end in np.linspace(0, len(data) - 1, 80).astype(int).tolist():
+        if name == "a.splat" and end and end % 32 == 0:
+            continue  # a smaller model
+        with pytest.raises(InputError):
+            read_source(MemoryInput(name, data[:end]))
+
+
+# --- counts that no file can hold ------------------------------------------------------------------------
+
+
+def legacy_spz(count: int, body: bytes = b"", *, version: int = 3, degree: int = 0, bits: int = 12) -> bytes:
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, 0, 0) + body)
+
+
+@pytest.mark.parametrize("count", [2**31, 2**32 - 1, 10**6])
+def test_counts_beyond_all_measure(count: int) -> None:
+    refused("a.spz", legacy_spz(count, bytes(5000)), f"it announces {count:,} Gaussians, more than")
+    header = struct.pack("<4sIIBBBBI12s", b"NGSP", 4, count, 0, 12, 0, 5, 32, bytes(12))
+    refused("a.spz", header + bytes(500), "it announces")
+    ply = f"ply\nformat binary_little_endian 1.0\nelement chunk {count // 256}\nproperty float min_x\n"
+    ply += f"element vertex {count}\nproperty uint packed_position\nend_header\n"
+    refused("a.ply", ply.encode() + bytes(500), "the header announces")
+    refused("a.sog", with_meta(lambda meta: meta.update(count=count)), "it announces")
+    refused(
+        "a.glb", with_json(lambda gltf: gltf["accessors"][0].update(count=count)), "leads out of its data"
+    )
+    ksplat = bytearray(examples()["a.ksplat"][0])
+    ksplat[16:20] = struct.pack("<I", count)
+    refused("a.ksplat", bytes(ksplat), "it announces|do not have")
+
+
+def test_no_gaussians_at_all() -> None:
+    refused("a.spz", legacy_spz(0), "holds no Gaussians")
+    refused("a.sog", with_meta(lambda meta: meta.update(count=0)), "holds no Gaussians")
+    refused("a.splat", b"", "an empty file")
+
+
+# --- bombs -----------------------------------------------------------------------------------------------
+
+
+def test_a_gzip_bomb() -> None:
+    bomb = legacy_spz(1000, bytes(200 * MEGABYTE))
+    refused("a.spz", bomb, "found more than was announced", most=20 * MEGABYTE)
+
+
+def test_a_zstd_bomb() -> None:
+    """A stream that says and holds more than the header announces: only what is needed is unpacked."""
+    codes = spz.quantise(MODEL, version=4)
+    data = spz.serialise(codes)
+    bomb = zstandard.ZstdCompressor().compress(bytes(200 * MEGABYTE))
+    old = struct.unpack_from("<Q", data, 32)[0]
+    start = 32 + 6 * 16
+    changed = data[:32] + struct.pack("<Q", len(bomb)) + data[40:start] + bomb + data[start + old :]
+    tracemalloc.start()
+    read_source(MemoryInput("a.spz", changed))
+    assert tracemalloc.get_traced_memory()[1] < 4 * MEGABYTE
+    tracemalloc.stop()
+
+
+def archive(files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", compression) as found:
+        for name, content in files.items():
+            found.writestr(name, content)
+    return data.getvalue()
+
+
+def contents(data: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(data)) as found:
+        return {name: found.read(name) for name in found.namelist()}
+
+
+def with_meta(change: Callable[[dict], object], **files: bytes) -> bytes:
+    """A .sog whose meta.json was changed, and files in it."""
+    inside = contents(sog.write_sog(MODEL))
+    meta = json.loads(inside["meta.json"])
+    change(meta)
+    inside["meta.json"] = json.dumps(meta).encode()
+    return archive(inside | {f"{name}.webp": content for name, content in files.items()})
+
+
+def test_a_zip_bomb() -> None:
+    inside = contents(sog.write_sog(MODEL))
+    for name in ("meta.json", "means_l.webp"):
+        bomb = archive(inside | {name: bytes(200 * MEGABYTE)}, zipfile.ZIP_DEFLATED)
+        refused("a.sog", bomb, "unpacks to 209,715,200 bytes")
+    lzma = archive(inside, zipfile.ZIP_LZMA)
+    refused("a.sog", lzma, "packed by neither of the ways")
+
+
+def webp(width: int, height: int) -> bytes:
+    data = io.BytesIO()
+    Image.new("RGBA", (width, height)).save(data, "WEBP", lossless=True, quality=0, method=0)
+    return data.getvalue()
+
+
+def test_a_webp_of_huge_size() -> None:
+    """Its header says so; 1 GB would be what its few bytes unpack to."""
+    small = bytearray(webp(16, 16))
+    small[21:25] = struct.pack("<I", 16382 | 16382 << 14)
+    for image in (bytes(small), webp(4000, 4000)):
+        for name in ("means_l", "quats", "shN_labels", "shN_centroids"):
+            # numpy's and Python's memory is counted here, and a canvas of Pillow's is neither
+            start = time.perf_counter()
+            refused("a.sog", with_meta(lambda meta: None, **{name: image}), "damaged SOG")
+            assert time.perf_counter() - start < 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda meta: meta["means"].update(mins=[0, 0, 1e999]), "makes no sense"),
+        (lambda meta: meta["means"].update(maxs=[0, 0, 1e300]), "not finite|infinite"),
+        (lambda meta: meta["means"].update(mins=[0, 0]), "no bounds of three coordinates"),
+        (lambda meta: meta["scales"].update(codebook=[1e200] * 256), "not finite"),
+        (lambda meta: meta["scales"].update(codebook=[0.0] * 300), "at most 256"),
+        (lambda meta: meta["quats"].update(files=[]), "fewer images"),
+        (lambda meta: meta["quats"].update(files=["../../etc/passwd"]), "not a SOG: there is no"),
+        (lambda meta: meta["shN"].update(count=10), "beyond the end of its palette"),
+        (lambda meta: meta["shN"].update(count=10**9), "beyond the end of its palette"),
+        (lambda meta: meta["shN"].update(bands=4), "degree 0 to 3"),
+        (lambda meta: meta["shN"].update(bands=3), "expected an image of"),
+        (lambda meta: meta.update(version=3), "expected SOG of version 2, found 3"),
+        (lambda meta: meta.pop("version"), "expected SOG of version 2, found 1"),
+    ],
+)
+def test_a_meta_json_that_lies(change: Callable[[dict], object], words: str) -> None:
+    refused("a.sog", with_meta(change), words)
+
+
+def test_a_folder_of_sog_is_not_left(tmp_path: Path) -> None:
+    for name, content in contents(sog.write_sog(MODEL)).items():
+        (tmp_path / name).write_bytes(content)
+    assert len(read_model(tmp_path / "meta.json")) == len(MODEL)
+    (tmp_path / "inside").mkdir()
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    meta["quats"]["files"] = ["../quats.webp"]
+    for name in contents(sog.write_sog(MODEL)):
+        (tmp_path / "inside" / name).write_bytes((tmp_path / name).read_bytes())
+    (tmp_path / "inside" / "meta.json").write_text(json.dumps(meta))
+    with pytest.raises(InputError, match=r"there is no '\.\./quats\.webp' beside it"):
+        read_model(tmp_path / "inside" / "meta.json")
+
+
+# --- versions, and numbers that are none -----------------------------------------------------------------
+
+
+def test_versions_that_are_not_read() -> None:
+    refused("a.spz", legacy_spz(1, bytes(100), version=1), "version 1")
+    refused("a.spz", legacy_spz(1, bytes(100), version=9), "version 2 or 3")
+    refused("a.spz", legacy_spz(1, bytes(900), degree=4), "degree 0 to 3")
+    refused("a.spz", legacy_spz(1, bytes(100), bits=60), "fractional bits")
+    refused("a.spz", gzip.compress(b"something else entirely"), "the gzip data do not hold one")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_none(value: float) -> None:
+    splat = bytearray(model_bytes("a.splat", MODEL))
+    splat[4:8] = struct.pack("<f", value)
+    refused("a.splat", bytes(splat), "NaN or infinite values in means")
+    compressed = model_bytes("a.compressed.ply", MODEL)
+    at = compressed.index(b"end_header\n") + 11
+    refused("a.ply", compressed[:at] + struct.pack("<f", value) + compressed[at + 4 :], "NaN or infinite")
+    binary = glb.write_glb(MODEL)
+    at = binary.index(b"BIN\0") + 4
+    refused("a.glb", binary[:at] + struct.pack("<f", value) + binary[at + 4 :], "NaN or infinite")
+
+
+def test_scales_of_zero_and_below() -> None:
+    splat = bytearray(model_bytes("a.splat", MODEL))
+    splat[12:16] = struct.pack("<f", 0.0)
+    assert float(read_source(MemoryInput("a.splat", bytes(splat))).log_scales.min()) < -80
+    splat[12:16] = struct.pack("<f", -1.0)
+    refused("a.splat", bytes(splat), "NaN or infinite values in log_scales")
+
+
+# --- glTF ------------------------------------------------------------------------------------------------
+
+
+def with_json(change: Callable[[dict], object]) -> bytes:
+    data = glb.write_glb(MODEL)
+    (size,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    start = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest))
+    return start + struct.pack("<I4s", len(text), b"JSON") + text + rest
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda gltf: gltf["nodes"][0].update(children=[0]), "its nodes are no tree"),
+        (lambda gltf: gltf["nodes"][0].update(children=[7]), "a part that is not there"),
+        (lambda gltf: gltf["nodes"][0].update(scale=[1, 2, 1]), "move, turn and scale them evenly"),
+        (lambda gltf: gltf["nodes"][0].update(scale=[0, 0, 0]), "move, turn and scale them evenly"),
+        (lambda gltf: gltf["nodes"][0].update(rotation=[0, 0, 0, 0]), "no proper transform"),
+        (lambda gltf: gltf["nodes"][0].update(mesh=3), "a part that is not there"),
+        (lambda gltf: gltf["meshes"][0]["primitives"][0].pop("extensions"), "without Gaussians"),
+        (lambda gltf: gltf["accessors"][2].update(bufferView=99), "buffer view that is not there"),
+        (lambda gltf: gltf["accessors"][0].update(byteOffset=-4), "leads out of its data"),
+        (lambda gltf: gltf["accessors"][2].update(type="VEC3"), "4 numbers each"),
+        (lambda gltf: gltf["accessors"][3].update(count=3), "different lengths"),
+        (lambda gltf: gltf["buffers"][0].update(uri="https://example.org/a.bin"), "these lie elsewhere"),
+        (lambda gltf: gltf["bufferViews"][0].update(byteOffset=10**9), "leads out of its data"),
+    ],
+)
+def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
+    refused("a.glb", with_json(change), words)
+
+
+def test_a_gltf_that_shows_the_same_over_and_over() -> None:
+    def change(gltf: dict) -> None:
+        gltf["nodes"] = [{"mesh": 0}] * 20_000
+        gltf["scenes"][0]["nodes"] = list(range(20_000))
+
+    refused("a.glb", with_json(change), "over and over", most=32 * MEGABYTE)
+
+
+def test_nodes_move_gaussians() -> None:
+    def change(gltf: dict) -> None:
+        gltf["nodes"] = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}]
+
+    found = read_source(MemoryInput("a.glb", with_json(change)))
+    expected = MODEL.means.numpy() * 2 + np.array([1, 2, 3], np.float32)
+    expected[:, :2] *= -1  # from y up to y down
+    assert np.allclose(found.means.numpy(), expected, atol=1e-5)
+    assert np.allclose(found.log_scales.numpy(), MODEL.log_scales.numpy() + np.log(2), atol=1e-5)
+
+
+def test_deep_json_is_no_problem(tmp_path: Path) -> None:
+    deep = b"[" * 100_000
+    refused("a.sog", archive({"meta.json": deep}), "makes no sense", most=32 * MEGABYTE)
+    with pytest.raises(InputError):
+        glb.read_glb(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(deep), len(deep), b"JSON") + deep)
+
+
+def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:
+    """Up to a quarter of a million equal Gaussians, whatever they pack to."""
+    model = MODEL[torch.zeros(100_000, dtype=torch.long)]
+    write_model(tmp_path / "a.spz", replace(model))
+    assert len(read_model(tmp_path / "a.spz")) == 100_000
