@@ -56,7 +56,7 @@ def test_another_folder_in_place_of_a_model_is_called_one(keyss: Keyss, world: P
         ("render", world / "a", "--cameras", world / "a"),
     ):
         said = keyss(*arguments, "-o", tmp_path / "out.ply")
-        assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.ply), found a folder")
+        assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.compressed.ply, ")
 
 
 @pytest.mark.parametrize("inside", ["publish/stego.ply", "publish", "private", "private/config.json"])
@@ -103,7 +103,7 @@ def test_foreign_files_are_called_what_they_are(keyss: Keyss, world: Path, tmp_p
         assert_refused(said, 4, f"found {kind}")
         assert str(path) in said.err
         assert advice in said.err
-    assert "expected a scene folder or a 3DGS model (.ply)" in said.err
+    assert "expected a scene folder or a 3DGS model (.compressed.ply, .ply" in said.err
     assert listing(tmp_path) == before
 
 

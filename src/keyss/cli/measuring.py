@@ -27,7 +27,7 @@ def evaluate(
 ) -> None:
     """Measure a hiding run on test views, with the keys and with wrong ones.
 
-    Test views are photos that were not trained on or, of a .ply model, renders of it. Beside each number
+    Test views are photos that were not trained on or, of a model, renders of it. Beside each number
     stands the baseline, which is that of the scene's plain model (3DGS with nothing hidden). Chance level is
     what the stego model itself reaches against the secret: a wrong key should not get above it.
 
