@@ -197,7 +197,7 @@ def _read_ascii(
 
 
 def _tokens(file: BinaryIO) -> Iterator[bytes]:
-    """What white space separates, however long the lines are. Raises ValueError for what is no number's length."""
+    """What white space separates, however long the lines are; ValueError for what is longer than a number."""
     rest = b""
     while data := file.read(_CHUNK_BYTES):
         *whole, rest = re.split(rb"[ \t\r\n\f\v]+", rest + data)
