@@ -3,8 +3,9 @@
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
 In each model one secret is hidden alone, and beside one to three others, as carried models and as sealed
-payloads. The holder opens his own, tries every cell of the file with his key (`tests/channels/low_bits/holder.py`)
-and takes the statistics of `keyss.measure.stealth` besides. Detectors learn from all scenes but one.
+payloads. The holder opens his own, tries every cell of the file with his key
+(`tests/channels/low_bits/holder.py`), and takes the statistics of `keyss.measure.stealth` besides. Detectors
+learn from all scenes but one.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from channels.low_bits import payloads
 from channels.low_bits.holder import seen_by_holder
 from channels.low_bits.trained_like import keys
+from keyss.core import UsageError
 from keyss.files.models import read_model
 from keyss.measure.stealth.detection import Examples, learned_detectors, single_detectors
 from keyss.measure.stealth.suite import stealth_statistics
@@ -60,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     started = time.monotonic()
     with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
-        seen = list(pool.map(_seen, jobs))
+        results = list(pool.map(_seen, jobs))
+    jobs, seen = zip(*[each for each in zip(jobs, results, strict=True) if each[1]], strict=True)
     print(f"{len(jobs)} models of {len({job.scene for job in jobs})} scenes, ", end="")
     print(f"{time.monotonic() - started:.0f} s\n")
     print("| secret | detector | AUC | standard error | largest by chance |\n| --- | --- | --- | --- | --- |")
@@ -82,8 +85,19 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _seen(job: Job) -> dict[tuple[str, int], dict[str, float]]:
-    """By kind, and alone (0) or beside others (1): what the holder of the first key counts."""
+def _seen(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:
+    """By kind, and alone (0) or beside others (1): what the holder of the first key counts.
+
+    None for a cover that is too small for several secrets.
+    """
+    try:
+        return _counted(job)
+    except UsageError as error:
+        print(f"{job.cover}: {error}", file=sys.stderr)
+        return None
+
+
+def _counted(job: Job) -> dict[tuple[str, int], dict[str, float]]:
     random = np.random.default_rng(job.index)
     cover = read_model(job.cover)
     secrets = [
