@@ -188,7 +188,7 @@ def test_interrupted_at_any_stage_it_resumes_to_the_same_result(
     with pytest.raises(Interrupted):
         run(False, _InterruptAt("plain model of the secret", 17))
     with pytest.raises(Interrupted):
-        run(True, _InterruptAt("hide", 23))
+        run(True, _InterruptAt("hide" if sidecar else "refit", 23))
     resumed = run(True)
     assert _same(resumed.stego, whole.stego)
     assert resumed.sidecar == whole.sidecar

@@ -81,17 +81,18 @@ class LearnedMethod:
         if options.in_records:
             gaussians = fit.max_gaussians if cover is None else len(cover)
             carriers = carriers_of(cover, gaussians, fit.sh_degree)
-            capacity = sum(secret_sizes(sizes[1:], gaussians, carriers, options))
+            drawn = [0, *secret_sizes(sizes[1:], gaussians, carriers, options)]
         else:
             gaussians = min(fit.max_gaussians, sum(sizes))
             weights = [1.0] + [options.secret_share] * (len(sizes) - 1)
-            capacity = sum(divided(sizes, weights, fit.max_gaussians)[1:])
+            drawn = divided(sizes, weights, fit.max_gaussians)
         return Outlook(
             gaussians=gaussians,
             sh_degree=fit.sh_degree,
             asked=sum(sizes[1:]),
-            capacity=capacity,
+            capacity=sum(drawn[1:]),
             steps=fit.iterations,
+            drawn=tuple(drawn),
             notes=tuple(notes),
         )
 

@@ -55,7 +55,7 @@ def hide_refitted(
             replace(fit, seed=fit.seed_of(f"secret {index}")),
             rate=options.warm_rate,
             device=context.device,
-            title="hide" if len(secrets) == 1 else f"hide, secret {index} of {len(secrets)}",
+            title="refit of the secret" if len(secrets) == 1 else f"refit of secret {index}",
             checkpoint=context.checkpoints / f"secret-{index}.safetensors" if context.checkpoints else None,
             resume=context.resume,
             reporter=context.reporter,
