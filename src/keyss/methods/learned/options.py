@@ -41,8 +41,7 @@ class LearnedOptions(MethodOptions):
     poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
     densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
     # Steps at which all scenes are drawn from one pose, photo or plain model's render; at the others each is
-    # drawn from a pose of its own and compared with its photo. The paper has the first kind only. Scenes
-    # that share no Gaussians (`in_records`) have the second kind only.
+    # drawn from a pose of its own and compared with its photo. The paper has the first kind only.
     common_poses: float = 0.1
 
     mask: Annotated[  # theta
@@ -110,11 +109,17 @@ class LearnedOptions(MethodOptions):
                 f"mask {','.join(self.mask)} with start {self.start} needs a network"
             )
 
+        if self.in_records and (self.decoder != "remap" or self.key_encoder != "argon2"):
+            raise UsageError(
+                "secrets in the low bits of the cover have no decoder that a mask or an encoder of keys "
+                'could be for; `sidecar=True` or `start="points"` gives them one'
+            )
+
     @property
     def in_records(self) -> bool:
-        """Whether secrets are published in the low bits of the cover's own Gaussians.
+        """Whether secrets are published as Gaussians in the low bits of the cover's, which stay as they are.
 
-        Otherwise the published model has Gaussians of the secrets, or some that it shares with them.
+        Otherwise cover and secrets are trained together, and a key opens a decoder.
         """
         return self.start == "warm" and not self.sidecar
 
