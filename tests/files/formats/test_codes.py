@@ -225,6 +225,8 @@ def test_codebooks_are_good() -> None:
     assert np.square(errors[rare]).mean() < 0.7 * np.square(others[rare]).mean()
     mixed = np.concatenate([values[:5000], np.zeros(5000, np.float32)])  # half of them equal
     assert np.square(codebook_of(mixed)[nearest(codebook_of(mixed), mixed)] - mixed).mean() < 4e-5
+    some = values[:300]
+    assert np.abs(codebook_of(some)[nearest(codebook_of(some), some)] - some).max() < 0.1
     few = np.array([3, 1, 2, 1], np.float32)
     assert np.array_equal(codebook_of(few)[nearest(codebook_of(few), few)], few)
 

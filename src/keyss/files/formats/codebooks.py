@@ -30,7 +30,7 @@ def codebook_of(values: Floats) -> Floats:
     if len(distinct) <= SIZE:
         padded: Floats = np.pad(distinct, (0, SIZE - len(distinct)), mode="edge").astype(np.float32)
         return padded
-    at = np.linspace(0, len(ordered) - 1, _BINS + 1).astype(int)
+    at = np.unique(np.linspace(0, len(ordered) - 1, _BINS + 1).astype(int))
     width = np.maximum(np.diff(ordered[at]), _LEAST_WIDTH * (distinct[-1] - distinct[0]))
     density = np.diff(at) / width
     # The best density of numbers is the third root of the density that counts (Panter and Dite 1951).
