@@ -35,7 +35,7 @@ class LearnedOptions(MethodOptions):
 
     start: Annotated[
         Literal["warm", "points"],
-        CommandLineOption("Start from plain models, or from sparse points (the paper's)."),
+        CommandLineOption("Start from plain models, or all together from sparse points (the paper's)."),
     ] = "warm"
     points: Scenes = "both"  # start from points: whose sparse points (combined SfM initialisation)
     poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
@@ -47,7 +47,7 @@ class LearnedOptions(MethodOptions):
     mask: Annotated[  # theta
         Mask,
         CommandLineOption(
-            "Attributes that the decoder changes, some of these; more than op take a network.",
+            "Attributes that the decoder of --sidecar or --start points changes, some of these.",
             metavar="op,ro,sc,xyz,sh",
             parse=parse_mask,
         ),
@@ -63,7 +63,7 @@ class LearnedOptions(MethodOptions):
     weight_decay: float = 1e-4
     key_encoder: Annotated[
         Literal["argon2", "clip"],
-        CommandLineOption("What conditions the decoder; the encryption is always under Argon2id's key."),
+        CommandLineOption("What conditions that decoder; the encryption is always under Argon2id's key."),
     ] = "argon2"
     clip_model: Annotated[
         str | None,
@@ -71,7 +71,10 @@ class LearnedOptions(MethodOptions):
     ] = None
     sidecar: Annotated[
         bool,
-        CommandLineOption("Write the encrypted payloads to decoder.sealed, not into low bits of stego.ply."),
+        CommandLineOption(
+            "For files that will be quantised: secrets lie in the model as transparent Gaussians, and what "
+            "finds them in decoder.sealed."
+        ),
     ] = False
 
     cover_weight: float = 0.5  # beta_cover
