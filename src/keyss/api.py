@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from keyss._verbs.asking import Secret
+    from keyss._verbs.filing import HideFilesResult, SecretFile, hide_files, reveal_file
     from keyss._verbs.fitting import fit
     from keyss._verbs.hiding import HideResult, hide
     from keyss._verbs.looking import evaluate, render
@@ -19,18 +20,23 @@ if TYPE_CHECKING:
 
 __all__ = ["HideResult", "Secret", "audit", "evaluate", "fit", "hide", "plan", "render", "reveal"]
 __all__ += ["reveal_counted", "verify", "write_report"]
+__all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
 
 _HOMES = {
+    "HideFilesResult": "_verbs.filing",
     "HideResult": "_verbs.hiding",
     "Secret": "_verbs.asking",
+    "SecretFile": "_verbs.filing",
     "audit": "audit.run",
     "evaluate": "_verbs.looking",
     "fit": "_verbs.fitting",
     "hide": "_verbs.hiding",
+    "hide_files": "_verbs.filing",
     "plan": "_verbs.planning",
     "render": "_verbs.looking",
     "reveal": "_verbs.opening",
     "reveal_counted": "_verbs.opening",
+    "reveal_file": "_verbs.filing",
     "verify": "_verbs.opening",
     "write_report": "report.page",
 }
