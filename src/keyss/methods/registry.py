@@ -8,10 +8,12 @@ from keyss.channels.sidecar import decrypt_slots, read_header
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
+from keyss.methods import hidden_file
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
 from keyss.methods.carry.options import CarryOptions as CarryOptions
 from keyss.methods.decoy import Decoy
+from keyss.methods.hidden_file import HiddenFile
 from keyss.methods.learned.method import LearnedMethod
 from keyss.methods.learned.options import LearnedOptions as LearnedOptions
 
@@ -48,9 +50,9 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
             if not decoy:
                 raise
             return Decoy.of(stego, derived)
-    reader = LowBitsReader.of(stego)
     if not decoy:
-        return _unpacked(reader.open(key))
+        return _unpacked(open_content(stego, key))
+    reader = LowBitsReader.of(stego)
     for derived in reader.keys(key, 1):
         try:
             return _unpacked(reader.extract(derived))
@@ -59,7 +61,18 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
     raise WrongKeyError("this key opens nothing here")
 
 
+def open_content(stego: Gaussians, key: str) -> Content:
+    """What `key` opens in the low bits of `stego`, whoever reads it. Raises WrongKeyError and InputError."""
+    return LowBitsReader.of(stego).open(key)
+
+
 def _unpacked(content: Content) -> Opened:
+    if content.method == hidden_file.NAME:
+        size = len(HiddenFile.of(content).data)
+        raise InputError(
+            f"this key opens a file of {size:,} bytes, not a scene: take a name for it that does not end as "
+            "that of a model (keyss.api.reveal_file)"
+        )
     if content.method not in METHODS:
         raise InputError(
             f"the secret was hidden by the method {content.method!r}; this program has {', '.join(METHODS)}"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -98,13 +99,21 @@ def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, d
     """
     data = read_sidecar(Path(sidecar)) if isinstance(sidecar, str | Path) else sidecar
     try:
-        return registry.open_model(stego, key, sidecar=data, decoy=decoy)
-    except WrongKeyError as error:
-        raise WrongKeyError(OPENS_NOTHING) from error
+        with naming_what_opens_nothing():
+            return registry.open_model(stego, key, sidecar=data, decoy=decoy)
     except InputError as error:
         if isinstance(sidecar, str | Path):
             raise InputError(f"{sidecar}: {error}") from error
         raise
+
+
+@contextmanager
+def naming_what_opens_nothing() -> Iterator[None]:
+    """A key that opens nothing is told so in the same words whatever there is."""
+    try:
+        yield
+    except WrongKeyError as error:
+        raise WrongKeyError(OPENS_NOTHING) from error
 
 
 def read_sidecar(path: Path) -> bytes:
