@@ -45,11 +45,11 @@ def hide(
     ],
     secret: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("SCENE", "Scene or model to hide in it; at least one.", "give --secret-file"),
+        optional("SCENE", "Scene or model to hide in it, once for each secret.", "files are hidden"),
     ] = (),
     secret_file: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Any file to hide in a cover that is a model, instead of scenes.", "none"),
+        optional("FILE", "Any file to hide, in a cover that is a model; once for each.", "scenes are hidden"),
     ] = (),
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
