@@ -1,0 +1,124 @@
+"""Reading a payload with nothing but a model and a key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from keyss.channels.robust.carriers import CELL, Carriers, Numbers
+from keyss.channels.robust.channel import Key, derive
+from keyss.channels.robust.fountain import Fountain
+from keyss.channels.robust.header import (
+    CLASSES,
+    DATA_KEY_BYTES,
+    LEVELS,
+    Header,
+    bucket_bytes,
+    class_of,
+    places,
+    read_header,
+)
+from keyss.channels.robust.payload import decrypt_payload
+from keyss.channels.robust.salts import SALTS, Salts
+from keyss.core.errors import InputError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+
+_OPENS_NOTHING = "this key opens nothing here"
+_DAMAGED = (
+    "the key is right, but too much of the model was lost or changed since something was hidden in it: what is "
+    "left is not enough to read it"
+)
+_GARBAGE = (0.08, 0.5)  # shares of carriers that may hold something else: ordinary files, merged ones
+_ROUNDS = 60
+_MOST_RATE = 2.0  # data bits for each code bit; a writer stays below a half
+_CELLS_AROUND = (0, 1, -1)  # where a writer may have had its zero, in cells
+_FINEST = 0.02  # steps in which it is looked for in a model that was scaled
+_REFINED = 0.001
+
+
+def extract(model: Gaussians, key: Key) -> bytes:
+    """The payload that `key` opens. Raises WrongKeyError where it opens nothing, InputError for what is damaged.
+
+    Takes about 0.1 s for each of eight salts, and as long for a key that opens nothing.
+    """
+    return Reader(Numbers.of(model)).read(key)
+
+
+class Reader:
+    """A model as a reader sees it."""
+
+    def __init__(self, numbers: Numbers) -> None:
+        self._numbers = numbers
+        self._salts = Salts.of(numbers)
+
+    def read(self, key: Key) -> bytes:
+        """See `extract`."""
+        secrets = [
+            derive(key, salt).expand("robust/header", 32) for salt in self._salts.salts[:SALTS]
+        ]
+        damaged: set[bytes] = set()
+        for header, carriers in self._headers(secrets):
+            if header.data_key in damaged:
+                continue
+            for garbage in _GARBAGE:
+                payload = _payload(header, carriers, garbage)
+                if payload is not None:
+                    return payload
+            damaged.add(header.data_key)
+        if damaged:
+            raise InputError(_DAMAGED)
+        raise WrongKeyError(_OPENS_NOTHING)
+
+    def _headers(self, secrets: list[bytes]) -> Iterator[tuple[Header, Carriers]]:
+        """What the key opens, each with the carriers under the names that it was found with."""
+        found = False
+        for offset in self._offsets():
+            carriers = self._numbers.carriers(offset)
+            for secret in secrets:
+                header = read_header(secret, carriers)
+                if header is not None:
+                    found = True
+                    refined = self._refined(header, offset, carriers)
+                    yield header, _without_headers(refined, secrets)
+        if not found:  # the same work as where there is something
+            header = Header(bytes(DATA_KEY_BYTES), len(LEVELS) // 2, 0, (1 << CLASSES) - 1, 0)
+            _payload(header, self._numbers.carriers(0.0), _GARBAGE[0])
+
+    def _offsets(self) -> Iterator[float]:
+        """What the writer may have taken for a log scale of zero, the likeliest first."""
+        size = self._numbers.size
+        whole = round(size / CELL) * CELL
+        yield from (whole + cells * CELL for cells in _CELLS_AROUND)
+        steps = int(CELL / _FINEST)
+        yield from (size + step * _FINEST for step in sorted(range(-steps, steps + 1), key=abs))
+
+    def _refined(self, header: Header, offset: float, carriers: Carriers) -> Carriers:
+        """The carriers under better names, where the model was scaled: those that fit the lattice best."""
+        if offset % CELL == 0:
+            return carriers
+        steps = np.arange(-_FINEST, _FINEST, _REFINED)
+        every = [self._numbers.carriers(offset + float(step)) for step in steps]
+        fits = [header.lattice.fit(header.data_key, each) for each in every]
+        return every[int(np.argmax(fits))]
+
+
+def _without_headers(carriers: Carriers, secrets: list[bytes]) -> Carriers:
+    """Those that hold no header of this key."""
+    free = np.ones(len(carriers), bool)
+    for secret in secrets:
+        free[places(secret, carriers)[0]] = False
+    return carriers[free]
+
+
+def _payload(header: Header, carriers: Carriers, garbage: float) -> bytes | None:
+    """What the header's data key decrypts, or None."""
+    own = carriers[header.classes >> class_of(carriers) & 1 == 1]
+    size = bucket_bytes(header.bucket)
+    if not len(own) or 8 * size > _MOST_RATE * len(own) * header.lattice.each:
+        return None
+    doubt = 1 - (1 - garbage) * (1 - own.doubt) / own.namesakes()
+    ratios = header.lattice.read(header.data_key, own, doubt)
+    seeds = header.lattice.seeds(header.data_key, own)
+    bits, _ = Fountain.of(8 * size).decode(seeds.ravel(), ratios.ravel(), _ROUNDS)
+    return decrypt_payload(header.data_key, np.packbits(bits).tobytes())
