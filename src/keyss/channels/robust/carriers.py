@@ -1,13 +1,14 @@
 """Which numbers of a model carry something, and by what else of the model a reader knows them again.
 
 Written are the constant green and blue coefficients of a Gaussian (`f_dc_1`, `f_dc_2`): of all numbers these
-cost least for what every format leaves of them. A Gaussian is known by its *name*: the cells in which its three
-log scales, its opacity and its red coefficient lie. None of these is changed by writing, and none depends on
-where the model stands, how it is turned, or in what order it is stored.
+cost least for what every format leaves of them. A Gaussian is known by its *name*: the cells in which its
+three log scales, its opacity and its red coefficient lie. None of these is changed by writing, and none
+depends on where the model stands, how it is turned, or in what order it is stored.
 
 Borders of cells lie where 8-bit formats have the border between two roundings (`.spz`: log scales in
 sixteenths, colours in steps of 1 / 38.25; opacities in 255ths nearly everywhere), so that rounding moves no
-number across one. Where another format or another change may have done so, `Carriers.doubt` says how likely it is.
+number across one. Where another format or another change may have done so, `Carriers.doubt` says how likely
+it is.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _SCALE_STEPS, _COLOUR_STEPS, _OPACITY_STEPS = 4, 5, 16  # that make a cell
 _LEAST_OPACITY = 2.5 / 255  # formats keep the colour of nothing less
 # What formats move these numbers by, at most (`.spz` aside, see above): half widths of uniform noise.
 _SCALE_NOISE, COLOUR_NOISE, OPACITY_NOISE = 0.018, 0.009, 0.004
+_SCALE_ROUNDED = SCALE_STEP / 2  # where borders lie elsewhere, by `.spz` as well
 _CELLS = 30_000  # on either side of zero: what fits into 16 bits
 
 Doubles = npt.NDArray[np.float64]
@@ -60,9 +62,12 @@ class Numbers:
 
         An offset that is a multiple of `CELL` keeps the borders where formats have theirs.
         """
+        noise = _SCALE_NOISE if offset % CELL == 0 else _SCALE_ROUNDED
         parts = (
-            _cells((self.log_scales - offset) / SCALE_STEP - 0.5, _SCALE_STEPS, _SCALE_NOISE / SCALE_STEP),
-            _cells(self.opacities[:, None] / OPACITY_STEP - 0.5, _OPACITY_STEPS, OPACITY_NOISE / OPACITY_STEP),
+            _cells((self.log_scales - offset) / SCALE_STEP - 0.5, _SCALE_STEPS, noise / SCALE_STEP),
+            _cells(
+                self.opacities[:, None] / OPACITY_STEP - 0.5, _OPACITY_STEPS, OPACITY_NOISE / OPACITY_STEP
+            ),
             _cells(self.colours[:, :1] / COLOUR_STEP, _COLOUR_STEPS, COLOUR_NOISE / COLOUR_STEP),
         )
         names = np.concatenate([cells for cells, _ in parts], axis=1)
@@ -85,6 +90,14 @@ class Carriers:
     def __getitem__(self, which: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Carriers:
         return Carriers(self.rows[which], self.names[which], self.doubt[which], self.values[which])
 
+    @property
+    def impact(self) -> Doubles:
+        """[C] how much a change of colour shows, from the name: log of area times squared opacity."""
+        log_scales = np.sort((self.names[:, :3] + 0.5) * CELL, axis=1)
+        opacity = (self.names[:, 3] + 0.5) * _OPACITY_STEPS * OPACITY_STEP
+        result: Doubles = log_scales[:, 1] + log_scales[:, 2] + 2 * np.log(opacity.clip(1e-3))
+        return result
+
     def namesakes(self) -> npt.NDArray[np.int64]:
         """[C] how many carriers have the same name, itself included."""
         _, inverse, counts = np.unique(self._packed(), return_inverse=True, return_counts=True)
@@ -105,7 +118,7 @@ class Carriers:
 
 
 def _cells(values: Doubles, steps: int, noise: float) -> tuple[Names, Doubles]:
-    """Of values [C, k] in steps of a format: the cells of so many steps, and the chance of having left them."""
+    """Cells of so many `steps` of a format of values [C, k] in its steps, and chances of having left them."""
     cells = np.floor(values / steps)
     inside = values - cells * steps
     nearest = np.minimum(inside, steps - inside)

@@ -1,40 +1,40 @@
 """Bytes in a model that come out of it after formats that round, whatever became of its order or its frame.
 
 A payload is encrypted and authenticated (ChaCha20-Poly1305), made into as many code bits as there is room for
-(`fountain`), and written into colours (`lattice`) of Gaussians that are known by what else they are (`carriers`).
-A *header* for each of a few *salts* holds the data key; see `header` and `salts`. A key opens its header under the
-salt alone, and everything else by the data key: nothing in the model tells how many secrets there are, or that
-there are any.
+(`fountain`), and written into colours (`lattice`) of Gaussians that are known by what else they are
+(`carriers`). A *header* for each of a few *salts* holds the data key; see `header` and `salts`. A key opens
+its header under the salt alone, and everything else by the data key: nothing in the model tells how many
+secrets there are, or that there are any.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from keyss.channels.robust.carriers import CELL, Carriers, Doubles, Numbers
 from keyss.channels.robust.fountain import Fountain
 from keyss.channels.robust.header import (
-    CARRIERS,
+    BITS,
     CLASSES,
     DATA_KEY_BYTES,
     LATTICE,
-    LEVELS,
-    SPACINGS,
     Header,
     bucket_bytes,
     class_of,
     places,
     write_header,
 )
-from keyss.channels.robust.lattice import Lattice
+from keyss.channels.robust.lattice import COLUMNS, LEVELS, SPACINGS, Lattice
 from keyss.channels.robust.payload import OVERHEAD, encrypt_payload
 from keyss.channels.robust.salts import SALTS, Salts, renewed
 from keyss.core.errors import InputError, KeyssWarning, UsageError
@@ -45,10 +45,11 @@ from keyss.rendering.difference import cost
 STRENGTH = 45.0  # dB
 Key = str | Callable[[bytes], DerivedKey]  # text, or what it becomes with a salt
 
-_RATE = 0.5  # data bits for each bit of information that is expected to be read
+_RATE = 0.42  # data bits for each bit of information that is expected to be read
 _GARBAGE = 0.02  # share of carriers whose name has changed although it seemed safe
 _SHARES = (2, 4, 8)  # classes that a payload gets, by its size
-_PROBE = 0.05  # standard deviation of the noise that tells what writing costs
+_SPREAD = 0.5  # dB by which what is written may cost more than what was measured
+_COMFORTABLE = 0.6  # of what they hold, unless it gets all
 _NOTICED = (
     "the secrets are too large, or too many, to lie in this model as each would alone: who holds one of the "
     "keys can notice that there are other secrets"
@@ -74,9 +75,10 @@ def embed(
 ) -> Gaussians:
     """The model with one (key, payload) for each secret in it; order and all other numbers stay.
 
-    `entropy`: at least 32 bytes that nobody else can know, from which all that is random is derived; by default
-    the system's. Raises UsageError for equal keys and for what does not fit, InputError for a model that can
-    carry nothing. Warns (KeyssWarning) where the holder of one key can notice that there are other secrets.
+    `entropy`: at least 32 bytes that nobody else can know, from which all that is random is derived; by
+    default the system's. Raises UsageError for equal keys and for what does not fit, InputError for a model
+    that can carry nothing. Warns (KeyssWarning) where the holder of one key can notice that there are other
+    secrets.
     """
     return RobustCover.of(model, spacing).embed(contents, strength=strength, entropy=entropy)
 
@@ -88,6 +90,7 @@ class RobustCover:
     model: Gaussians
     numbers: Numbers
     spacing: int  # index into SPACINGS
+    measured: dict[int, float] = field(default_factory=dict, compare=False)  # costs of levels
 
     @staticmethod
     def of(model: Gaussians, spacing: float = SPACINGS[0]) -> RobustCover:
@@ -97,28 +100,38 @@ class RobustCover:
 
     def capacity(self, strength: float = STRENGTH) -> int:
         """See `capacity`."""
-        return max(0, self._largest(self._level(strength), CLASSES) - OVERHEAD)
+        return max(0, self._largest(self._level(strength), CLASSES) - OVERHEAD) if len(self._own) else 0
 
     def cost(self, level: int) -> float:
-        """PSNR in dB that a payload in all carriers leaves, at this one of LEVELS."""
-        carriers = max(1, len(self._carriers))
-        headers = min(1.0, SALTS * CARRIERS / carriers)
-        variance = (1 - headers) * self._lattice(level).variance + headers * LATTICE.variance
-        return float(self._unit_cost - 10 * np.log10(variance / _PROBE**2))
+        """PSNR in dB that a payload in all carriers leaves with its headers, at this level of the lattice."""
+        random = np.random.default_rng(0)
+        noise = self._lattice(level).noise(self._own, random)
+        headers = random.random(len(self._own)) < self._headers_share
+        noise[headers] = LATTICE.noise(self._own[headers], random)
+        colours = self.numbers.colours.copy()
+        colours[self._own_rows, 1:] += noise
+        return cost(self.model, self._with_colours(colours))
 
     def embed(
-        self, contents: Sequence[tuple[Key, bytes]], *, strength: float = STRENGTH, entropy: bytes | None = None
+        self,
+        contents: Sequence[tuple[Key, bytes]],
+        *,
+        strength: float = STRENGTH,
+        entropy: bytes | None = None,
     ) -> Gaussians:
         """See `embed`."""
         mixed = hashlib.sha256(os.urandom(32) if entropy is None else entropy)
         for _, payload in contents:
             mixed.update(hashlib.sha256(payload).digest())
-        secret, level = mixed.digest(), self._level(strength)
+        if not contents:
+            raise UsageError("expected at least one secret, got none")
+        secret = mixed.digest()
         random = np.random.default_rng(np.frombuffer(stream(secret, "robust/random", 32), np.uint32))
         numbers = renewed(self.numbers, random)
         salts = Salts.of(numbers)
-        if not contents or len(salts.salts) < SALTS:
+        if len(salts.salts) < SALTS:
             raise InputError("this model has too few Gaussians to hide anything that survives other formats")
+        level = self._level(strength)
         headers = self._headers(contents, level, secret, random)
         derived = [[derive(key, each) for each in salts.salts[:SALTS]] for key, _ in contents]
         if len({keys[0].verifier() for keys in derived}) != len(contents):
@@ -128,17 +141,17 @@ class RobustCover:
         free = np.zeros(len(carriers), bool)
         free[carriers.one_of_each()] = True
         free[salts.rows] = False
-        for keys, header in zip(derived, headers, strict=True):
-            for key in keys:
-                self._header(colours, carriers, free, key, header)
+        for each in range(SALTS):  # the best salt of every secret first: later headers find places taken
+            for keys, header in zip(derived, headers, strict=True):
+                self._header(colours, carriers, free, keys[each], header)
         classes = class_of(carriers)
         for header, (_, payload) in zip(headers, contents, strict=True):
             own = np.flatnonzero(free & (header.classes >> classes & 1 == 1))
             encrypted = encrypt_payload(header.data_key, payload, bucket_bytes(header.bucket))
             code = Fountain.of(8 * len(encrypted))
             seeds = header.lattice.seeds(header.data_key, carriers[own])
-            bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), seeds.ravel())
-            colours[own, 1:] = header.lattice.write(header.data_key, carriers[own], bits.reshape(seeds.shape))
+            bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), seeds)
+            colours[own, 1:] = header.lattice.write(header.data_key, carriers[own], bits)
         return self._with_colours(colours)
 
     @staticmethod
@@ -156,15 +169,15 @@ class RobustCover:
         self, contents: Sequence[tuple[Key, bytes]], level: int, secret: bytes, random: np.random.Generator
     ) -> list[Header]:
         sizes = [len(payload) + OVERHEAD for _, payload in contents]
-        shares = [self._share(size, level, _SHARES) for size in sizes]
+        shares = [self._share(size / _COMFORTABLE, level, _SHARES[:-1], CLASSES) for size in sizes]
         if sum(shares) > CLASSES:
-            shares = [self._share(size, level, range(1, CLASSES + 1)) for size in sizes]
-            if sum(shares) <= CLASSES:
+            shares = [self._share(size, level, range(1, CLASSES + 1), CLASSES + 1) for size in sizes]
+            if len(sizes) > 1 and sum(shares) <= CLASSES:
                 warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
-        if sum(shares) > CLASSES:
+        if sum(shares) > CLASSES or max(sizes) > self._largest(level, CLASSES):
             room = max(0, self._largest(level, CLASSES) - OVERHEAD)
             raise UsageError(
-                f"expected payloads of {room:,} bytes in all, which is what this model holds at this `strength`, "
+                f"expected payloads of {room:,} bytes in all, as this model holds at this `strength`, "
                 f"got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
             )
         order, headers = random.permutation(CLASSES), []
@@ -175,54 +188,64 @@ class RobustCover:
             headers.append(Header(data_key, level, self.spacing, mask, _bucket(size)))
         return headers
 
-    def _share(self, size: int, level: int, shares: Sequence[int]) -> int:
-        """The least number of classes that holds `size` bytes; more than there are if none does."""
-        return next((each for each in shares if self._largest(level, each) >= size), CLASSES + 1)
+    def _share(self, size: float, level: int, shares: Sequence[int], otherwise: int) -> int:
+        """The least number of classes that holds `size` bytes."""
+        return next((each for each in shares if self._largest(level, each) >= size), otherwise)
 
     def _largest(self, level: int, classes: int) -> int:
         """Bytes of the largest bucket that so many classes hold."""
-        room = _RATE * self._information * self._lattice(level).each * classes / CLASSES / 8
+        bits = COLUMNS * self._lattice(level).bits(self._own)
+        room = _RATE * float((bits * self._information).sum()) * classes / CLASSES / 8
         return max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
 
     def _level(self, strength: float) -> int:
-        """The largest of LEVELS that costs no more than `strength` allows."""
-        costs = [self.cost(level) for level in range(len(LEVELS))]
-        if costs[0] < strength:
-            raise UsageError(
-                f"expected a `strength` of at most {costs[0]:.1f} dB, which is what the least that can be written "
-                f"leaves of this model, got {strength:.1f}"
-            )
-        return max(level for level, each in enumerate(costs) if each >= strength)
+        """The largest level that costs no more than `strength` allows, or the least of all."""
+        if not (math.isfinite(strength) and strength > 0):
+            raise UsageError(f"expected a `strength` above 0 dB, got {strength}")
+        least, beyond = 0, LEVELS
+        while beyond - least > 1:
+            middle = (least + beyond) // 2
+            least, beyond = (middle, beyond) if self._costs(middle) >= strength + _SPREAD else (least, middle)
+        return least
+
+    def _costs(self, level: int) -> float:
+        if level not in self.measured:
+            self.measured[level] = self.cost(level)
+        return self.measured[level]
 
     def _lattice(self, level: int) -> Lattice:
-        return Lattice(LEVELS[level], SPACINGS[self.spacing])
+        return Lattice(level, SPACINGS[self.spacing])
 
     @cached_property
     def _carriers(self) -> Carriers:
         return self.numbers.carriers(_reference(self.numbers))
 
     @cached_property
-    def _information(self) -> float:
-        """Bits that a reader is expected to have of all carriers, for each bit that one of them carries."""
-        carriers = self._carriers
-        own = carriers.one_of_each()
-        free = max(0.0, 1 - SALTS * CARRIERS / max(1, len(own)))
-        garbage = 1 - (1 - _GARBAGE) * (1 - carriers.doubt) / carriers.namesakes()
-        return free * float((1 - _entropy(garbage / 2)).sum())
+    def _own_rows(self) -> npt.NDArray[np.int64]:
+        """[D] those that are written."""
+        return self._carriers.one_of_each()
 
     @cached_property
-    def _unit_cost(self) -> float:
-        """dB of noise of standard deviation _PROBE on what would be written."""
-        own = self._carriers.one_of_each()
-        if not len(own):
-            return 0.0
-        noise = np.random.default_rng(0).uniform(-1, 1, (len(own), 2)) * 3**0.5 * _PROBE
-        colours = self.numbers.colours.copy()
-        colours[own, 1:] += noise
-        return cost(self.model, self._with_colours(colours))
+    def _own(self) -> Carriers:
+        return self._carriers[self._own_rows]
+
+    @cached_property
+    def _headers_share(self) -> float:
+        """Of carriers, those that the headers of one secret take."""
+        bits = LATTICE.bits(self._own)
+        return min(1.0, SALTS * BITS / max(1.0, COLUMNS * float(bits.sum())))
+
+    @cached_property
+    def _information(self) -> Doubles:
+        """[D] bits that a reader is expected to have of each bit that one of them carries."""
+        namesakes = self._carriers.namesakes()[self._own_rows]
+        garbage = 1 - (1 - _GARBAGE) * (1 - self._own.doubt) / namesakes
+        return (1 - self._headers_share) * (1 - _entropy(garbage / 2))
 
     def _with_colours(self, colours: Doubles) -> Gaussians:
-        """The model with other constant colours [C, 3] of its carriers; those that are equal stay as they are."""
+        """The model with other constant colours [C, 3] of its carriers; those that are equal stay as they
+        are.
+        """
         sh = self.model.sh.detach().clone()
         changed = (colours != self.numbers.colours).any(axis=1)
         rows = torch.from_numpy(self.numbers.rows[changed]).to(sh.device)

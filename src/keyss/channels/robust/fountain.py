@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from keyss.rendering.cpu.jit import kernel
 
-# Shares of code bits that are sums of 1, 2, ... intermediate bits (Shokrollahi 2006, table I, k = 65,536), with
-# more single ones, which belief propagation starts from where code bits are noisy.
+# Shares of code bits that are sums of 1, 2, ... intermediate bits (Shokrollahi 2006, table I, k = 65,536),
+# with more single ones, which belief propagation starts from where code bits are noisy.
 _DEGREES = ((1, 0.020), (2, 0.486), (3, 0.163), (4, 0.072), (5, 0.081), (8, 0.055), (9, 0.037), (19, 0.055))
 _LARGEST = 65  # degree of the remaining ones
 _REPEATS = 4  # parity checks that each data bit takes part in
@@ -30,7 +30,7 @@ _SETTLED = 3
 
 Bits = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.uint64]
-Numbers = npt.NDArray[np.float32]
+Ratios = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Fountain:
         starts, members = equations(seeds, self.length)
         return (np.add.reduceat(every[members], starts[:-1]) & 1).astype(np.uint8)
 
-    def decode(self, seeds: Words, ratios: Numbers, rounds: int) -> tuple[Bits, bool]:
+    def decode(self, seeds: Words, ratios: Ratios, rounds: int) -> tuple[Bits, bool]:
         """The likeliest data [size], and whether all checks hold.
 
         `ratios` [n]: natural logarithms of P(0) / P(1) of the code bits of `seeds` [n]. Takes at most
@@ -122,7 +122,7 @@ def _parity_checks(size: int, parity: int) -> tuple[npt.NDArray[np.int64], npt.N
 
 @kernel
 def _propagate(starts: Any, members: Any, given: Any, length: int, parity: int, rounds: int) -> Any:
-    """Belief propagation over checks, of which the last `parity` have to hold: totals [length], whether they do."""
+    """Totals [length] after belief propagation, and whether the last `parity` of the checks hold."""
     total = np.zeros(length, np.float32)
     sent = np.zeros(len(members), np.float32)
     widest = 1

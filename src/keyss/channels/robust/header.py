@@ -12,20 +12,21 @@ import numpy.typing as npt
 
 from keyss.channels.robust.carriers import Carriers, Doubles
 from keyss.channels.robust.fountain import Bits, Fountain
-from keyss.channels.robust.lattice import Lattice, rank
+from keyss.channels.robust.lattice import COLUMNS, SPACINGS, Lattice, rank
 from keyss.keys.derivation import expand
 
 DATA_KEY_BYTES = 16
-CARRIERS = 110  # of a header
+BITS = 1100  # of the code of a header
 CLASSES = 8  # of carriers, of which a payload has some
-# Bits of green and blue, the cheapest first, and distances between points of the lattice.
-LEVELS = ((1, 0), (1, 1), (2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4))
-SPACINGS = (0.0275, 0.04, 0.06, 0.09)
-LATTICE = Lattice((3, 3), SPACINGS[0])  # of headers
+LATTICE = Lattice(40, SPACINGS[0])  # of headers
+_LEAST_BITS = 2  # of a number that holds some of a header
 _CHECK_BYTES = 2
 _BYTES = DATA_KEY_BYTES + 3 + _CHECK_BYTES
-_ROUNDS = 20
-_SAFE = 0.7  # of the places: what is there is what was written, if no more than a quarter was lost
+_ROUNDS = 12
+# How a header is looked at: bits (of BITS), those of them that are likely to hold what was written, how
+# likely that is, and how likely for the rest. Where Gaussians were lost, others have taken their places, at
+# the end; where two models were put together, half of the places are the other's.
+_VIEWS = ((1.0, 0.7, 0.92, 0.7), (1.0, 0.45, 0.92, 0.1), (2.0, 2.0, 0.5, 0.5))
 _PUBLIC = hashlib.sha256(b"keyss/v1/robust-class").digest()
 
 
@@ -34,18 +35,18 @@ class Header:
     """How a payload is read."""
 
     data_key: bytes
-    level: int  # index into LEVELS
+    level: int  # of the lattice
     spacing: int  # index into SPACINGS
     classes: int  # a bit for each of CLASSES
     bucket: int  # see `bucket_bytes`
 
     @property
     def lattice(self) -> Lattice:
-        return Lattice(LEVELS[self.level], SPACINGS[self.spacing])
+        return Lattice(self.level, SPACINGS[self.spacing])
 
     def pack(self, secret: bytes) -> Bits:
         """The bits of a header, encrypted under `secret`, which no other header has."""
-        plain = self.data_key + bytes([self.level << 4 | self.spacing, self.classes, self.bucket])
+        plain = self.data_key + bytes([self.level << 2 | self.spacing, self.classes, self.bucket])
         data = np.frombuffer(plain + _check(secret, plain), np.uint8) ^ _stream(secret)
         return np.unpackbits(data)
 
@@ -57,44 +58,56 @@ class Header:
         lattice, classes, bucket = plain[DATA_KEY_BYTES:]
         if not hmac.compare_digest(check, _check(secret, plain)):
             return None
-        if lattice >> 4 >= len(LEVELS) or lattice & 15 >= len(SPACINGS) or not classes:
+        if not classes:
             return None
-        return Header(plain[:DATA_KEY_BYTES], lattice >> 4, lattice & 15, classes, bucket)
+        return Header(plain[:DATA_KEY_BYTES], lattice >> 2, lattice & 3, classes, bucket)
 
 
 def write_header(header: Header, secret: bytes, carriers: Carriers) -> Doubles:
     """[P, 2] new values of the carriers that `places` names."""
     seeds = LATTICE.seeds(secret, carriers)
-    code = _fountain().encode(header.pack(secret), seeds.ravel()).reshape(seeds.shape)
-    return LATTICE.write(secret, carriers, code)
+    return LATTICE.write(secret, carriers, _fountain().encode(header.pack(secret), seeds))
 
 
-def read_header(secret: bytes, carriers: Carriers) -> Header | None:
-    """The header of this secret, if there is one."""
-    rows, order = places(secret, carriers)
-    if not len(rows):
-        return None
-    own = carriers[rows]
-    # Where Gaussians were lost, others have taken their places, at the end.
-    safe = np.where(order < _SAFE * CARRIERS, 0.92, 0.7)
-    doubt = 1 - safe * (1 - own.doubt) / np.bincount(order)[order]
-    ratios, seeds = LATTICE.read(secret, own, doubt), LATTICE.seeds(secret, own)
-    bits, _ = _fountain().decode(seeds.ravel(), ratios.ravel(), _ROUNDS)
-    return Header.unpack(bits, secret)
+def read_header(secret: bytes, carriers: Carriers, thorough: bool = True) -> Header | None:
+    """The header of this secret, if there is one. `thorough`: even where half is lost or foreign."""
+    for window, safe, trust, rest in _VIEWS if thorough else _VIEWS[:1]:
+        rows, namesakes, before = places(secret, carriers, window * BITS)
+        if not len(rows):
+            return None
+        own = carriers[rows]
+        sure = np.where(before < safe * BITS, trust, rest)
+        doubt = 1 - sure * (1 - own.doubt) / namesakes
+        ratios, seeds = LATTICE.read(secret, own, doubt), LATTICE.seeds(secret, own)
+        bits, _ = _fountain().decode(seeds, ratios, _ROUNDS)
+        header = Header.unpack(bits, secret)
+        if header is not None:
+            return header
+    return None
 
 
-def places(secret: bytes, carriers: Carriers) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """[P] which carriers hold the header of `secret`, and [P] the place of their names, below CARRIERS.
+def places(
+    secret: bytes, carriers: Carriers, bits: float = BITS
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Doubles]:
+    """[P] which carriers hold the header of `secret`, [P] how many share a name, [P] bits that come before.
 
-    The names with the least keyed hashes. Carriers with one name have one place.
+    Those whose names have the least keyed hashes, as many as hold `bits` bits. Of carriers with one name one
+    counts.
     """
-    ranks = rank(secret, "places", carriers.names)
-    most = 8 * CARRIERS  # which are enough, unless most names are equal
-    some = np.argpartition(ranks, most)[:most] if len(ranks) > most else np.arange(len(ranks))
-    _, order = np.unique(ranks[some], return_inverse=True)
-    own = np.flatnonzero(order < CARRIERS)
-    own = own[np.argsort(order[own], kind="stable")]
-    return some[own], order[own]
+    some = np.flatnonzero(LATTICE.bits(carriers) >= _LEAST_BITS)
+    ranks = rank(secret, "places", carriers.names[some])
+    most = int(2 * bits)  # of them are enough, unless most names are equal
+    if len(ranks) > most:
+        least = np.argpartition(ranks, most)[:most]
+        some, ranks = some[least], ranks[least]
+    some = some[np.argsort(ranks, kind="stable")]
+    _, first, order, namesakes = np.unique(
+        np.sort(ranks), return_index=True, return_inverse=True, return_counts=True
+    )
+    each = COLUMNS * LATTICE.bits(carriers[some[first]])
+    before = np.cumsum(each) - each
+    own = before[order] < bits
+    return some[own], namesakes[order][own], before[order][own].astype(np.float64)
 
 
 def class_of(carriers: Carriers) -> npt.NDArray[np.int64]:

@@ -1,13 +1,17 @@
 """Bits in numbers: dithered quantisation index modulation (Chen and Wornell 2001), read softly.
 
-A number that carries b bits is moved to the nearest point of one of 2^b lattices of step 2^b x spacing, which lie
-`spacing` apart and are shifted together by a *dither*, a number that only the key tells and that no two
+A number that carries b bits is moved to the nearest point of one of 2^b lattices of step 2^b x spacing, which
+lie `spacing` apart and are shifted together by a *dither*, a number that only the key tells and that no two
 Gaussians share. So what writing adds is, for whoever has not the key, independent noise that is uniform over
 one step, of variance step^2 / 12, and nothing else: no value is likelier than another.
+
+How many bits a Gaussian carries follows from its *impact* and one *level* for all: a bit less for every
+factor of four by which a change of its colour shows more, so that all that carry something cost equally much.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,83 +20,94 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
-from keyss.channels.robust.carriers import Carriers, Doubles
-from keyss.channels.robust.fountain import Bits, Numbers, Words, mixed
+from keyss.channels.robust.carriers import Carriers, Doubles, Names
+from keyss.channels.robust.fountain import Bits, Ratios, Words, mixed
 from keyss.keys.derivation import expand
 
+COLUMNS = 2  # numbers of a Gaussian that are written
+MOST_BITS = 5  # of a number
+SPACINGS = (0.0275, 0.04, 0.06, 0.09)
+LEVELS = 64
+_LEVEL_STEP, _MIDDLE = math.log(4) / 4, 44  # of impact; a level is a quarter of a bit
 _NOISE = 0.23  # standard deviation of what formats do to a number, of the spacing
-_COLUMNS = 2  # numbers of a Gaussian
-_MOST_BITS = 8
-
 _BLOCK = 16
+
+Counts = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """`bits`: of green and of blue, each up to 8. `spacing`: between neighbouring points."""
+    """`level`: below LEVELS, the more the more bits. `spacing`: between neighbouring points."""
 
-    bits: tuple[int, int]
+    level: int
     spacing: float
 
-    @property
-    def each(self) -> int:
-        """Bits of a Gaussian."""
-        return sum(self.bits)
+    def bits(self, carriers: Carriers) -> Counts:
+        """[C] bits of each of a carrier's numbers, at most MOST_BITS."""
+        water = (self.level - _MIDDLE) * _LEVEL_STEP + MOST_BITS * math.log(4)
+        return np.floor((water - carriers.impact) / math.log(4)).clip(0, MOST_BITS).astype(np.int64)
 
-    @property
-    def variance(self) -> float:
-        """Of what writing adds to a number, the mean of both."""
-        return sum((self.spacing * 2**bits) ** 2 / 12 if bits else 0.0 for bits in self.bits) / _COLUMNS
+    def noise(self, carriers: Carriers, random: np.random.Generator) -> Doubles:
+        """[C, 2] something that is distributed as what writing adds."""
+        bits = self.bits(carriers)
+        steps = np.where(bits > 0, self.spacing * 2.0**bits, 0)
+        result: Doubles = random.uniform(-0.5, 0.5, (len(carriers), COLUMNS)) * steps[:, None]
+        return result
 
     def seeds(self, secret: bytes, carriers: Carriers) -> Words:
-        """[C, each] what each bit of the carriers is, as `Fountain` understands it."""
-        words = _random(secret, "seeds", carriers)[:, :1]
-        order = np.arange(self.each, dtype=np.uint64)
-        return mixed(words ^ mixed(order + np.uint64(1)))
+        """[B] what each bit of all carriers is, as `Fountain` understands it."""
+        bits = self.bits(carriers)
+        words = _random(secret, "seeds", carriers)[:, 0]
+        counts = COLUMNS * bits
+        first = np.repeat(np.cumsum(counts) - counts, counts)
+        order = (np.arange(counts.sum()) - first).astype(np.uint64)
+        return mixed(np.repeat(words, counts) ^ mixed(order + np.uint64(1)))
 
     def write(self, secret: bytes, carriers: Carriers, code: Bits) -> Doubles:
-        """[C, 2] new green and blue that carry the bits `code` [C, each]."""
-        dither = self._dither(secret, carriers)
-        written, first = carriers.values.copy(), 0
-        for column, bits in enumerate(self.bits):
-            if bits:
-                label = np.zeros(len(carriers), np.int64)
-                for bit in range(bits):
-                    label = label << 1 | code[:, first + bit]
-                step = self.spacing * 2**bits
-                lattice = dither[:, column] * step + _ungray(label) * self.spacing
-                written[:, column] = np.round((carriers.values[:, column] - lattice) / step) * step + lattice
-            first += bits
+        """[C, 2] new values that carry the bits `code` [B]."""
+        bits, dither = self.bits(carriers), self._dither(secret, carriers)
+        ends = COLUMNS * np.cumsum(bits)
+        written = carriers.values.copy()
+        for each in range(1, MOST_BITS + 1):
+            rows = np.flatnonzero(bits == each)
+            step = self.spacing * 2**each
+            for column in range(COLUMNS):
+                first = ends[rows] - (COLUMNS - column) * each
+                label = np.zeros(len(rows), np.int64)
+                for bit in range(each):
+                    label = label << 1 | code[first + bit]
+                lattice = dither[rows, column] * step + _ungray(label) * self.spacing
+                nearest = np.round((carriers.values[rows, column] - lattice) / step) * step + lattice
+                written[rows, column] = nearest
         return written
 
-    def read(self, secret: bytes, carriers: Carriers, doubt: Doubles) -> Numbers:
-        """[C, each] logarithms of P(0) / P(1); `doubt` [C]: chance that a carrier holds something else."""
-        dither = self._dither(secret, carriers)
-        ratios = np.zeros((len(carriers), self.each), np.float32)
-        first = 0
-        for column, bits in enumerate(self.bits):
-            step = self.spacing * 2**bits
-            place = (carriers.values[:, column] - dither[:, column] * step) / self.spacing
-            place = np.mod(place, 2.0**bits)
-            points = np.floor(place)[:, None] + np.array([-1.0, 0.0, 1.0, 2.0])
-            weight = np.exp(-((place[:, None] - points) ** 2) / (2 * _NOISE**2))
-            label = points.astype(np.int64) % (1 << bits)
-            label ^= label >> 1
-            for bit in range(bits):
-                ones = (weight * (label >> (bits - 1 - bit) & 1)).sum(axis=1) / weight.sum(axis=1)
-                ones = (1 - doubt) * ones + doubt / 2
-                ratios[:, first + bit] = np.log((1 - ones).clip(1e-9) / ones.clip(1e-9))
-            first += bits
+    def read(self, secret: bytes, carriers: Carriers, doubt: Doubles) -> Ratios:
+        """[B] logarithms of P(0) / P(1); `doubt` [C]: chance that a carrier holds something else."""
+        bits, dither = self.bits(carriers), self._dither(secret, carriers)
+        ends = COLUMNS * np.cumsum(bits)
+        ratios = np.zeros(COLUMNS * int(bits.sum()), np.float32)
+        for each in range(1, MOST_BITS + 1):
+            rows = np.flatnonzero(bits == each)
+            for column in range(COLUMNS):
+                place = carriers.values[rows, column] / self.spacing - dither[rows, column] * 2**each
+                place = np.mod(place, 2.0**each)
+                points = np.floor(place)[:, None] + np.array([-1.0, 0.0, 1.0, 2.0])
+                weight = np.exp(-((place[:, None] - points) ** 2) / (2 * _NOISE**2))
+                weight /= weight.sum(axis=1, keepdims=True)
+                label = points.astype(np.int64) % (1 << each)
+                label ^= label >> 1
+                first = ends[rows] - (COLUMNS - column) * each
+                for bit in range(each):
+                    ones = (weight * (label >> (each - 1 - bit) & 1)).sum(axis=1)
+                    ones = ((1 - doubt[rows]) * ones + doubt[rows] / 2).clip(1e-9, 1 - 1e-9)
+                    ratios[first + bit] = np.log((1 - ones) / ones)
         return ratios
 
     def fit(self, secret: bytes, carriers: Carriers) -> float:
         """How well the values lie on the lattice: 0 by chance, 1 on its points."""
-        dither, places = self._dither(secret, carriers), []
-        for column, bits in enumerate(self.bits):
-            if bits:
-                place = carriers.values[:, column] / self.spacing - dither[:, column] * 2**bits
-                places.append(np.cos(2 * np.pi * place))
-        return float(np.mean(places))
+        bits = self.bits(carriers)
+        place = carriers.values / self.spacing - self._dither(secret, carriers) * 2.0 ** bits[:, None]
+        return float(np.cos(2 * np.pi * place[bits > 0]).sum() / max(1, COLUMNS * (bits > 0).sum()))
 
     def _dither(self, secret: bytes, carriers: Carriers) -> Doubles:
         """[C, 2] numbers in [0, 1)."""
@@ -100,7 +115,7 @@ class Lattice:
         return dither
 
 
-def rank(secret: bytes, label: str, names: npt.NDArray[np.int16]) -> Words:
+def rank(secret: bytes, label: str, names: Names) -> Words:
     """[C] a number for each name [C, k], k at most 8; equal for equal names."""
     return _encrypted(expand(secret, f"robust/{label}", 32), names)[:, 0]
 
@@ -110,7 +125,7 @@ def _random(secret: bytes, label: str, carriers: Carriers) -> Words:
     return _encrypted(expand(secret, f"robust/{label}", 32), carriers.names)
 
 
-def _encrypted(key: bytes, names: npt.NDArray[np.int16]) -> Words:
+def _encrypted(key: bytes, names: Names) -> Words:
     """[C, 2] of AES-256 of the names [C, k]: a pseudo-random function of them."""
     blocks = np.zeros((len(names), _BLOCK // 2), "<i2")
     blocks[:, : names.shape[1]] = names
@@ -119,7 +134,7 @@ def _encrypted(key: bytes, names: npt.NDArray[np.int16]) -> Words:
     return words.astype(np.uint64)
 
 
-def _ungray(code: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def _ungray(code: Counts) -> Counts:
     """The number whose Gray code, number xor half of it, is `code` (up to 8 bits)."""
     for shift in (1, 2, 4):
         code = code ^ code >> shift

@@ -1,11 +1,11 @@
-"""The Gaussians that serve as the salt of Argon2id: found in any order of a rounded model, and new in every file.
+"""The Gaussians that serve as the salt of Argon2id: found in a rounded model, and new in every file.
 
-*Listed* are the Gaussians with the least public hashes of the cells in which their red coefficient, their opacity
-and the ratios of their scales lie, of those where these are in the inner part of their cells, from where no
-format moves them out. Writing changes none of these numbers. A salt is a hash of the cells of one listed Gaussian,
-green and blue included; the best salts are those with all numbers far inside. To have new salts, a writer
-moves green and blue of the listed ones by whole cells, at random and by at most 0.4. Where they lie inside of
-their cells stays as it is, so that nothing tells that this has happened.
+*Listed* are the Gaussians with the least public hashes of the cells in which their red coefficient, their
+opacity and the ratios of their scales lie, of those where these are in the inner part of their cells, from
+where no format moves them out. Writing changes none of these numbers. A salt is a hash of the cells of one
+listed Gaussian, green and blue included; the best salts are those with all numbers far inside. To have new
+salts, a writer moves green and blue of the listed ones by whole cells, at random and by at most 0.4. Where
+they lie inside of their cells stays as it is, so that nothing tells that this has happened.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 10  # that are written for and tried: random pruning of a quarter removes all with p = 1e-6
 _LISTED = 12  # Gaussians; rounding brings in a few others
-_LEAST_OPACITY = 0.1
+_OPACITIES = 0.08, 0.4  # of listed ones: a new colour is hardly seen, and hardly any pruning removes them
 _COLOUR_STEPS, _OPACITY_STEPS, _RATIO_STEPS = 5, 16, 8  # that make a cell
 # Rounding a number leaves it in its cell, whose borders are borders of rounding too; a ratio moves by a step.
 _NOISE = np.array([OPACITY_NOISE / OPACITY_STEP] + [1.0] * 2 + [COLOUR_NOISE / COLOUR_STEP] * 3)
@@ -51,9 +51,8 @@ class Salts:
     @staticmethod
     def of(numbers: Numbers) -> Salts:
         cells, outward = _cells(numbers)
-        small = numbers.log_scales.max(axis=1) < numbers.size  # for whose new colours nobody cares
-        stable = (outward[:, :_UNCHANGED].max(axis=1) < 1) & (numbers.opacities > _LEAST_OPACITY)
-        stable = np.flatnonzero(stable & small)
+        faint = (numbers.opacities > _OPACITIES[0]) & (numbers.opacities < _OPACITIES[1])
+        stable = np.flatnonzero((outward[:, :_UNCHANGED].max(axis=1) < 1) & faint)
         hashes = rank(_PUBLIC, "salt", cells[stable, :_UNCHANGED])
         _, first = np.unique(hashes, return_index=True)  # in ascending order; equal ones once
         listed = stable[first[:_LISTED]]
@@ -76,7 +75,10 @@ def _salt(cells: npt.NDArray[np.int16]) -> bytes:
 
 
 def _cells(numbers: Numbers) -> tuple[npt.NDArray[np.int16], Doubles]:
-    """[C, 6] cells of opacity, two ratios, red, green and blue, and how far out the numbers lie: 1 may be outside."""
+    """[C, 6] cells of opacity, two ratios, red, green and blue, and how far out the numbers lie.
+
+    Zero is the middle of a cell; above one, a format may move the number out of it.
+    """
     steps = np.concatenate(
         [
             numbers.opacities[:, None] / OPACITY_STEP - 0.5,
