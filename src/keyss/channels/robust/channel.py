@@ -24,13 +24,14 @@ import torch
 from keyss.channels.robust.carriers import CELL, Carriers, Doubles, Numbers
 from keyss.channels.robust.fountain import Fountain
 from keyss.channels.robust.header import (
-    BITS,
     CLASSES,
     DATA_KEY_BYTES,
     LATTICE,
+    UNNOTICED,
     Header,
     bucket_bytes,
     class_of,
+    header_share,
     places,
     write_header,
 )
@@ -39,7 +40,7 @@ from keyss.channels.robust.payload import OVERHEAD, encrypt_payload
 from keyss.channels.robust.salts import SALTS, Salts, renewed
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey, KeyDerivation, expand, stream
+from keyss.keys.derivation import MASTER_BYTES, DerivedKey, KeyDerivation, expand, stream
 from keyss.rendering.difference import cost
 
 STRENGTH = 45.0  # dB
@@ -48,6 +49,7 @@ Key = str | Callable[[bytes], DerivedKey]  # text, or what it becomes with a sal
 _RATE = 0.42  # data bits for each bit of information that is expected to be read
 _GARBAGE = 0.02  # share of carriers whose name has changed although it seemed safe
 _SHARES = (2, 4, 8)  # classes that a payload gets, by its size
+_LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
 _SPREAD = 0.5  # dB by which what is written may cost more than what was measured
 _COMFORTABLE = 0.6  # of what they hold, unless it gets all
 _NOTICED = (
@@ -136,6 +138,27 @@ class RobustCover:
         derived = [[derive(key, each) for each in salts.salts[:SALTS]] for key, _ in contents]
         if len({keys[0].verifier() for keys in derived}) != len(contents):
             raise UsageError("two secrets have the same key: expected each with its own")
+        for index in range(len(contents), UNNOTICED):  # nobody has these keys
+            nobody = [expand(secret, f"robust/nobody/{index}/{each}", MASTER_BYTES) for each in range(SALTS)]
+            derived.append([DerivedKey.of_master(each) for each in nobody])
+            headers.append(Header(nobody[0][:DATA_KEY_BYTES], level, self.spacing, 0, 0))
+        payloads = [payload for _, payload in contents]
+        for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
+            fitting = [replace(each, level=max(0, level - lower)) for each in headers]
+            stego = self._written(numbers, salts, fitting, derived, payloads)
+            if cost(self.model, stego) >= strength:
+                break
+        return stego
+
+    def _written(
+        self,
+        numbers: Numbers,
+        salts: Salts,
+        headers: list[Header],
+        derived: list[list[DerivedKey]],
+        payloads: list[bytes],
+    ) -> Gaussians:
+        """The model with new salts, headers for each of the `derived` keys, and payloads of the first."""
         colours = numbers.colours.copy()
         carriers = numbers.carriers(_reference(numbers))
         free = np.zeros(len(carriers), bool)
@@ -145,7 +168,7 @@ class RobustCover:
             for keys, header in zip(derived, headers, strict=True):
                 self._header(colours, carriers, free, keys[each], header)
         classes = class_of(carriers)
-        for header, (_, payload) in zip(headers, contents, strict=True):
+        for header, payload in zip(headers, payloads, strict=False):
             own = np.flatnonzero(free & (header.classes >> classes & 1 == 1))
             encrypted = encrypt_payload(header.data_key, payload, bucket_bytes(header.bucket))
             code = Fountain.of(8 * len(encrypted))
@@ -156,7 +179,7 @@ class RobustCover:
 
     @staticmethod
     def _header(
-        colours: Doubles, carriers: Carriers, free: np.ndarray, key: DerivedKey, header: Header
+        colours: Doubles, carriers: Carriers, free: npt.NDArray[np.bool_], key: DerivedKey, header: Header
     ) -> None:
         """Write a header where it belongs, except where there is something; its carriers are free no more."""
         secret = key.expand("robust/header", 32)
@@ -169,17 +192,19 @@ class RobustCover:
         self, contents: Sequence[tuple[Key, bytes]], level: int, secret: bytes, random: np.random.Generator
     ) -> list[Header]:
         sizes = [len(payload) + OVERHEAD for _, payload in contents]
+        noticed = len(sizes) > UNNOTICED
         shares = [self._share(size / _COMFORTABLE, level, _SHARES[:-1], CLASSES) for size in sizes]
         if sum(shares) > CLASSES:
             shares = [self._share(size, level, range(1, CLASSES + 1), CLASSES + 1) for size in sizes]
-            if len(sizes) > 1 and sum(shares) <= CLASSES:
-                warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
+            noticed = len(sizes) > 1
         if sum(shares) > CLASSES or max(sizes) > self._largest(level, CLASSES):
             room = max(0, self._largest(level, CLASSES) - OVERHEAD)
             raise UsageError(
                 f"expected payloads of {room:,} bytes in all, as this model holds at this `strength`, "
                 f"got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
             )
+        if noticed:
+            warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
         order, headers = random.permutation(CLASSES), []
         for index, (size, share) in enumerate(zip(sizes, shares, strict=True)):
             own, order = order[:share], order[share:]
@@ -231,9 +256,8 @@ class RobustCover:
 
     @cached_property
     def _headers_share(self) -> float:
-        """Of carriers, those that the headers of one secret take."""
-        bits = LATTICE.bits(self._own)
-        return min(1.0, SALTS * BITS / max(1.0, COLUMNS * float(bits.sum())))
+        """Of carriers, those that headers take."""
+        return min(1.0, UNNOTICED * header_share(self._own))
 
     @cached_property
     def _information(self) -> Doubles:

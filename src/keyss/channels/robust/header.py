@@ -13,20 +13,22 @@ import numpy.typing as npt
 from keyss.channels.robust.carriers import Carriers, Doubles
 from keyss.channels.robust.fountain import Bits, Fountain
 from keyss.channels.robust.lattice import COLUMNS, SPACINGS, Lattice, rank
+from keyss.channels.robust.salts import SALTS
 from keyss.keys.derivation import expand
 
 DATA_KEY_BYTES = 16
 BITS = 1100  # of the code of a header
+UNNOTICED = 2  # secrets whose headers are always there, if only as noise
 CLASSES = 8  # of carriers, of which a payload has some
 LATTICE = Lattice(40, SPACINGS[0])  # of headers
 _LEAST_BITS = 2  # of a number that holds some of a header
 _CHECK_BYTES = 2
 _BYTES = DATA_KEY_BYTES + 3 + _CHECK_BYTES
-_ROUNDS = 12
+_ROUNDS = 16
 # How a header is looked at: bits (of BITS), those of them that are likely to hold what was written, how
 # likely that is, and how likely for the rest. Where Gaussians were lost, others have taken their places, at
 # the end; where two models were put together, half of the places are the other's.
-_VIEWS = ((1.0, 0.7, 0.92, 0.7), (1.0, 0.45, 0.92, 0.1), (2.0, 2.0, 0.5, 0.5))
+_VIEWS = ((1.0, 1.0, 0.85, 0.85), (1.0, 0.73, 0.85, 0.1), (1.0, 0.48, 0.85, 0.05), (2.0, 2.0, 0.45, 0.45))
 _PUBLIC = hashlib.sha256(b"keyss/v1/robust-class").digest()
 
 
@@ -108,6 +110,12 @@ def places(
     before = np.cumsum(each) - each
     own = before[order] < bits
     return some[own], namesakes[order][own], before[order][own].astype(np.float64)
+
+
+def header_share(carriers: Carriers) -> float:
+    """Of carriers, those that the headers of one secret take."""
+    bits = LATTICE.bits(carriers)
+    return min(1.0, SALTS * BITS / max(1.0, COLUMNS * float(bits.sum())))
 
 
 def class_of(carriers: Carriers) -> npt.NDArray[np.int64]:
