@@ -27,6 +27,8 @@ _REPEATS = 4  # parity checks that each data bit takes part in
 _SURE = 25.0  # log-likelihood ratio of what is known
 _MOST = 30.0  # of any message
 _SETTLED = 3
+_RANK = np.uint64(0xD1B54A32D192ED03)
+_BLOCK = 1 << 16  # equations at a time
 
 Bits = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.uint64]
@@ -99,9 +101,16 @@ def equations(seeds: Words, length: int) -> tuple[npt.NDArray[np.int64], npt.NDA
     uniform = mixed(seeds) / 2.0**64
     chosen = degrees[np.searchsorted(shares, uniform, side="right")]
     starts = np.concatenate([[0], np.cumsum(chosen)]).astype(np.int64)
-    rank = (np.arange(starts[-1]) - np.repeat(starts[:-1], chosen)).astype(np.uint64)
-    drawn = mixed(np.repeat(seeds, chosen) ^ (rank + np.uint64(1)) * np.uint64(0xD1B54A32D192ED03))
-    return starts, ((drawn >> np.uint64(32)) * np.uint64(length) >> np.uint64(32)).astype(np.int32)
+    members = np.empty(starts[-1], np.int32)
+    for first in range(0, len(seeds), _BLOCK):  # what lies between takes ten times the memory of the result
+        own = slice(first, first + _BLOCK)
+        start = starts[first]
+        where = np.repeat(starts[:-1][own] - start, chosen[own])
+        rank = (np.arange(len(where)) - where).astype(np.uint64)
+        drawn = mixed(np.repeat(seeds[own], chosen[own]) ^ (rank + np.uint64(1)) * _RANK)
+        numbers = (drawn >> np.uint64(32)) * np.uint64(length) >> np.uint64(32)
+        members[start : start + len(where)] = numbers.astype(np.int32)
+    return starts, members
 
 
 @lru_cache(maxsize=4)

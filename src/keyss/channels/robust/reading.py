@@ -61,10 +61,11 @@ class Reader:
         """See `extract`."""
         secrets = [derive(key, salt).expand("robust/header", 32) for salt in self._salts.salts[:SALTS]]
         damaged: Counter[bytes] = Counter()
-        for header, carriers in self._headers(secrets):
+        for header, offset in self._headers(secrets):
             damaged[header.data_key] += 1
             if damaged[header.data_key] > 1:
                 continue
+            carriers = _without_headers(self._refined(header, offset), secrets)
             for garbage in (header_share(carriers) + _CHANGED, _MERGED):
                 payload = _payload(header, carriers, garbage)
                 if payload is not None:
@@ -74,8 +75,8 @@ class Reader:
             raise InputError(_DAMAGED)
         raise WrongKeyError(_OPENS_NOTHING)
 
-    def _headers(self, secrets: list[bytes]) -> Iterator[tuple[Header, Carriers]]:
-        """What the key opens, each with the carriers under the names that it was found with."""
+    def _headers(self, secrets: list[bytes]) -> Iterator[tuple[Header, float]]:
+        """What the key opens, each with what it took for a log scale of zero."""
         found = False
         for offset in self._offsets():
             carriers = self._numbers.carriers(offset)
@@ -84,8 +85,7 @@ class Reader:
                 header = read_header(secret, carriers, thorough=not scaled)
                 if header is not None:
                     found = True
-                    refined = self._refined(header, offset, carriers)
-                    yield header, _without_headers(refined, secrets)
+                    yield header, offset
         if not found:  # the same work as where there is something
             header = Header(bytes(DATA_KEY_BYTES), LEVELS // 2, 0, (1 << CLASSES) - 1, 0)
             _payload(header, self._numbers.carriers(0.0), _CHANGED)
@@ -98,8 +98,9 @@ class Reader:
         steps = int(CELL / _FINEST)
         yield from (size + step * _FINEST for step in sorted(range(-steps, steps + 1), key=abs))
 
-    def _refined(self, header: Header, offset: float, carriers: Carriers) -> Carriers:
-        """The carriers under better names, where the model was scaled: those that fit the lattice best."""
+    def _refined(self, header: Header, offset: float) -> Carriers:
+        """The carriers; where the model was scaled, under the names with which they fit the lattice best."""
+        carriers = self._numbers.carriers(offset)
         if offset % CELL == 0:
             return carriers
         for reach, step in _REFINED:
