@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from keyss._verbs.filing import open_file_in
 from keyss.core.errors import InputError, KeyssError, QualityError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
@@ -18,9 +19,7 @@ from keyss.files.models import (
     model_of_bytes,
 )
 from keyss.files.streams import StandardOutput, is_standard
-from keyss.methods import registry
 from keyss.methods.dither import cost
-from keyss.methods.hidden_file import HiddenFile
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import PathLike
 from keyss.runs.folder import check_not_published
@@ -108,9 +107,9 @@ def _opened(model: Gaussians, key: str, device: torch.device, beside: Path | Non
     """How much a key opens: Gaussians of a scene, or bytes of a file. Raises WrongKeyError, InputError."""
     try:
         return reveal_model(model, key, device=device, beside=beside).remains.found, "Gaussians"
-    except InputError as error:
+    except (InputError, WrongKeyError) as error:
         try:
-            return len(HiddenFile.of(registry.open_content(model, key)).data), "bytes"
+            return len(open_file_in(model, key).data), "bytes"
         except KeyssError:
             raise error from None
 

@@ -1,4 +1,4 @@
-"""`hide_files` and `reveal_file`: any files in the low bits of a model."""
+"""`hide_files` and `reveal_file`: any files in a model's low bits, or in colours that survive rounding."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from keyss._verbs.asking import check_keys
+from keyss.channels import robust
 from keyss.channels.low_bits import LOW_BITS
-from keyss.core.errors import UsageError
+from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.models import read_model
@@ -23,6 +25,8 @@ from keyss.runs.config import PathLike
 from keyss.runs.files import STEGO, writers
 from keyss.runs.folder import RunFolder, check_not_published
 from keyss.runs.opening import as_model, naming_what_opens_nothing
+
+Publish = Literal["ply", "any"]
 
 
 @dataclass(frozen=True)
@@ -54,13 +58,17 @@ def hide_files(
     cover: PathLike | Gaussians,
     files: Sequence[SecretFile],
     *,
+    publish: Publish = "ply",
+    strength: float = robust.STRENGTH,
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> HideFilesResult:
-    """Hide files in the low bits of a model, each under its own key, and open them again as a reader will.
+    """Hide files in a model, each under its own key, and open them again as a reader will.
 
-    `out` (a folder) gets `publish/stego.ply`. Raises InputError for a cover whose low bits are not random,
-    UsageError for files that do not fit, which names the size of a model that would do, and for equal keys.
+    `publish`: "ply" writes into low bits, for a file that is passed on as it is; "any" into colours, which
+    survive formats that round, at a cost of `strength` (dB PSNR that views of the model keep at least). `out`
+    (a folder) gets `publish/stego.ply`. Raises InputError for a cover whose low bits are not random, or that
+    has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal keys.
     """
     if not files:
         raise UsageError("expected at least one file to hide")
@@ -72,12 +80,16 @@ def hide_files(
         folder = RunFolder(out, "hide files", writes=(STEGO,), inputs=inputs, overwrite=overwrite)
     hidden, model = [each.read() for each in files], as_model(cover)
     keys = [each.key for each in files]
-    payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
-    stego = LOW_BITS.prepare(model).embed(payloads)
+    if publish == "any":
+        packed = [(key, each.packed()) for key, each in zip(keys, hidden, strict=True)]
+        stego = robust.embed(model, packed, strength=strength)
+    else:
+        payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
+        stego = LOW_BITS.prepare(model).embed(payloads)
     with folder.work() if folder else nullcontext():
         there = folder.write(writers({STEGO: stego})) if folder else None
         as_read = read_model(there / STEGO) if there else stego
-        if [HiddenFile.of(LOW_BITS.extract(as_read, key)) for key in keys] != hidden:
+        if [open_file_in(as_read, key) for key in keys] != hidden:
             raise RuntimeError("what was written does not open again as it should")
     return HideFilesResult(stego, cost(model, stego), tuple(len(each.data) for each in hidden))
 
@@ -95,7 +107,15 @@ def reveal_file(
         path = check_output_file(out, overwrite)
         check_not_published(path)
     with naming_what_opens_nothing():
-        found = HiddenFile.of(registry.open_content(as_model(stego), key))
+        found = open_file_in(as_model(stego), key)
     if path is not None:
         write_bytes(path, found.data)
     return found
+
+
+def open_file_in(stego: Gaussians, key: str) -> HiddenFile:
+    """What `key` opens in low bits, or else in colours. Raises WrongKeyError and InputError."""
+    try:
+        return HiddenFile.of(registry.open_content(stego, key))
+    except WrongKeyError:
+        return HiddenFile.unpacked(robust.extract(stego, key))

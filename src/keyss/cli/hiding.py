@@ -51,6 +51,13 @@ def hide(
         UseAppendAction[tuple[Path, ...]],
         optional("FILE", "Any file to hide, in a cover that is a model; once for each.", "scenes are hidden"),
     ] = (),
+    publish: Annotated[
+        Literal["ply", "any"],
+        arg(
+            help="Formats that hidden files are to survive: any for those that round, too, at 45 dB between "
+            "pictures before and after."
+        ),
+    ] = "ply",
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
     out: OutFolder,
@@ -106,8 +113,12 @@ def hide(
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
-        _hide_files(cover, secret_file, key_file, out, overwrite)
+        _hide_files(cover, secret_file, publish, key_file, out, overwrite)
         return
+    if publish != "ply":
+        raise UsageError(
+            "--publish any is for files (--secret-file); scenes take --sidecar for other formats"
+        )
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
     if secret_model and len(secret_model) != len(secret):
@@ -186,7 +197,12 @@ def hide(
 
 
 def _hide_files(
-    cover: Path, files: Sequence[Path], key_file: Sequence[Path], out: Path, overwrite: bool
+    cover: Path,
+    files: Sequence[Path],
+    publish: Literal["ply", "any"],
+    key_file: Sequence[Path],
+    out: Path,
+    overwrite: bool,
 ) -> None:
     """`keyss hide --secret-file`."""
     from keyss import api
@@ -202,11 +218,12 @@ def _hide_files(
     opening = keys(key_file, len(files), confirm=True)
     warn_of_doubtful_keys(opening)
     secrets = [api.SecretFile(file, key) for file, key in zip(files, opening, strict=True)]
-    result = api.hide_files(cover, secrets, out=out, overwrite=overwrite)
+    result = api.hide_files(cover, secrets, publish=publish, out=out, overwrite=overwrite)
     for file, size in zip(files, result.sizes, strict=True):
         print(f"{file.name}: {size:,} bytes, opened again from what was written")
     print(f"The cover's views changed by {result.psnr:.0f} dB PSNR")
-    print_files(out, {"publish/stego.ply": "publish this, byte for byte as it is"})
+    how = "as it is, or converted" if publish == "any" else "byte for byte as it is"
+    print_files(out, {"publish/stego.ply": f"publish this, {how}"})
 
 
 def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:

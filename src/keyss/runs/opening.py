@@ -28,7 +28,8 @@ MOST_SIDECAR_BYTES = 1 << 30
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
     "(converted or quantised, moved, scaled, pruned, edited or trained on); its sidecar "
-    f"({Path(SIDECAR).name}) may be missing or another one; or nothing is hidden here"
+    f"({Path(SIDECAR).name}) may be missing or another one; it may be a file that is hidden, which comes out "
+    "under a name that is no model's; or nothing is hidden here"
 )
 
 
