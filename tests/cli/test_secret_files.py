@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from channels.low_bits.trained_like import trained_like
+from channels.robust.made import cover
 from cli.said import Said, assert_refused, listing
 from keyss import api, write_model
 from keyss.channels.base import Payload
@@ -84,10 +86,37 @@ def test_a_file_too_large_for_its_cover_is_told_what_would_do(tmp_path: Path) ->
         api.hide_files(trained_like(2000), [api.SecretFile(os.urandom(90_000), KEYS[0])])
 
 
+def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
+    keyss: Keyss, folder: Path, tmp_path: Path
+) -> None:
+    write_model(tmp_path / "cover.ply", cover(6000))
+    (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)
+    key, out = ("--key-file", folder / "key0"), tmp_path / "out"
+    hide = ("hide", "--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "note.txt", *key)
+    said = keyss(*hide, "--publish", "any", "-o", out)
+    assert (said.status, said.err) == (0, "")
+    assert "or converted" in said.out
+    said = keyss("convert", out / "publish" / "stego.ply", tmp_path / "web.spz", *key)
+    assert (said.status, said.err) == (0, "")
+    assert keyss("reveal", tmp_path / "web.spz", *key, "-o", tmp_path / "back").status == 0
+    assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()
+    said = keyss("reveal", tmp_path / "web.spz", "--key-file", folder / "key1", "-o", tmp_path / "none")
+    assert_refused(said, 3, "opens nothing")
+    scene = ("hide", "--cover", tmp_path / "cover.ply", "--secret", tmp_path / "cover.ply", *key)
+    assert_refused(keyss(*scene, "--publish", "any", "-o", tmp_path / "x"), 2, "is for files")
+
+
 @given(st.binary(max_size=400), st.text(max_size=60))
 def test_any_bytes_and_any_name_come_back(data: bytes, name: str) -> None:
     file = HiddenFile(name.encode(errors="replace").decode(), data)
     assert HiddenFile.of(file.payload()) == file
+    assert HiddenFile.unpacked(file.packed()) == file
+
+
+@pytest.mark.parametrize("data", [b"", b"\1", b"\1junk", b"\1" + zlib.compress(bytes(10**6)), b"\0"])
+def test_what_no_writer_packed_is_refused(data: bytes) -> None:
+    with pytest.raises(InputError):
+        HiddenFile.unpacked(data)
 
 
 @given(st.binary(max_size=300))
