@@ -157,10 +157,7 @@ def serialise(codes: SogCodes) -> bytes:
 
 def dequantise(codes: SogCodes) -> Gaussians:
     """The model that codes stand for. Raises InputError where it is not finite."""
-    extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
-    logs = codes.mins + extent * (codes.positions / _FINEST)
-    with np.errstate(over="ignore"):
-        means = np.copysign(np.expm1(np.abs(logs)), logs)
+    means = positions_of(codes, codes.positions)
     rotations = (codes.rotations / 255 * 2 - 1) * np.sqrt(0.5)
     palette = codes.sh_codebook[codes.palette] if codes.palette.size else np.empty((1, 0, 3), np.float32)
     return gaussians_of(
@@ -171,6 +168,15 @@ def dequantise(codes: SogCodes) -> Gaussians:
         codes.color_codebook[codes.colors],
         palette[codes.labels],
     )
+
+
+def positions_of(codes: SogCodes, levels: npt.NDArray[Any]) -> Doubles:
+    """[N, 3] world positions that `levels`, 0 to 65535, stand for in a file; they need not be integers."""
+    extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
+    logs = codes.mins + extent * (levels / _FINEST)
+    with np.errstate(over="ignore"):
+        found: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
+    return found
 
 
 def quantise(model: Gaussians) -> SogCodes:
