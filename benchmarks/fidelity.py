@@ -134,7 +134,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
         "metrics": msgspec.to_builtins(metrics),
         "history": watch.history,
         "near": near_and_wrong(out, keys, scenes, seed),
-        "cost": step_cost(scenes, models, config),
+        "cost": None if config.in_records else step_cost(scenes, models, config),
     }
     write_bytes(out / "fidelity.json", json.dumps(result, indent=1).encode())
     return result
@@ -219,7 +219,7 @@ def row(result: dict[str, Any]) -> list[str]:
         against("wrong"),
         against("near"),
         f"{near['refused']} of {near['keys']}",
-        f"{result['cost']:.2f}",
+        f"{result['cost']:.2f}" if result["cost"] else "as plain",
         f"{metrics['seconds']:.0f}",
     ]
 
@@ -270,7 +270,8 @@ def numbers_and_ratios(results: Iterable[dict[str, Any]]) -> tuple[dict[str, flo
         for index, each in enumerate(metrics["secrets"], 1):
             numbers[f"{name}: secret {index}, dB"] = each["psnr"]
         numbers[f"{name}: hiding, s"] = metrics["seconds"]
-        ratios[f"{name}: step / plain step"] = result["cost"]
+        if result["cost"]:
+            ratios[f"{name}: step / plain step"] = result["cost"]
     return numbers, ratios
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from cli.said import COMMANDS, Said
 from keyss import __version__
+from keyss.audit.parts import PARTS
 from keyss.files.ply import write_ply
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.methods import registry
@@ -76,6 +77,11 @@ class TestHelp:
             said = "".join(keyss(*command, "--help").out.replace("│", " ").split())
             for name, fit in fits.items():
                 assert f"{name}{fit.iterations:,}and{fit.max_gaussians:,}" in said
+
+    def test_offers_the_parts_of_an_audit_there_are(self, keyss: Callable[..., Said]) -> None:
+        said = " ".join(keyss("audit", "--help").out.replace("│", " ").split())
+        *others, last = PARTS
+        assert f"{', '.join(others)} or {last}; once for each" in said
 
     @pytest.mark.parametrize("method", ["learned", "carry"])
     def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:

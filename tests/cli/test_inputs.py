@@ -56,7 +56,7 @@ def test_another_folder_in_place_of_a_model_is_called_one(keyss: Keyss, world: P
         ("render", world / "a", "--cameras", world / "a"),
     ):
         said = keyss(*arguments, "-o", tmp_path / "out.ply")
-        assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.ply), found a folder")
+        assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.compressed.ply, ")
 
 
 @pytest.mark.parametrize("inside", ["publish/stego.ply", "publish", "private", "private/config.json"])
@@ -76,12 +76,11 @@ def test_what_is_no_run_is_not_evaluated(keyss: Keyss, world: Path, path: str) -
 
 
 FOREIGN = {
-    "scene.spz": (b"\x1f\x8b\x08\0" * 9, "an SPZ model", "splat-transform"),
-    "scene.sog": (b"PK\x03\x04" * 9, "an SOG model", "splat-transform"),
-    "scene.splat": (bytes(64), "a .splat model", "splat-transform"),
+    "scene.lcc": (b"{}", "an LCC model", "splat-transform"),
+    "scene.gltf": (b"{}", "a glTF file with its data beside it", "export a .glb"),
     "scene.csv": (b"x,y,z\n0,0,0\n", "a table", "export a .ply"),
     "photo.jpg": (b"\xff\xd8\xff\xe0", "a picture", "poses"),
-    "archive": (b"PK\x03\x04" * 9, "a ZIP archive", "unpack"),
+    "archive": (b"7z\xbc\xaf\x27\x1c" * 9, "an archive", "unpack"),
 }
 
 
@@ -103,7 +102,35 @@ def test_foreign_files_are_called_what_they_are(keyss: Keyss, world: Path, tmp_p
         assert_refused(said, 4, f"found {kind}")
         assert str(path) in said.err
         assert advice in said.err
-    assert "expected a scene folder or a 3DGS model (.ply)" in said.err
+    assert "expected a scene folder or a 3DGS model (.compressed.ply, .ply" in said.err
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *(("a.spz", b"\x1f\x8b\x08\0" * 9), ("a.sog", b"PK\x03\x04" * 9), ("a.splat", bytes(65))),
+        *(
+            ("a.ksplat", bytes(65)),
+            ("a.glb", b"glTF" * 9),
+            ("meta.json", b"{}"),
+            ("archive", b"PK\x03\x04" * 9),
+        ),
+    ],
+)
+def test_damaged_models_of_all_formats(
+    keyss: Keyss, world: Path, tmp_path: Path, name: str, content: bytes
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    before = listing(tmp_path)
+    for said in (
+        keyss("verify", tmp_path / name),
+        keyss("convert", tmp_path / name, tmp_path / "out.ply"),
+        keyss(
+            "hide", *key(world), "-o", tmp_path / "out", "--cover", world / "a", "--secret", tmp_path / name
+        ),
+    ):
+        assert_refused(said, 4, str(tmp_path / name))
     assert listing(tmp_path) == before
 
 

@@ -21,6 +21,7 @@ from keyss.channels.low_bits import LOW_BITS, cells, reading
 from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
+from keyss.files import read_model
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey, random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
@@ -251,13 +252,20 @@ class TestOutputs:
         assert_refused(said, 2, "is the input")
         assert listing(tmp_path) == before
 
-    @pytest.mark.parametrize("name", ["x.spz", "x.splat", "x.txt", "x.compressed.ply", "x"])
+    @pytest.mark.parametrize("name", ["x.ksplat", "x.lcc", "x.txt", "meta.json", "x"])
     def test_other_formats_are_refused_before_any_work(
         self, keyss: Run, files: Path, tmp_path: Path, name: str
     ) -> None:
         arguments = ("reveal", tmp_path / "nothing.ply", "--key-file", files / "key", "-o", tmp_path / name)
-        assert_refused(keyss(*arguments), 2, "expected a name that ends in .ply")
+        assert_refused(keyss(*arguments), 2, "expected a name that ends in .compressed.ply, .ply, .spz, ")
         assert listing(tmp_path) == {}
+
+    @pytest.mark.parametrize("name", ["secret.spz", "secret.compressed.ply"])
+    def test_a_secret_comes_in_the_format_that_is_asked_for(
+        self, keyss: Run, files: Path, tmp_path: Path, name: str
+    ) -> None:
+        said = keyss("reveal", files / "whole.ply", "--key-file", files / "key", "-o", tmp_path / name)
+        assert (said.status, len(read_model(tmp_path / name))) == (0, 500)
 
 
 class TestStreams:

@@ -23,11 +23,13 @@ def _started(arguments: list[object]) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True)
     status = Path(f"/proc/{process.pid}/status")
+    # The last that is provided for, and not ignored, as under nohup.
+    last = next(each for each in (signal.SIGHUP, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN)
     if not status.exists():
         time.sleep(0.5)
     while status.exists() and process.poll() is None:
         caught = next(line for line in status.read_text().splitlines() if line.startswith("SigCgt"))
-        if int(caught.split()[1], 16) >> (signal.SIGHUP - 1) & 1:  # the last that is provided for
+        if int(caught.split()[1], 16) >> (last - 1) & 1:
             break
         time.sleep(0.001)
     return process

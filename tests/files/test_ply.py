@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tracemalloc
 from pathlib import Path
 
 import gsply
@@ -273,6 +274,25 @@ def test_broken_ascii(tmp_path: Path, tail: bytes) -> None:
     head, body = ply_bytes(columns_of(random_gaussians(5, 0)), form="ascii").split(b"end_header\n")
     (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.rsplit(b" ", 1)[0] + b" " + tail)
     with pytest.raises(InputError, match="cut short or hold something not a number"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_ascii_in_one_line_takes_no_more_memory_than_in_lines(tmp_path: Path) -> None:
+    head, body = ply_bytes(columns_of(random_gaussians(6000, 3)), form="ascii").split(b"end_header\n")
+    peaks = []
+    for separator in (b"\n", b" "):
+        (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.replace(b"\n", separator))
+        tracemalloc.start()
+        read_ply(tmp_path / "a.ply")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.5 * peaks[0]
+
+
+def test_one_number_without_end(tmp_path: Path) -> None:
+    head = ply_bytes(columns_of(random_gaussians(5, 0)), form="ascii").split(b"end_header\n")[0]
+    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + b"1" * 3_000_000)
+    with pytest.raises(InputError, match="not a number"):
         read_ply(tmp_path / "a.ply")
 
 

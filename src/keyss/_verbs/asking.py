@@ -19,7 +19,7 @@ from keyss.runs.opening import as_model
 
 @dataclass(frozen=True)
 class Secret:
-    """A scene, a .ply file or a model to hide, and the key that is to open it."""
+    """A scene, a model or the file of one to hide, and the key that is to open it."""
 
     scene: PathLike | Scene | Gaussians
     key: str = field(repr=False)

@@ -62,8 +62,8 @@ def hide(
 ) -> HideResult:
     """Hide every secret in the cover, and measure the result on the test views.
 
-    Cover and secrets are scenes, or `.ply` models, of which pictures are rendered. Plain models of all scenes
-    come first unless they are given. `method`: a name for default options, or a method's own options
+    Cover and secrets are scenes, or models of any format, of which pictures are rendered. Plain models of all
+    scenes come first unless they are given. `method`: a name for default options, or a method's own options
     (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
     Without a seed in the options' `fit` the run draws one from the system, and `config.json` records it; to
     be resumed it needs none.

@@ -40,10 +40,12 @@ DEFAULT_METHOD = "learned"
 
 def hide(
     *,
-    cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see, or a .ply model.")],
+    cover: Annotated[
+        Path, arg(metavar="SCENE", help="Scene that everybody may see, or a model (.ply, .spz, ...).")
+    ],
     secret: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        arg(metavar="SCENE", help="Scene or .ply model to hide in it; at least one."),
+        arg(metavar="SCENE", help="Scene or model to hide in it; at least one."),
     ],
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
@@ -229,7 +231,7 @@ def _with_options_of(method: Method) -> Callable[..., None]:
 def _preset_help(method: Method) -> str:
     """What the presets of a method come to."""
     sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
-    return f"Size and kind of a run on photos; .ply models bring their size along. {sizes}"
+    return f"Size and kind of a run on photos; models bring their size along. {sizes}"
 
 
 def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
@@ -253,16 +255,19 @@ def _flags(method: Method) -> set[str]:
 
 
 def reveal(
-    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published .ply, or - for stdin.")],
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="The published model, or - for stdin.")],
     *,
     key_file: Annotated[
         UseAppendAction[tuple[Path, ...]],
         optional("FILE", "File with the key.", "KEYSS_KEY, or a hidden prompt"),
     ] = (),
-    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE", help="The .ply to write, or - for stdout.")],
+    out: Annotated[
+        Path,
+        arg(aliases=["-o"], metavar="FILE", help="The model to write (.ply, .spz, ...), or - for stdout."),
+    ],
     decoder: Annotated[
         Path | None,
-        optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
+        optional("FILE", "A sidecar.", "decoder.sealed beside the model, else what is in it"),
     ] = None,
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
@@ -271,7 +276,7 @@ def reveal(
     force: Annotated[
         bool,
         arg(
-            help="For a .ply that was quantised or pruned: skip the check that the decoder belongs to it, "
+            help="For a model that was quantised or pruned: skip the check that the decoder belongs to it, "
             "and write what there is."
         ),
     ] = False,
@@ -307,14 +312,16 @@ def reveal(
 
 
 def verify(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="A 3DGS .ply, or - for stdin.")],
+    model: Annotated[
+        Positional[Path], arg(metavar="FILE", help="A 3DGS model (.ply, .spz, ...), or - for stdin.")
+    ],
     *,
     key_file: Annotated[
         Path | None, optional("FILE", "File with a key: check what it opens.", "the model alone is checked")
     ] = None,
     decoder: Annotated[
         Path | None,
-        optional("FILE", "A sidecar.", "decoder.sealed beside the .ply, else what is in the .ply"),
+        optional("FILE", "A sidecar.", "decoder.sealed beside the model, else what is in it"),
     ] = None,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
     device: Device = "auto",

@@ -6,13 +6,14 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import Device, KeyFiles, Overwrite, Resume, checked_seed, optional
 
 PartName = Literal["images", "parameters", "stealth", "stegexpose", "leaks", "robustness", "speed"]
+_PARTS = get_args(PartName)
 
 
 def evaluate(
@@ -27,7 +28,7 @@ def evaluate(
 ) -> None:
     """Measure a hiding run on test views, with the keys and with wrong ones.
 
-    Test views are photos that were not trained on or, of a .ply model, renders of it. Beside each number
+    Test views are photos that were not trained on or, of a model, renders of it. Beside each number
     stands the baseline, which is that of the scene's plain model (3DGS with nothing hidden). Chance level is
     what the stego model itself reaches against the secret: a wrong key should not get above it.
 
@@ -96,7 +97,7 @@ def audit(
         UseAppendAction[tuple[PartName, ...]],
         optional(
             "PART",
-            "A part: images, parameters, stegexpose, leaks, robustness or speed; once for each.",
+            f"A part: {', '.join(_PARTS[:-1])} or {_PARTS[-1]}; once for each.",
             "all of them",
         ),
     ] = (),

@@ -177,9 +177,11 @@ def _for_writing(path: Path | str) -> tuple[ModelFormat, Callable[[Path | Standa
 def _by_content(path: Path | StandardInput) -> ModelFormat:
     try:
         if path.is_dir():
-            raise InputError(f"{path}: expected the file of a 3DGS model ({_known()}), found a folder")
+            raise InputError(
+                f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found a folder"
+            )
         if not path.is_file():
-            raise InputError(f"{path}: expected a 3DGS model ({_known()}), but there is no such file")
+            raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
         with path.open("rb") as file:
             start = file.read(max(len(magic) for each in FORMATS for magic in each.magic))
     except OSError as error:
@@ -189,7 +191,7 @@ def _by_content(path: Path | StandardInput) -> ModelFormat:
     if named in fitting or (named and start and not named.magic and not fitting):
         return named
     if not fitting:
-        raise InputError(f"{path}: expected a 3DGS model ({_known()}), found {what_it_is(path)}")
+        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), found {what_it_is(path)}")
     found = fitting[-1]
     if named is not None:
         raise InputError(
@@ -199,5 +201,6 @@ def _by_content(path: Path | StandardInput) -> ModelFormat:
     return found
 
 
-def _known() -> str:
+def known_suffixes() -> str:
+    """Ends of names of the formats that are read, as they stand in messages."""
     return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -24,6 +24,7 @@ from keyss.files.streams import StandardInput
 MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
+_MAX_TOKEN_BYTES = 4096  # of one number in text
 _GREY = 128  # for points without colours
 
 _SCALARS = {
@@ -208,16 +209,34 @@ def _read_ascii(
 ) -> npt.NDArray[np.float32]:
     """The values in text, after `skipped` values. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
-    tokens = (token for line in file for token in line.split())
+    columns = [list(vertex.properties).index(name) for name in names]
+    rows = np.empty((vertex.count, len(names)), dtype=np.float32)
+    step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
+    tokens = _tokens(file)
     try:
         for _ in range(skipped):
             next(tokens)
-        values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=vertex.count * width)
+        for start in range(0, vertex.count, step):
+            part = rows[start : start + step]
+            count = len(part) * width
+            values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=count)
+            with np.errstate(over="ignore"):
+                part[:] = values.reshape(len(part), width)[:, columns]
     except (StopIteration, ValueError) as error:
         raise InputError(f"{path}: the ascii data are cut short or hold something not a number") from error
-    columns = [list(vertex.properties).index(name) for name in names]
-    with np.errstate(over="ignore"):
-        return values.reshape(vertex.count, width)[:, columns].astype(np.float32)
+    return rows
+
+
+def _tokens(file: BinaryIO) -> Iterator[bytes]:
+    """What white space separates, however long the lines are; ValueError for what is longer than a number."""
+    rest = b""
+    while data := file.read(_CHUNK_BYTES):
+        *whole, rest = re.split(rb"[ \t\r\n\f\v]+", rest + data)
+        yield from filter(None, whole)
+        if len(rest) > _MAX_TOKEN_BYTES:
+            raise ValueError("not a number")
+    if rest:
+        yield rest
 
 
 def read_point_cloud(path: Path) -> PointCloud:

@@ -1,7 +1,8 @@
-"""Plain 3DGS: one scene from its training photos (Kerbl et al. 2023)."""
+"""Plain 3DGS: one scene from its training photos (Kerbl et al. 2023), or a model of it trained on."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from keyss.fitting.parameters import (
 from keyss.fitting.sampling import Shuffle
 from keyss.rendering import render_with_meta
 
+LAST_RATE = 0.1  # of the rates of a model trained on, reached over the second half of the run
+
 
 @dataclass(frozen=True)
 class FitResult:
@@ -37,10 +40,16 @@ class FitResult:
 
 
 class PlainRun:
-    """The state of a plain 3DGS training and its step."""
+    """The state of a plain 3DGS training and its step.
 
-    def __init__(self, scene: Scene, config: FitConfig, device: torch.device) -> None:
+    With a `model` it starts from that one, which keeps the number of its Gaussians.
+    """
+
+    def __init__(
+        self, scene: Scene, config: FitConfig, device: torch.device, model: Gaussians | None = None
+    ) -> None:
         self.config = config
+        self.grows = model is None
         self.device = device
         self.views = scene.train
         self.watched = subsample_views(scene.test, 8)
@@ -48,11 +57,12 @@ class PlainRun:
         self.iterations = config.iterations
         self.iteration = 0
         self.generator = torch.Generator().manual_seed(config.known_seed)
-        points, colors = initial_points(scene, config.max_gaussians, self.generator)
-        start = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
-        self.parameters = to_parameters(start, device)
-        self.means_rate = config.means_rate * scene.extent
+        if model is None:
+            points, colors = initial_points(scene, config.max_gaussians, self.generator)
+            model = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
+        self.parameters = to_parameters(model, device)
         self.optimizers = make_optimizers(self.parameters, config, scene.extent)
+        self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
         self.strategy = CappedStrategy(config)
         self.density: dict[str, Any] = self.strategy.initialize_state(scene.extent)
         self.shuffle = Shuffle(len(self.views), self.generator)
@@ -64,18 +74,31 @@ class PlainRun:
         config = self.config
         view = self.views[self.shuffle.draw()]
         self.iteration += 1
-        degree = config.sh_degree_at(self.iteration)
+        degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
         model = to_gaussians(self.parameters)
         image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
         loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
-        self.strategy.step_pre_backward(self.parameters, self.optimizers, self.density, self.iteration, meta)
+        if self.grows:
+            self.strategy.step_pre_backward(
+                self.parameters, self.optimizers, self.density, self.iteration, meta
+            )
         loss.backward()
-        decay = 0.01 ** (self.iteration / config.iterations)
-        self.optimizers["means"].param_groups[0]["lr"] = self.means_rate * decay
+        self._set_rates()
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, meta)
+        if self.grows:
+            self.strategy.step_post_backward(
+                self.parameters, self.optimizers, self.density, self.iteration, meta
+            )
+
+    def _set_rates(self) -> None:
+        progress = self.iteration / self.config.iterations
+        # At constant rates Gaussians jitter around their optimum; where none are added, they can settle.
+        late = 1.0 if self.grows else LAST_RATE ** max(0.0, 2 * progress - 1)
+        for name, optimizer in self.optimizers.items():
+            decay = 0.01**progress if name == "means" else late
+            optimizer.param_groups[0]["lr"] = self.rates[name] * decay
 
     def gaussians(self) -> Gaussians:
         return to_gaussians(self.parameters).detach()
@@ -112,10 +135,49 @@ def fit_scene(
     """
     config = (config or FitConfig()).seeded()
     run = PlainRun(scene, config, torch.device(device))
-    seconds = train(
+    seconds = _train(run, title, {"scene": scene.digest()}, checkpoint, resume, reporter)
+    return FitResult(without_faint(run.gaussians().to("cpu"), config.prune_opacity), replace(config), seconds)
+
+
+def refit_model(
+    scene: Scene,
+    model: Gaussians,
+    config: FitConfig,
+    *,
+    rate: float = 1.0,
+    device: torch.device | str = "cpu",
+    title: str = "refit",
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> FitResult:
+    """Train `model` on to the training views of `scene`, with as many Gaussians as it has.
+
+    `rate`: a factor on all rates of `config`, whose degree and cap do not count. Raises as `fit_scene`.
+    """
+    rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
+    config = replace(config.seeded(), sh_degree=model.sh_degree, **rates)
+    run = PlainRun(scene, config, torch.device(device), model)
+    digest = hashlib.sha256(b"".join(values.numpy().tobytes() for values in vars(model).values()))
+    inputs = {"scene": scene.digest(), "model": digest.hexdigest()}
+    seconds = _train(run, title, inputs, checkpoint, resume, reporter)
+    return FitResult(run.gaussians().to("cpu"), config, seconds)
+
+
+def _train(
+    run: PlainRun,
+    title: str,
+    inputs: dict[str, str],
+    checkpoint: Path | None,
+    resume: bool,
+    reporter: Reporter | None,
+) -> float:
+    """Seconds that it took; see `train`. `inputs`: digests of what the run starts from."""
+    config = run.config
+    return train(
         run,
         title,
-        fingerprint={"scene": scene.digest(), "config": asdict(config), "device": str(device)},
+        fingerprint={**inputs, "config": asdict(config), "device": str(run.device)},
         seed=config.known_seed,
         checkpoint=checkpoint,
         resume=resume,
@@ -123,7 +185,6 @@ def fit_scene(
         evaluate_every=config.evaluate_every,
         reporter=reporter,
     )
-    return FitResult(without_faint(run.gaussians().to("cpu"), config.prune_opacity), replace(config), seconds)
 
 
 def without_faint(model: Gaussians, least: float) -> Gaussians:

@@ -43,6 +43,7 @@ class Outlook:
     asked: int  # Gaussians that the secrets have together, at most
     capacity: int  # of these, how many fit
     steps: int = 0  # of the method's own training
+    drawn: tuple[int, ...] = ()  # Gaussians of the cover and of each secret that a step of it draws
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each
 
 

@@ -79,7 +79,7 @@ class SidecarInfo:
 
 
 def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    """What is in a PLY, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
+    """What is in a model, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
     InputError.
 
     Photos that a scene names but that are not there are left out, with a KeyssWarning.
@@ -117,14 +117,15 @@ def _folder_info(path: Path) -> RunInfo | SceneInfo:
 
 def _sidecar_info(path: Path) -> SidecarInfo:
     from keyss.channels.sidecar import MAGIC, read_header
+    from keyss.files.models import known_suffixes
     from keyss.runs.opening import read_sidecar
 
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
     if start != MAGIC:
         raise InputError(
-            f"{path}: expected a model (.ply), a sidecar, a scene folder or a result folder, "
-            f"found {what_it_is(path)}"
+            f"{path}: expected a model ({known_suffixes()}), a sidecar, a scene folder or a result "
+            f"folder, found {what_it_is(path)}"
         )
     try:
         costs, _, _ = read_header(read_sidecar(path))

@@ -11,7 +11,7 @@ from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.foreign import what_it_is
-from keyss.files.models import read_model
+from keyss.files.models import known_suffixes, read_model
 from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
 from keyss.files.streams import is_standard
@@ -128,7 +128,7 @@ def as_scene(
     train_pictures: bool = True,
     skip_missing: bool = False,
 ) -> Scene:
-    """A scene, the photos in a folder, or what a model or the one in a `.ply` shows from all around.
+    """A scene, the photos in a folder, or what a model or the one in its file shows from all around.
 
     `train_pictures`: see `scene_of_model`. `skip_missing`: see `load_scene`.
     """
@@ -137,7 +137,9 @@ def as_scene(
     if not isinstance(source, Gaussians) and not is_model(source):
         if os.path.exists(source) and not os.path.isdir(source):
             found = what_it_is(Path(source))
-            raise InputError(f"{source}: expected a scene folder or a 3DGS model (.ply), found {found}")
+            raise InputError(
+                f"{source}: expected a scene folder or a 3DGS model ({known_suffixes()}), found {found}"
+            )
         try:
             return load_scene(source, width=width, background=background, skip_missing=skip_missing)
         except InputError as error:
@@ -151,7 +153,7 @@ def as_scene(
 
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
-    """A model, or the one in a `.ply`, on the CPU. Raises InputError, which knows folders of runs."""
+    """A model, or the one in a file, on the CPU. Raises InputError, which knows folders of runs."""
     if isinstance(source, Gaussians):
         return source.to("cpu")
     if inside := model_in(Path(source)):

@@ -96,7 +96,7 @@ def plan_hiding(
         if each.model is None:
             stages.append(_fitting(f"plain model of the {role}", options.fit, probe, sizes[index]))
     if method.trains:
-        stages.append(_hiding(options.fit, probes, sizes, outlook))
+        stages.append(_hiding(options.fit, probes, outlook))
     writing = _KEY_SECONDS * len(inputs[1:]) + _CODING_SECONDS * outlook.gaussians
     stages.append(Stage("encrypting, opening again", 0, outlook.gaussians, writing))
     stages.append(
@@ -247,13 +247,12 @@ def _fitting(name: str, config: FitConfig, probe: _Probe, most: int) -> Stage:
     return Stage(name, config.iterations, most, config.iterations * each + _watching(config, [probe], [most]))
 
 
-def _hiding(config: FitConfig, probes: Sequence[_Probe], sizes: Sequence[int], outlook: Outlook) -> Stage:
-    """A joint training: a picture of every scene in each step."""
-    share = min(1.0, outlook.gaussians / sum(sizes))
-    own = [share * size for size in sizes]
-    each = sum(probe.step(size) for probe, size in zip(probes, own, strict=True))
-    seconds = outlook.steps * each + _watching(config, probes, own, outlook.steps)
-    return Stage("hiding", outlook.steps, outlook.gaussians, seconds)
+def _hiding(config: FitConfig, probes: Sequence[_Probe], outlook: Outlook) -> Stage:
+    """The method's own training: a picture of every scene that it draws in each step."""
+    drawn = [(probe, count) for probe, count in zip(probes, outlook.drawn, strict=True) if count]
+    each = sum(probe.step(count) for probe, count in drawn)
+    watching = _watching(config, [probe for probe, _ in drawn], [count for _, count in drawn], outlook.steps)
+    return Stage("hiding", outlook.steps, sum(outlook.drawn), outlook.steps * each + watching)
 
 
 def _watching(

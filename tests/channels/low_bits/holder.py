@@ -23,7 +23,7 @@ def seen_by_holder(stego: Gaussians, key: DerivedKey) -> dict[str, float]:
     content, cells = _opened(stego, key)
     found: dict[str, float] = {}
     size = max(len(content.records) if isinstance(content, Records) else 1, 1)
-    used = np.zeros(len(stego), np.int64)
+    used = np.zeros(len(next(iter(cells.values()))), np.int64)  # readers leave out copies
     for (cipher, slot), fits in cells.items():
         found[f"cells of cipher {cipher}, slot {slot}, of all Gaussians"] = float(fits.mean())
         found[f"cells of cipher {cipher}, slot {slot}, of records"] = float(fits.sum() / size)

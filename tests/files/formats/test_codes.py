@@ -215,9 +215,18 @@ def test_codebooks_are_good() -> None:
     values = np.random.default_rng(0).normal(size=50_000).astype(np.float32)
     book = codebook_of(values)
     assert (np.diff(book) >= 0).all()
-    error = float(np.square(book[nearest(book, values)] - values).mean())
-    # Panter and Dite (1951): sqrt(3) pi / 2 / 256^2 is the least that is possible for normal values.
-    assert error < 1.03 * np.sqrt(3) * np.pi / 2 / 256**2
+    errors = np.abs(book[nearest(book, values)] - values)
+    # Panter and Dite (1951): sqrt(3) pi / 2 / 256^2 is the least mean squared error for normal values. Some
+    # of it is given for rare values, which k-means would serve worse.
+    assert np.square(errors).mean() < 1.4 * np.sqrt(3) * np.pi / 2 / 256**2
+    least = KMeans(256, n_init=1, max_iter=30, random_state=0).fit(values[:, None])
+    others = np.abs(least.cluster_centers_[least.labels_, 0] - values)
+    rare = np.abs(values) > 3
+    assert np.square(errors[rare]).mean() < 0.7 * np.square(others[rare]).mean()
+    mixed = np.concatenate([values[:5000], np.zeros(5000, np.float32)])  # half of them equal
+    assert np.square(codebook_of(mixed)[nearest(codebook_of(mixed), mixed)] - mixed).mean() < 4e-5
+    some = values[:300]
+    assert np.abs(codebook_of(some)[nearest(codebook_of(some), some)] - some).max() < 0.1
     few = np.array([3, 1, 2, 1], np.float32)
     assert np.array_equal(codebook_of(few)[nearest(codebook_of(few), few)], few)
 

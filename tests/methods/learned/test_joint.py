@@ -164,26 +164,37 @@ class _InterruptAt(SilentReporter):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("base", [CONFIG, replace(CONFIG, decoder="network"), PAPER])
-def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path, base: LearnedOptions) -> None:
+@pytest.mark.parametrize(
+    ("base", "sidecar"),
+    [
+        (CONFIG, False),
+        (CONFIG, True),
+        (replace(CONFIG, decoder="network", sidecar=True), True),
+        (PAPER, True),
+    ],
+)
+def test_interrupted_at_any_stage_it_resumes_to_the_same_result(
+    tmp_path: Path, base: LearnedOptions, sidecar: bool
+) -> None:
     scenes = _scenes()[0][:2]
     config = replace(base, fit=replace(CONFIG.fit, iterations=40, grow_every=5))
 
     def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
         return hide_scenes(
-            scenes, KEYS[:1], config, sidecar=True, checkpoints=tmp_path, resume=resume, reporter=reporter
+            scenes, KEYS[:1], config, sidecar=sidecar, checkpoints=tmp_path, resume=resume, reporter=reporter
         )
 
-    whole = hide_scenes(scenes, KEYS[:1], config, sidecar=True)
+    whole = hide_scenes(scenes, KEYS[:1], config, sidecar=sidecar)
     with pytest.raises(Interrupted):
         run(False, _InterruptAt("plain model of the secret", 17))
     with pytest.raises(Interrupted):
-        run(True, _InterruptAt("hide", 23))
+        run(True, _InterruptAt("hide" if sidecar else "refit", 23))
     resumed = run(True)
     assert _same(resumed.stego, whole.stego)
     assert resumed.sidecar == whole.sidecar
+    changed = replace(config, fit=replace(config.fit, sh0_rate=1e-3))
     with pytest.raises(InputError, match="other settings"):
-        hide_scenes(scenes, ["another key"], config, sidecar=True, checkpoints=tmp_path, resume=True)
+        hide_scenes(scenes, KEYS[:1], changed, sidecar=sidecar, checkpoints=tmp_path, resume=True)
 
 
 def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
@@ -230,6 +241,10 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
         LearnedOptions(mask=("op", "sh"))
     with pytest.raises(UsageError, match="gate"):
         LearnedOptions(conditioning="bias")
+    for decoding in ({"mask": ("op", "sh"), "decoder": "network"}, {"key_encoder": "clip"}):
+        with pytest.raises(UsageError, match="`sidecar=True`"):
+            LearnedOptions(**decoding)
+        LearnedOptions(**decoding, sidecar=True)
 
 
 @pytest.mark.parametrize("preset", ["paper", "released"])

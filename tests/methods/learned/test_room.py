@@ -13,7 +13,6 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, LearnedOptions, Secret
-from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.fitting.config import FitConfig
@@ -21,7 +20,8 @@ from keyss.measure.hiding import mean_psnr
 from keyss.methods import registry
 from keyss.methods.base import SceneInput
 from keyss.methods.learned import publication
-from keyss.methods.learned.room import record_degree, with_low_bits
+from keyss.methods.learned.options import training_options
+from keyss.methods.learned.room import record_degree, secret_sizes, with_low_bits
 from keyss.rendering.orbit import scene_of_model
 from methods.learned.hiding import hide_scenes, open_secret
 from tiny_scenes import random_gaussians, tiny_scene
@@ -104,24 +104,30 @@ def test_payloads_go_to_a_sidecar_rather_than_nowhere(monkeypatch: pytest.Monkey
     assert np.isfinite(revealed.means.numpy()).all()
 
 
-def test_low_bits_that_are_not_random_after_all_get_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of models that are fitted here it is not known before; the training is not lost."""
-    prepare, seen = LOW_BITS.prepare, []
+@pytest.mark.parametrize("quantised", [False, True])
+def test_the_cover_keeps_all_but_low_bits_unless_they_are_not_random(quantised: bool) -> None:
+    cover, secret = trained_like(2000), trained_like(900, 1)
+    cover = cover.map(_steps) if quantised else cover
+    options = LearnedOptions(iterations=2)
+    result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
+    details = result.metrics.details
+    assert ("dithered_cover_psnr_against_the_one_before" in details) == quantised
+    assert [len(keyss.reveal(result.stego, KEY))] == details["gaussians_before_pruning"]
+    assert torch.equal(result.stego.means, cover.means)
+    if not quantised:
+        for name in ("quats", "log_scales", "opacity_logits", "sh"):
+            ours, theirs = (getattr(each, name).view(torch.int32) for each in (result.stego, cover))
+            assert int((ours ^ theirs).max()) < 1 << 13
+            assert int((ours ^ theirs).min()) >= 0  # neither sign nor exponent
 
-    def at_first_not(model: Gaussians) -> LowBitsCover:
-        seen.append(model)
-        if len(seen) == 1:
-            raise InputError("no low bits")
-        return prepare(model)
 
-    models = [trained_like(2000), trained_like(900, 1)]
-    monkeypatch.setattr(type(LOW_BITS), "prepare", lambda self, cover: at_first_not(cover))
-    result = keyss.hide(
-        models[0], [Secret(models[1], KEY)], method=LearnedOptions(iterations=2), width=24, min_psnr=0
-    )
-    assert len(seen) == 2
-    assert "dithered_cover_psnr_against_the_one_before" in result.metrics.details
-    assert [len(keyss.reveal(result.stego, KEY))] == result.metrics.details["gaussians_before_pruning"]
+def test_secrets_get_what_fits_and_no_more_than_they_have() -> None:
+    options = training_options(LearnedOptions())
+    first, second = secret_sizes([1500, 9000], 2000, 1800, options)
+    # Two records to a Gaussian that carries something, less headers.
+    assert 2000 < first + second < 3600
+    assert first <= 1500
+    assert secret_sizes([1500, 9000], 2000, 1800, replace(options, secret_share=0.2)) == [400, 400]
 
 
 def test_zeros_that_training_left_stay() -> None:

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channels.low_bits.trained_like import trained_like
 from keyss.core import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
@@ -96,21 +95,6 @@ def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
     start = make_start([both], config, torch.Generator())
     assert (start.means.abs() < 100).all()
     assert (start.opacity_logits == 5).all()
-
-
-def test_secrets_in_records_take_no_place_of_the_covers() -> None:
-    placed = [
-        PlacedScene.of(tiny_scene(seed), trained_like(count, seed), Similarity.identity())
-        for seed, count in ((0, 2000), (1, 1500), (2, 9000))
-    ]
-    start = make_start(placed, LearnedOptions(), torch.Generator())
-    drawn = start.opacity_logits > DRAWN_LOGIT
-    assert int(drawn.sum()) == int((placed[0].plain.opacity_logits > DRAWN_LOGIT).sum())
-    hidden = len(start) - int(drawn.sum())
-    # Two records to a Gaussian that carries something, of which there are fewer than all, and headers.
-    assert 2000 < hidden < 4000
-    fewer = make_start(placed, LearnedOptions(secret_share=0.2), torch.Generator())
-    assert len(fewer) - int(drawn.sum()) == 2 * int(0.2 * int(drawn.sum()))
 
 
 def test_start_from_points_divides_the_cap_between_the_scenes() -> None:

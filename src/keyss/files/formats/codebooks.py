@@ -13,28 +13,37 @@ from keyss.files.formats.common import Bytes, Floats, Shorts
 
 SIZE = 256  # numbers of a codebook
 _ROUNDS = 50
+_BINS = 1024  # of as many values each, in which densities are measured
+_LEAST_WIDTH = 1e-6  # of such a bin, as a share of the whole: values may be equal
 _AXES = 12  # of the largest spread, by which groups are split
 _SAMPLE = 50_000  # vectors that tell which they are
 
 
 def codebook_of(values: Floats) -> Floats:
-    """[256] ascending numbers that stand for `values` of any shape with a small mean squared error."""
+    """[256] ascending numbers that stand for `values` of any shape.
+
+    Squared errors count by the inverse root of the density: rare values are often those of the few Gaussians
+    that cover most. Measured on six models, that gains 0 to 8 dB of pictures against counting them alike.
+    """
     ordered = np.sort(values, axis=None).astype(np.float64)
     distinct = np.unique(ordered)
     if len(distinct) <= SIZE:
         padded: Floats = np.pad(distinct, (0, SIZE - len(distinct)), mode="edge").astype(np.float32)
         return padded
-    # The best density of numbers is the third root of that of the values (Panter and Dite 1951).
-    grid = ordered[np.linspace(0, len(ordered) - 1, 4 * SIZE + 1).astype(int)]
-    weight = np.diff(grid) ** (2 / 3)
-    at = np.concatenate([[0], np.cumsum(weight)])
-    numbers = np.interp((np.arange(SIZE) + 0.5) / SIZE * at[-1], at, grid)
-    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    at = np.unique(np.linspace(0, len(ordered) - 1, _BINS + 1).astype(int))
+    width = np.maximum(np.diff(ordered[at]), _LEAST_WIDTH * (distinct[-1] - distinct[0]))
+    density = np.diff(at) / width
+    # The best density of numbers is the third root of the density that counts (Panter and Dite 1951).
+    share = np.concatenate([[0.0], np.cumsum(width * density ** (1 / 6))])
+    numbers = np.interp((np.arange(SIZE) + 0.5) / SIZE * share[-1], share, ordered[at])
+    weight = np.repeat(density**-0.5, np.diff(np.append(at[:-1], len(ordered))))
+    weights = np.concatenate([[0.0], np.cumsum(weight)])
+    sums = np.concatenate([[0.0], np.cumsum(weight * ordered)])
     for _ in range(_ROUNDS):
         ends = np.searchsorted(ordered, (numbers[1:] + numbers[:-1]) / 2)
         ends = np.concatenate([[0], ends, [len(ordered)]])
-        count = np.diff(ends)
-        moved = np.where(count > 0, np.diff(sums[ends]) / np.maximum(count, 1), numbers)
+        mass = np.diff(weights[ends])
+        moved = np.where(mass > 0, np.diff(sums[ends]) / np.where(mass > 0, mass, 1), numbers)
         if np.array_equal(moved, numbers):
             break
         numbers = np.sort(moved)

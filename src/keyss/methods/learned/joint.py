@@ -146,8 +146,7 @@ class JointRun:
     def _draw_poses(self) -> list[tuple[int, int]]:
         """For each scene whose training pose it is drawn from, and which one."""
         count = len(self.scenes)
-        common = 0.0 if self.config.in_records else self.config.common_poses
-        if float(torch.rand((), generator=self.generator)) < common:
+        if float(torch.rand((), generator=self.generator)) < self.config.common_poses:
             owner = self.owners[self.owner_order.draw()]
             return [(owner, self.shuffles[owner].draw())] * count
         return [(scene, self.shuffles[scene].draw()) for scene in range(count)]
@@ -179,18 +178,6 @@ class JointRun:
     def gaussians(self) -> Gaussians:
         """The model as it would be published."""
         return to_gaussians(self.parameters).detach()
-
-    @torch.no_grad()
-    def separated(self) -> tuple[Gaussians, list[Gaussians]]:
-        """After a warm start: the cover's own Gaussians, and each secret's as its decoder shows them."""
-        model = self.gaussians()
-        cover = torch.ones(len(model), dtype=torch.bool, device=model.device)
-        secrets = []
-        for decoder, embedding in self._keyed_decoders():
-            decoded = decoder(model, embedding)
-            secrets.append(decoded[decoded.opacities >= DRAWN_OPACITY])
-            cover &= ~decoder.band.contains(model.opacity_logits)
-        return model[cover], secrets
 
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:

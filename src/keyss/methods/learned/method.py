@@ -1,7 +1,8 @@
-"""The learned method: cover and secrets trained together, and published as one model.
+"""The learned method: secrets trained for the cover that they are hidden in, and published as one model.
 
 *Key-Secured 3D Secrets within 3D Gaussian Splatting* (KeySS), with the corrections in `docs/method.md`: one
-frame for all scenes, joint training, encryption. What is published: `keyss.methods.learned.publication`.
+frame for all scenes, joint training, encryption (`keyss.methods.learned.publication`). Where a file keeps
+every bit, there is a better way: `keyss.methods.learned.refit`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,15 @@ from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, sized, training_options
 from keyss.methods.learned.payload import unpack_secret
 from keyss.methods.learned.publication import NAME, publish
-from keyss.methods.learned.room import check_room, record_degree, shares, usable_share, with_low_bits
+from keyss.methods.learned.refit import hide_refitted
+from keyss.methods.learned.room import (
+    carriers_of,
+    check_room,
+    divided,
+    record_degree,
+    secret_sizes,
+    with_low_bits,
+)
 from keyss.methods.learned.targets import PlacedScene
 from keyss.methods.records.embedding import unpack_records
 
@@ -42,7 +51,7 @@ class LearnedMethod:
     """See `keyss.methods.base.Method`."""
 
     name = NAME
-    summary = "train cover and secrets together, then carry the secrets"
+    summary = "train the secrets for the cover, then carry them"
     trains = True
     most_secrets = 9
     options = LearnedOptions
@@ -69,20 +78,28 @@ class LearnedMethod:
                     f"{role} of SH degree {each.model.sh_degree} gets degree {degree}: {psnr:.1f} dB PSNR "
                     "against itself"
                 )
-        counts = shares(sizes, options, usable_share(cover, fit.sh_degree) if options.in_records else 0.0)
+        if options.in_records:
+            gaussians = fit.max_gaussians if cover is None else len(cover)
+            carriers = carriers_of(cover, gaussians, fit.sh_degree)
+            drawn = [0, *secret_sizes(sizes[1:], gaussians, carriers, options)]
+        else:
+            gaussians = min(fit.max_gaussians, sum(sizes))
+            weights = [1.0] + [options.secret_share] * (len(sizes) - 1)
+            drawn = divided(sizes, weights, fit.max_gaussians)
         return Outlook(
-            gaussians=counts[0] if options.in_records else min(fit.max_gaussians, sum(sizes)),
+            gaussians=gaussians,
             sh_degree=fit.sh_degree,
             asked=sum(sizes[1:]),
-            capacity=sum(counts[1:]),
+            capacity=sum(drawn[1:]),
             steps=fit.iterations,
+            drawn=tuple(drawn),
             notes=tuple(notes),
         )
 
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context
     ) -> Stego:
-        """Train cover and secrets together, then encrypt the secrets into the model or into a sidecar.
+        """Train cover and secrets together, or secrets for what the cover can carry, and encrypt them.
 
         Raises UsageError for a model too small for what it has to carry, Interrupted on Ctrl-C, and
         InputError for a checkpoint of another run.
@@ -92,6 +109,17 @@ class LearnedMethod:
         scenes = [source.scene for source in sources]
         derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.known_seed))
         derived = [DerivedKey(key, derivation) for key in keys]
+        details: dict[str, Any] = {}
+        fewer = [
+            round(cost(source.model, source.model.with_sh_degree(degree)), 1)
+            for source, degree in zip(sources, _degrees(options, len(sources)), strict=True)
+            if source.model.sh_degree > degree
+        ]
+        if fewer:
+            details["psnr_of_fewer_harmonics"] = fewer
+        if options.in_records:
+            found = hide_refitted(cover, secrets, derived, options, context, NAME)
+            return replace(found, details=details | dict(found.details))
         # What training does not reach keeps its low bits: those of a quantised model would be no good.
         entropy = hashlib.sha256(b"keyss/v1/dither" + b"".join(key.expand("writer", 32) for key in derived))
         models = [
@@ -128,14 +156,6 @@ class LearnedMethod:
             evaluate_every=options.fit.evaluate_every,
             reporter=context.reporter,
         )
-        details: dict[str, Any] = {}
-        fewer = [
-            round(cost(source.model, source.model.with_sh_degree(degree)), 1)
-            for source, degree in zip(sources, _degrees(options, len(sources)), strict=True)
-            if source.model.sh_degree > degree
-        ]
-        if fewer:
-            details["psnr_of_fewer_harmonics"] = fewer
         published = publish(run, keys, frames[1:], options, _discarded(run, derived))
         return Stego(
             published.stego,

@@ -35,20 +35,19 @@ class LearnedOptions(MethodOptions):
 
     start: Annotated[
         Literal["warm", "points"],
-        CommandLineOption("Start from plain models, or from sparse points (the paper's)."),
+        CommandLineOption("Start from plain models, or all together from sparse points (the paper's)."),
     ] = "warm"
     points: Scenes = "both"  # start from points: whose sparse points (combined SfM initialisation)
     poses: Scenes = "both"  # whose training poses are drawn (combined camera poses)
     densification: Scenes = "both"  # whose screen-space gradients ask for growth (combined densification)
     # Steps at which all scenes are drawn from one pose, photo or plain model's render; at the others each is
-    # drawn from a pose of its own and compared with its photo. The paper has the first kind only. Scenes
-    # that share no Gaussians (`in_records`) have the second kind only.
+    # drawn from a pose of its own and compared with its photo. The paper has the first kind only.
     common_poses: float = 0.1
 
     mask: Annotated[  # theta
         Mask,
         CommandLineOption(
-            "Attributes that the decoder changes, some of these; more than op take a network.",
+            "Attributes that the decoder of --sidecar or --start points changes, some of these.",
             metavar="op,ro,sc,xyz,sh",
             parse=parse_mask,
         ),
@@ -64,7 +63,7 @@ class LearnedOptions(MethodOptions):
     weight_decay: float = 1e-4
     key_encoder: Annotated[
         Literal["argon2", "clip"],
-        CommandLineOption("What conditions the decoder; the encryption is always under Argon2id's key."),
+        CommandLineOption("What conditions that decoder; the encryption is always under Argon2id's key."),
     ] = "argon2"
     clip_model: Annotated[
         str | None,
@@ -72,7 +71,10 @@ class LearnedOptions(MethodOptions):
     ] = None
     sidecar: Annotated[
         bool,
-        CommandLineOption("Write the encrypted payloads to decoder.sealed, not into low bits of stego.ply."),
+        CommandLineOption(
+            "For files that will be quantised: secrets lie in the model as transparent Gaussians, and what "
+            "finds them in decoder.sealed."
+        ),
     ] = False
 
     cover_weight: float = 0.5  # beta_cover
@@ -110,11 +112,17 @@ class LearnedOptions(MethodOptions):
                 f"mask {','.join(self.mask)} with start {self.start} needs a network"
             )
 
+        if self.in_records and (self.decoder != "remap" or self.key_encoder != "argon2"):
+            raise UsageError(
+                "secrets in the low bits of the cover have no decoder that a mask or an encoder of keys "
+                'could be for; `sidecar=True` or `start="points"` gives them one'
+            )
+
     @property
     def in_records(self) -> bool:
-        """Whether secrets are published in the low bits of the cover's own Gaussians.
+        """Whether secrets are published as Gaussians in the low bits of the cover's, which stay as they are.
 
-        Otherwise the published model has Gaussians of the secrets, or some that it shares with them.
+        Otherwise cover and secrets are trained together, and a key opens a decoder.
         """
         return self.start == "warm" and not self.sidecar
 

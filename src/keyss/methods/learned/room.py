@@ -1,4 +1,4 @@
-"""What fits into the low bits of a model that is still to be trained."""
+"""What fits into the low bits of a cover, and models that are made ready for that."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from collections.abc import Sequence
 
 import torch
 
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.layout import Room, record_capacity
 from keyss.channels.low_bits.spread import TYPICAL_SHARE, check_payload_fits
-from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -25,8 +24,6 @@ from keyss.methods.learned.payload import ANCHORS, HiddenSecret, pack_secret
 from keyss.methods.records.encoding import record_request
 from keyss.methods.records.table import Table
 
-# Of the Gaussians before training, which brings those that it reaches, about half and more, to 0.72.
-LEAST_USABLE_AT_START = 0.28
 LEAST_SECRET = 16  # Gaussians
 _SMALLER = (
     "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
@@ -37,8 +34,22 @@ _SIDECAR = "`sidecar=True` writes a file beside it instead"
 
 def with_low_bits(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     """`model` as the joint training starts from it, with low bits that are random before the first step."""
-    first, second = (expand(entropy, f"start/{index}", 32) for index in range(2))
-    return dither(raised(model.with_sh_degree(min(sh_degree, model.sh_degree)), sh_degree, first), second)
+    return dither(of_degree(model, sh_degree, entropy), expand(entropy, "start/1", 32))
+
+
+def prepared_cover(cover: Gaussians, entropy: bytes) -> LowBitsCover:
+    """The cover itself where its low bits are random, else with new ones. Raises InputError without room."""
+    try:
+        return LOW_BITS.prepare(cover)
+    except InputError:
+        return LOW_BITS.prepare(dither(cover, expand(entropy, "start/1", 32)))
+
+
+def of_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
+    """`model` with harmonics of `sh_degree`; those that it does not have are too small to be seen."""
+    if model.sh_degree > sh_degree:
+        return model.with_sh_degree(sh_degree)
+    return raised(model, sh_degree, expand(entropy, "start/0", 32))
 
 
 def record_degree(sh_degree: int) -> int | None:
@@ -51,34 +62,29 @@ def record_degree(sh_degree: int) -> int | None:
     return next(fitting, None)
 
 
-def usable_share(cover: Gaussians | None, sh_degree: int) -> float:
-    """Of the Gaussians of a cover before training, from a sample: 0 to 1; None: typical of what is fitted."""
-    if cover is None:
-        return TYPICAL_SHARE
-    start = with_low_bits(sampled(cover), sh_degree, os.urandom(32))
-    return float(usable_carriers(start).mean())
+def carriers_of(cover: Gaussians | None, gaussians: int, sh_degree: int) -> int:
+    """How many Gaussians of a cover can carry something, of a large one estimated from a sample.
 
-
-def shares(sizes: Sequence[int], options: LearnedOptions, usable: float) -> list[int]:
-    """How many Gaussians of each plain model, of which there are `sizes`, training starts with.
-
-    In records the secrets' take no place of the cover's, of which a share `usable` carries something;
-    otherwise all share the cap.
+    None: of one of so many `gaussians` that is still to be fitted. Raises InputError without room.
     """
-    cap = options.fit.max_gaussians
-    if options.in_records:
-        cover = min(sizes[0], cap)
-        return [cover, *_secret_sizes(sizes[1:], cover, options, usable)]
-    return divided(sizes, [1.0] + [options.secret_share] * (len(sizes) - 1), cap)
+    if cover is None:
+        return int(TYPICAL_SHARE * gaussians)
+    entropy = os.urandom(32)
+    sample = of_degree(sampled(cover), sh_degree, entropy)
+    carriers = prepared_cover(sample, entropy).carriers
+    return int(carriers / len(sample) * len(cover))
 
 
-def _secret_sizes(wanted: Sequence[int], cover: int, options: LearnedOptions, usable: float) -> list[int]:
-    """How many Gaussians of each secret fit into a published model of `cover` Gaussians."""
-    most = [min(each, int(options.secret_share * cover)) for each in wanted]
-    degree = record_degree(options.fit.sh_degree)
+def secret_sizes(wanted: Sequence[int], cover: int, carriers: int, options: LearnedOptions) -> list[int]:
+    """How many Gaussians of each secret fit into a `cover` of so many Gaussians, some of them `carriers`.
+
+    `wanted`: sizes of the secrets' plain models.
+    """
+    sh_degree = options.fit.sh_degree
+    degree = record_degree(sh_degree)
     if degree is None:
-        return [0] * len(most)
-    carriers, sh_degree = int(usable * cover), options.fit.sh_degree
+        return [0] * len(wanted)
+    most = [min(each, int(options.secret_share * cover)) for each in wanted]
     # No key should tell whether there are other secrets; where that leaves nothing, what fits at all.
     room = Room(carriers, bytes_per_gaussian(sh_degree))
     if each := room.unnoticed_records(Table.floor(degree).record_bytes, len(most)):
@@ -104,8 +110,7 @@ def divided(available: Sequence[int], weights: Sequence[float], total: int) -> l
 def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:
     """Raise UsageError or InputError if what is to be hidden will not fit into the model that is trained.
 
-    `models`: of the cover and of the secrets, those that are known. Training leaves the low bits of some
-    Gaussians of a given model as they are.
+    `models`: of the cover and of the secrets, those that are known.
     """
     options = training_options(options)
     degree, cap, cover = options.fit.sh_degree, options.fit.max_gaussians, models[0]
@@ -119,22 +124,17 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
             f"a model of SH degree {degree} has no room for anything in its low bits; `sh_degree=1` makes "
             f"room{_growth(cover)}, {_SIDECAR}"
         )
-    usable = usable_share(cover, degree)
-    if usable < LEAST_USABLE_AT_START:
-        raise InputError(
-            f"only {usable:.0%} of the cover's Gaussians could have random low bits, the others hold equal "
-            f"values; {_SIDECAR}"
-        )
-    if cover is not None:
-        cap = min(cap, len(cover))
+    gaussians = cap if cover is None else len(cover)
+    with advising(InputError, _SIDECAR):
+        carriers = carriers_of(cover, gaussians, degree)
     sizes = [cap if each is None else len(each) for each in models[1:]]
-    counts = _secret_sizes(sizes, cap, options, usable)
-    alone = [_secret_sizes([each], cap, options, usable)[0] for each in sizes]
+    counts = secret_sizes(sizes, gaussians, carriers, options)
+    alone = [secret_sizes([each], gaussians, carriers, options)[0] for each in sizes]
     if counts != alone:
         warnings.warn(_SMALLER, KeyssWarning, stacklevel=2)
     if min(counts) < min(LEAST_SECRET, *sizes):
         raise UsageError(
-            f"a cover of {cap:,} Gaussians is too small to hide {len(sizes)} secret"
+            f"a cover of {gaussians:,} Gaussians is too small to hide {len(sizes)} secret"
             f"{'s' if len(sizes) > 1 else ''} in its low bits; a larger one has room, {_SIDECAR}"
         )
 

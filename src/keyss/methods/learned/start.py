@@ -13,7 +13,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.methods.learned.opacity_band import DRAWN_LOGIT, hidden_logits
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes
-from keyss.methods.learned.room import divided, shares, usable_share
+from keyss.methods.learned.room import divided
 from keyss.methods.learned.targets import PlacedScene
 from keyss.rendering.contributions import contributions
 
@@ -49,10 +49,10 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gauss
     plains = [placed.plain.with_sh_degree(config.fit.sh_degree) for placed in scenes]
     # What is never drawn would lie among the hidden.
     plains = [plain[(plain.opacity_logits > DRAWN_LOGIT) & ~plain.overflow] for plain in plains]
-    usable = usable_share(plains[0], config.fit.sh_degree)
-    counts = shares([len(plain) for plain in plains], config, usable)
+    weights = [1.0] + [config.secret_share] * (len(plains) - 1)
+    counts = divided([len(plain) for plain in plains], weights, config.fit.max_gaussians)
     chosen = [
-        _most_contributing(plain, placed.scene, share)
+        most_contributing(plain, placed.scene, share)
         for plain, placed, share in zip(plains, scenes, counts, strict=True)
     ]
     parts = chosen[:1] + [
@@ -62,7 +62,7 @@ def _from_models(scenes: Sequence[PlacedScene], config: LearnedOptions) -> Gauss
     return Gaussians.cat(parts)
 
 
-def _most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
+def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
     """The `count` Gaussians that add most to what the training views show, in their order."""
     if count >= len(plain):
         return plain

@@ -1,0 +1,125 @@
+"""Whether the holder of one key can tell that other secrets lie in the file, on models that you have.
+
+    python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
+
+In each model one secret is hidden alone, and beside one to three others, as carried models and as sealed
+payloads. The holder opens his own, tries every cell of the file with his key
+(`tests/channels/low_bits/holder.py`), and takes the statistics of `keyss.measure.stealth` besides. Detectors
+learn from all scenes but one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from channels.low_bits import payloads
+from channels.low_bits.holder import seen_by_holder
+from channels.low_bits.trained_like import keys
+from keyss.core import UsageError
+from keyss.files.models import read_model
+from keyss.measure.stealth.detection import Examples, learned_detectors, single_detectors
+from keyss.measure.stealth.suite import stealth_statistics
+from keyss.methods.records.encoding import most_visible
+from methods.carry import carried
+
+MOST_OTHERS = 3
+SHARE = 8  # secrets are at most one such part of the cover's Gaussians
+PAYLOAD_BYTES = (500, 3000)
+KINDS = ("carried", "sealed")
+SHOWN = 3  # single statistics in the table
+
+
+@dataclass(frozen=True)
+class Job:
+    index: int
+    scene: str
+    cover: str
+    others: tuple[str, ...]  # models of which secrets are made
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("plain", nargs="+", metavar="SCENE=FILE")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    options = parser.parse_args(arguments)
+    named = [text.partition("=")[::2] for text in options.plain]
+    jobs = [
+        Job(index, scene, cover, tuple(other for each, other in named if each != scene))
+        for index, (scene, cover) in enumerate(named)
+    ]
+    started = time.monotonic()
+    with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
+        results = list(pool.map(_seen, jobs))
+    jobs, seen = zip(*[each for each in zip(jobs, results, strict=True) if each[1]], strict=True)
+    print(f"{len(jobs)} models of {len({job.scene for job in jobs})} scenes, ", end="")
+    print(f"{time.monotonic() - started:.0f} s\n")
+    print("| secret | detector | AUC | standard error | largest by chance |\n| --- | --- | --- | --- | --- |")
+    for kind in KINDS:
+        examples = Examples.of(
+            [each[kind, beside] for each in seen for beside in (0, 1)],
+            [beside for _ in jobs for beside in (0, 1)],
+            [job.scene for job in jobs for _ in (0, 1)],
+            [job.cover for job in jobs for _ in (0, 1)],
+        )
+        single, chance = single_detectors(examples)
+        for row in learned_detectors(examples):
+            print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | |")
+        for row in single[:SHOWN]:
+            print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance:.2f} |")
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def _seen(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:
+    """By kind, and alone (0) or beside others (1): what the holder of the first key counts.
+
+    None for a cover that is too small for several secrets.
+    """
+    try:
+        return _counted(job)
+    except UsageError as error:
+        print(f"{job.cover}: {error}", file=sys.stderr)
+        return None
+
+
+def _counted(job: Job) -> dict[tuple[str, int], dict[str, float]]:
+    random = np.random.default_rng(job.index)
+    cover = read_model(job.cover)
+    secrets = [
+        most_visible(read_model(path), int(random.integers(len(cover) // (2 * SHARE), len(cover) // SHARE)))
+        for path in random.choice(job.others, 1 + MOST_OTHERS)
+    ]
+    data = [os.urandom(int(random.integers(*PAYLOAD_BYTES))) for _ in secrets]
+    found = {}
+    for beside in (0, 1):
+        count = 1 + beside * int(random.integers(1, MOST_OTHERS + 1))
+        owned = [keys((1 + MOST_OTHERS) * job.index + each) for each in range(count)]
+        for kind in KINDS:
+            if kind == "carried":
+                stego = carried.embed_derived(cover, list(zip(owned, secrets[:count], strict=True)))
+            else:
+                stego = payloads.embed_derived(cover, list(zip(owned, data[:count], strict=True)))
+            statistics = stealth_statistics(stego)
+            found[kind, beside] = seen_by_holder(stego, owned[0][0]) | {
+                name: each.value for name, each in statistics.items()
+            }
+    return found
+
+
+if __name__ == "__main__":
+    main()
