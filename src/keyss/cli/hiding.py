@@ -90,6 +90,7 @@ def hide(
     from keyss.methods import registry
     from keyss.progress import reporter
     from keyss.rendering.orbit import is_model
+    from keyss.runs.files import STEGOS
 
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
@@ -157,7 +158,7 @@ def hide(
     print_files(
         out,
         {
-            "publish/stego.ply": "publish this, byte for byte as it is: the cover, with the secret in it",
+            **dict.fromkeys(STEGOS, "publish this, byte for byte as it is: the cover, with the secret in it"),
             "publish/decoder.sealed": "the encrypted secret: publish it too, or send it to who is to open it",
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },

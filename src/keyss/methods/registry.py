@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from keyss.channels.base import Content
+from keyss.channels.codes import CodesReader
 from keyss.channels.low_bits import LowBitsReader
 from keyss.channels.sidecar import decrypt_slots, read_header
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey
+from keyss.files.formats.common import CodedGaussians
+from keyss.keys.derivation import DerivedKey, KeyDerivation
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
 from keyss.methods.carry.options import CarryOptions as CarryOptions
@@ -35,7 +37,7 @@ def of_options(options: MethodOptions) -> Method:
 
 
 def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, decoy: bool = False) -> Opened:
-    """What `key` opens in the low bits of `stego`, or in the bytes of a `sidecar`.
+    """What `key` opens in the codes of a file's model, in the low bits of another, or in a `sidecar`'s bytes.
 
     With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
     wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
@@ -48,6 +50,15 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
             if not decoy:
                 raise
             return Decoy.of(stego, derived)
+    if isinstance(stego, CodedGaussians):
+        coded = CodesReader.of(stego.codes)
+        own = DerivedKey(key, KeyDerivation(salt=coded.salt))
+        try:
+            return _unpacked(coded.extract(own))
+        except WrongKeyError:
+            if not decoy:
+                raise
+            return Decoy.of(stego, own)
     reader = LowBitsReader.of(stego)
     if not decoy:
         return _unpacked(reader.open(key))

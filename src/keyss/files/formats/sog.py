@@ -22,6 +22,7 @@ from keyss.files.formats import sog_bundle as bundle
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
     Bytes,
+    CodedGaussians,
     Codes,
     Doubles,
     Floats,
@@ -214,9 +215,10 @@ def quantise(model: Gaussians) -> SogCodes:
     )
 
 
-def read_sog(data: bytes) -> Gaussians:
+def read_sog(data: bytes) -> CodedGaussians:
     """The model in a .sog. Raises InputError."""
-    return dequantise(parse(data))
+    codes = parse(data)
+    return CodedGaussians.of(dequantise(codes), codes)
 
 
 def read_sog_folder(meta: Path | StandardInput) -> Gaussians:
@@ -234,6 +236,8 @@ def read_sog_folder(meta: Path | StandardInput) -> Gaussians:
 
 def write_sog(model: Gaussians) -> bytes:
     """A model as a .sog, sorted so that its images pack well."""
+    if isinstance(model, CodedGaussians) and isinstance(model.codes, SogCodes):
+        return serialise(model.codes)
     return serialise(quantise(in_morton_order(model)))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.methods.base import CommandLineOption, MethodOptions
@@ -19,6 +19,13 @@ class CarryOptions(MethodOptions):
     dither: Annotated[bool, CommandLineOption("Give the cover new low bits where they are not random.")] = (
         False
     )
+    publish: Annotated[
+        Literal["ply", "spz", "sog", "compressed-ply"],
+        CommandLineOption(
+            "Format of the published file, which has to be passed on as it is; all but ply have room for "
+            "small secrets only.",
+        ),
+    ] = "ply"
 
 
 PRESETS: dict[str, CarryOptions] = {
