@@ -4,8 +4,9 @@ A *level* is an integer that grows with what it stands for; a *field* is one coo
 Gaussians. Which of its levels are usable follows from what writing leaves as it is: the ends of a range are
 left alone and never moved to, so that saturated values, extremes, and fields of one value stay.
 
-Positions stay in cells of 16 levels, so that Gaussians can be told apart, and put in an order, by these. They
-lie so evenly within 16 levels that it makes no difference to their frequencies.
+Positions stay in cells of as many levels as there are residues, 16 or 32, so that Gaussians can be told
+apart, and put in an order, by these. That is overwriting, but so evenly do positions lie within a cell that
+their frequencies stay the same; where they do not, a field is left alone (see `natural`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ Flags = npt.NDArray[np.bool_]
 _SIGN, _MAGNITUDE = 512, 511  # of SPZ's rotations
 _FAR_COLORS = 0.12  # numbers of a codebook of colours further apart than this are no neighbours
 _LEAST_RUN = 8  # of neighbours in a codebook; in shorter runs levels could hardly go both ways
-CELL = 16  # levels
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,11 @@ def format_of(codes: Codes) -> Format:
     if type(codes) not in _FORMATS:
         raise InputError(f"nothing can be carried in the codes of this format: expected {', '.join(NAMES)}")
     return _FORMATS[type(codes)]
+
+
+def position_cells(codes: SogCodes | SpzCodes) -> npt.NDArray[np.integer[Any]]:
+    """[N, 3] which cells the positions lie in, whatever is written."""
+    return codes.positions >> format_of(codes).bits["positions"]
 
 
 def fields_of(codes: Codes) -> list[Field]:
@@ -127,7 +132,7 @@ def _replaced(codes: Any, levels: Mapping[str, Levels]) -> Any:
 
 
 SPZ = Format("spz", {"positions": 4, "rotations": 2, "colors": 1, "alphas": 1}, _spz_fields, _spz_with_levels)
-SOG = Format("sog", {"positions": 4, "rotations": 1, "colors": 1, "alphas": 1}, _sog_fields, _replaced)
+SOG = Format("sog", {"positions": 5, "rotations": 1, "colors": 1, "alphas": 1}, _sog_fields, _replaced)
 COMPRESSED_PLY = Format(
     "compressed-ply",
     {"scales": 4, "rotations": 2, "colors": 1, "alphas": 1},
@@ -151,9 +156,10 @@ def _within_columns(name: str, bits: int, levels: npt.NDArray[Any]) -> list[Fiel
 
 def _within_cells(name: str, bits: int, levels: npt.NDArray[Any]) -> list[Field]:
     """Levels that stay in their cell, and none of the cells in which the extremes of the columns lie."""
-    cells = levels.astype(np.int32) // CELL
+    size = 1 << bits
+    cells = levels.astype(np.int32) // size
     inside = (cells > cells.min(axis=0)) & (cells < cells.max(axis=0))
-    return _fields(name, bits, levels, cells * CELL, cells * CELL + (CELL - 1), inside)
+    return _fields(name, bits, levels, cells * size, cells * size + (size - 1), inside)
 
 
 def _of_codebook(name: str, bits: int, levels: npt.NDArray[Any], codebook: Floats, far: float) -> list[Field]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.codes.fields import CELL, Field, Flags, fields_of
+from keyss.channels.codes.fields import Field, Flags, fields_of, position_cells
 from keyss.files.formats.common import Codes, Floats, morton_order
 from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes, positions_of
@@ -62,14 +62,14 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
 
 def _sog_order(codes: SogCodes) -> Rows:
     """By the cells that positions stay in; of several in one cell, which are twins, none carries."""
-    x, y, z = (codes.positions // CELL).T
+    x, y, z = (position_cells(codes)).T
     return np.lexsort((z, y, x))
 
 
 def _twins(codes: Codes) -> Flags:
     """[N] which Gaussians are like another one in everything that writing leaves as it is."""
     if isinstance(codes, (SogCodes, SpzCodes)):
-        names = _hashed(codes.positions // CELL)
+        names = _hashed(position_cells(codes))
     else:
         assert isinstance(codes, CompressedPlyCodes)
         chunks = np.arange(len(codes)) // CHUNK

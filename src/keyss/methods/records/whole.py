@@ -56,10 +56,10 @@ def decode(data: bytes) -> CarriedSecret:
     start = _COUNT.size + Codec.packed_size(codec.table.sh_degree)
     try:
         unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS)
-        planes = unpacker.decompress(data[start:], size)
+        planes = unpacker.decompress(data[start:], size + 1)
     except lzma.LZMAError as error:
         raise InputError(f"the hidden secret is damaged: {error}") from error
-    if len(planes) != size:
+    if len(planes) != size or not unpacker.eof or unpacker.unused_data:
         raise InputError("the hidden secret is damaged: it is not whole")
     found, at = [], 0
     for index, (columns, bits) in enumerate(layout):
