@@ -34,6 +34,7 @@ from keyss.channels.codes.layout import (
 from keyss.channels.codes.matching import matched
 from keyss.channels.codes.natural import is_natural
 from keyss.channels.codes.order import Counted, in_file_order
+from keyss.channels.codes.rotations import kept_smaller
 from keyss.channels.codes.unrounded import Doubles, unrounded
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -133,8 +134,18 @@ class CodesCover:
             found = matched(old, residues.astype(np.int32), field.bits, low, high, near)
             columns[field.name][field.column][field.usable] = found
         levels = {name: np.stack(each, axis=1) for name, each in columns.items()}
+        levels["rotations"] = self._with_largest(levels["rotations"])
         written: Codes = format_of(self.codes).with_levels(self.codes, levels)
         return written
+
+    def _with_largest(self, rotations: Levels) -> Levels:
+        """[N, 3] written levels of rotations, with no more parts than before larger than what is left out."""
+        turns = format_of(self.codes).turns(self.codes)
+        own = [each for each in self.fields if each.name == "rotations"]
+        before, usable = (
+            np.stack(each, axis=1) for each in zip(*((f.levels, f.usable) for f in own), strict=True)
+        )
+        return rotations if turns is None else kept_smaller(before, rotations, usable, own[0].bits, *turns)
 
     def _written_fields(self) -> list[Field]:
         """The fields that carry; of the first one, if it does not, the levels of salt and headers."""

@@ -58,6 +58,8 @@ class Format:
     bits: Mapping[str, int]  # of a level of each attribute
     levels: Callable[[Any], list[Field]]
     with_levels: Callable[[Any, Mapping[str, Levels]], Any]  # codes with new levels of some fields
+    # A level of a rotation stands for (level - first) * second; None: what is not stored need not be largest.
+    turns: Callable[[Any], tuple[float, float] | None]
 
 
 def format_of(codes: Codes) -> Format:
@@ -131,13 +133,30 @@ def _replaced(codes: Any, levels: Mapping[str, Levels]) -> Any:
     )
 
 
-SPZ = Format("spz", {"positions": 4, "rotations": 2, "colors": 1, "alphas": 1}, _spz_fields, _spz_with_levels)
-SOG = Format("sog", {"positions": 5, "rotations": 1, "colors": 1, "alphas": 1}, _sog_fields, _replaced)
+def _spz_turns(codes: SpzCodes) -> tuple[float, float] | None:
+    return (0.0, 0.5**0.5 / _MAGNITUDE) if codes.version > 2 else None
+
+
+SPZ = Format(
+    "spz",
+    {"positions": 4, "rotations": 2, "colors": 1, "alphas": 1},
+    _spz_fields,
+    _spz_with_levels,
+    _spz_turns,
+)
+SOG = Format(
+    "sog",
+    {"positions": 5, "rotations": 1, "colors": 1, "alphas": 1},
+    _sog_fields,
+    _replaced,
+    lambda codes: (127.5, 2**0.5 / 255),
+)
 COMPRESSED_PLY = Format(
     "compressed-ply",
     {"scales": 4, "rotations": 2, "colors": 1, "alphas": 1},
     _compressed_ply_fields,
     _replaced,
+    lambda codes: (511.5, 2**0.5 / 1023),
 )
 _FORMATS: dict[type[Codes], Format] = {SpzCodes: SPZ, SogCodes: SOG, CompressedPlyCodes: COMPRESSED_PLY}
 NAMES = tuple(each.name for each in _FORMATS.values())
