@@ -45,6 +45,8 @@ class CodedGaussians(Gaussians):
     those of a file that nobody has changed.
     """
 
+    __slots__ = ("codes",)  # and not in vars(), which are the tensors
+
     codes: Codes
 
     @staticmethod
