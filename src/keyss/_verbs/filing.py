@@ -10,6 +10,8 @@ from typing import Literal
 
 from keyss._verbs.asking import check_keys
 from keyss.channels import robust
+from keyss.channels.base import Payload
+from keyss.channels.codes import published
 from keyss.channels.low_bits import LOW_BITS
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -22,11 +24,11 @@ from keyss.methods import registry
 from keyss.methods.dither import cost
 from keyss.methods.hidden_file import HiddenFile
 from keyss.runs.config import PathLike
-from keyss.runs.files import STEGO, writers
+from keyss.runs.files import STEGOS, stego_name, writers
 from keyss.runs.folder import RunFolder, check_not_published
 from keyss.runs.opening import as_model, naming_what_opens_nothing
 
-Publish = Literal["ply", "any"]
+Publish = Literal["ply", "spz", "sog", "compressed-ply", "any"]
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,10 @@ def hide_files(
 ) -> HideFilesResult:
     """Hide files in a model, each under its own key, and open them again as a reader will.
 
-    `publish`: "ply" writes into low bits, for a file that is passed on as it is; "any" into colours, which
-    survive formats that round, at a cost of `strength` (dB PSNR that views of the model keep at least). `out`
-    (a folder) gets `publish/stego.ply`. Raises InputError for a cover whose low bits are not random, or that
+    `publish`: "ply" writes into low bits, and "spz", "sog" and "compressed-ply" into the codes of such a
+    file, which have to be passed on as they are; "any" writes into colours of a `.ply`, which survive formats
+    that round, at a cost of `strength` (dB PSNR that views of the model keep at least). `out` (a folder) gets
+    `publish/stego.ply`, or `.spz` and so on. Raises InputError for a cover whose low bits are not random, or that
     has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal keys.
     """
     if not files:
@@ -77,7 +80,7 @@ def hide_files(
     if out is not None:
         read = [cover, *(each.file for each in files)]
         inputs = [Path(each) for each in read if isinstance(each, str | Path)]
-        folder = RunFolder(out, "hide files", writes=(STEGO,), inputs=inputs, overwrite=overwrite)
+        folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
     hidden, model = [each.read() for each in files], as_model(cover)
     keys = [each.key for each in files]
     if publish == "any":
@@ -85,13 +88,21 @@ def hide_files(
         stego = robust.embed(model, packed, strength=strength)
     else:
         payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
-        stego = LOW_BITS.prepare(model).embed(payloads)
+        stego = _exact(model, publish, payloads)
     with folder.work() if folder else nullcontext():
-        there = folder.write(writers({STEGO: stego})) if folder else None
-        as_read = read_model(there / STEGO) if there else stego
+        name = stego_name(stego)
+        there = folder.write(writers({name: stego})) if folder else None
+        as_read = read_model(there / name) if there else stego
         if [open_file_in(as_read, key) for key in keys] != hidden:
             raise RuntimeError("what was written does not open again as it should")
     return HideFilesResult(stego, cost(model, stego), tuple(len(each.data) for each in hidden))
+
+
+def _exact(model: Gaussians, publish: str, payloads: Sequence[tuple[str, Payload]]) -> Gaussians:
+    """The model with payloads in what a file keeps only if it is passed on as it is."""
+    if publish == "ply":
+        return LOW_BITS.prepare(model).embed(payloads)
+    return published.coded(published.prepare(model, publish).embed(payloads))
 
 
 def reveal_file(
@@ -114,7 +125,7 @@ def reveal_file(
 
 
 def open_file_in(stego: Gaussians, key: str) -> HiddenFile:
-    """What `key` opens in low bits, or else in colours. Raises WrongKeyError and InputError."""
+    """What `key` opens in low bits or codes, or else in colours. Raises WrongKeyError and InputError."""
     try:
         return HiddenFile.of(registry.open_content(stego, key))
     except WrongKeyError:

@@ -24,7 +24,7 @@ from keyss.methods.plain_models import plain_models
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import Background, PathLike, RunConfig, colour_of, path_of, secret_ids
-from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, plain_names, writers
+from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGOS, plain_names, stego_name, writers
 from keyss.runs.folder import RunFolder, recorded_seed
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.opening import as_scene, open_file, read_sidecar
@@ -78,8 +78,8 @@ def hide(
     """
     if out is not None and is_model_path(out):
         raise UsageError(
-            f"{out}: expected the name of a folder; the model in it is a .ply, since secrets lie in "
-            "low bits, which no other format keeps"
+            f"{out}: expected the name of a folder; the model in it is a .ply, in whose low bits secrets "
+            'lie, or with `method="carry"` what its `publish` says'
         )
     chosen, options = method_for(method, secrets)
     recorded = recorded_seed(Path(out), "options", "fit", "seed") if resume and out is not None else None
@@ -111,7 +111,7 @@ def hide(
             "hide",
             told,
             onto=("scenes",),
-            writes=(STEGO, CONFIG),
+            writes=(*STEGOS, CONFIG),
             inputs=[Path(each) for each in (*sources, *models) if isinstance(each, str | Path)],
             overwrite=overwrite,
             resume=resume,
@@ -156,8 +156,9 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
     """The stego model and the secrets as a reader gets them, from the files that are to be published."""
     model, sidecar = stego.gaussians, stego.sidecar
     if folder:
-        there = folder.write(writers({STEGO: model} | ({SIDECAR: sidecar} if sidecar else {})))
-        model, sidecar = read_model(there / STEGO), read_sidecar(there / SIDECAR) if sidecar else None
+        name = stego_name(model)
+        there = folder.write(writers({name: model} | ({SIDECAR: sidecar} if sidecar else {})))
+        model, sidecar = read_model(there / name), read_sidecar(there / SIDECAR) if sidecar else None
     return [model, *(open_file(model, key, sidecar).reveal(model) for key in keys)]
 
 

@@ -42,7 +42,7 @@ from keyss.runs.audit_record import (
     RobustnessResult,
     SinkhornResult,
 )
-from keyss.runs.files import SIDECAR, STEGO
+from keyss.runs.files import SIDECAR, stego_in
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64
@@ -182,7 +182,7 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
     """How fast everything is for who uses it, and whether other people's programs read it."""
     plains = [subject.original, *subject.baselines]
     result = measure_speed(
-        subject.run.folder / STEGO,
+        stego_in(subject.run.folder),
         subject.reopeners,
         subject.scenes,
         [plain if plain is not None else model for plain, model in zip(plains, subject.models, strict=True)],

@@ -33,6 +33,7 @@ from keyss.cli.arguments import (
 )
 
 if TYPE_CHECKING:
+    from keyss._verbs.filing import Publish
     from keyss.methods.base import CommandLineOption, Method
 
 DEFAULT_METHOD = "learned"
@@ -52,10 +53,10 @@ def hide(
         optional("FILE", "Any file to hide, in a cover that is a model; once for each.", "scenes are hidden"),
     ] = (),
     publish: Annotated[
-        Literal["ply", "any"],
+        Literal["ply", "spz", "sog", "compressed-ply", "any"],
         arg(
-            help="Formats that hidden files are to survive: any for those that round, too, at 45 dB between "
-            "pictures before and after."
+            help="Format of the published file, which is passed on as it is; all but ply have room for small "
+            "secrets only. any: a .ply that may be converted, for files."
         ),
     ] = "ply",
     method: str = DEFAULT_METHOD,
@@ -103,6 +104,7 @@ def hide(
     from keyss.methods import registry
     from keyss.progress import reporter
     from keyss.rendering.orbit import is_model
+    from keyss.runs.files import STEGOS
 
     if secret_file:
         unused: dict[str, object] = {
@@ -132,6 +134,10 @@ def hide(
         for name, value in own.items()
         if value is not None and value is not False
     }
+    if publish != "ply":
+        if method != "carry":
+            raise UsageError(f"--publish {publish} carries models: leave out --method {method}")
+        changes["publish"] = publish
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     given = [cover_model or cover, *(secret_model or secret)]
@@ -185,7 +191,7 @@ def hide(
     print_files(
         out,
         {
-            "publish/stego.ply": "publish this, byte for byte as it is: the cover, with the secret in it",
+            **dict.fromkeys(STEGOS, "publish this, byte for byte as it is: the cover, with the secret in it"),
             "publish/decoder.sealed": "the encrypted secret: publish it too, or send it to who is to open it",
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
@@ -199,7 +205,7 @@ def hide(
 def _hide_files(
     cover: Path,
     files: Sequence[Path],
-    publish: Literal["ply", "any"],
+    publish: Publish,
     key_file: Sequence[Path],
     out: Path,
     overwrite: bool,
@@ -210,6 +216,7 @@ def _hide_files(
     from keyss.cli.tables import print_files
     from keyss.core.errors import UsageError
     from keyss.rendering.orbit import is_model
+    from keyss.runs.files import STEGOS
 
     if not is_model(cover):
         raise UsageError(
@@ -223,7 +230,7 @@ def _hide_files(
         print(f"{file.name}: {size:,} bytes, opened again from what was written")
     print(f"The cover's views changed by {result.psnr:.0f} dB PSNR")
     how = "as it is, or converted" if publish == "any" else "byte for byte as it is"
-    print_files(out, {"publish/stego.ply": f"publish this, {how}"})
+    print_files(out, dict.fromkeys(STEGOS, f"publish this, {how}"))
 
 
 def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
@@ -236,8 +243,11 @@ def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
 
     chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     chooser.add_argument("--method", nargs="?")
-    given = chooser.parse_known_args(arguments)[0].method
-    method = METHODS[given if given in METHODS else DEFAULT_METHOD]
+    chooser.add_argument("--publish", nargs="?")
+    asked = chooser.parse_known_args(arguments)[0]
+    # What rounds keeps no low bits, and codes are carried in.
+    usual = DEFAULT_METHOD if asked.publish in (None, "ply", "any") else "carry"
+    method = METHODS[asked.method if asked.method in METHODS else usual]
     flags = {name: _flags(each) for name, each in METHODS.items()}
     for argument in arguments:
         flag = argument.partition("=")[0].replace("_", "-")

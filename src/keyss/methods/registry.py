@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from keyss.channels.base import Content
+from keyss.channels.codes import CodesReader
 from keyss.channels.low_bits import LowBitsReader
 from keyss.channels.sidecar import decrypt_slots, read_header
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey
+from keyss.files.formats.common import CodedGaussians
+from keyss.keys.derivation import DerivedKey, KeyDerivation
 from keyss.methods import hidden_file
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
@@ -37,7 +39,7 @@ def of_options(options: MethodOptions) -> Method:
 
 
 def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, decoy: bool = False) -> Opened:
-    """What `key` opens in the low bits of `stego`, or in the bytes of a `sidecar`.
+    """What `key` opens in the codes of a file's model, in the low bits of another, or in a `sidecar`'s bytes.
 
     With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
     wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
@@ -52,6 +54,12 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
             return Decoy.of(stego, derived)
     if not decoy:
         return _unpacked(open_content(stego, key))
+    if isinstance(stego, CodedGaussians):
+        own = DerivedKey(key, KeyDerivation(salt=CodesReader.of(stego.codes).salt))
+        try:
+            return _unpacked(CodesReader.of(stego.codes).extract(own))
+        except WrongKeyError:
+            return Decoy.of(stego, own)
     reader = LowBitsReader.of(stego)
     for derived in reader.keys(key, 1):
         try:
@@ -62,7 +70,12 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
 
 
 def open_content(stego: Gaussians, key: str) -> Content:
-    """What `key` opens in the low bits of `stego`, whoever reads it. Raises WrongKeyError and InputError."""
+    """What `key` opens in the codes of a file's model, or in the low bits of another, whoever reads it.
+
+    Raises WrongKeyError and InputError.
+    """
+    if isinstance(stego, CodedGaussians):
+        return CodesReader.of(stego.codes).open(key)
     return LowBitsReader.of(stego).open(key)
 
 

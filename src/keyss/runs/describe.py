@@ -104,11 +104,11 @@ def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
 
 def _folder_info(path: Path) -> RunInfo | SceneInfo:
     from keyss.files.scenes import load_scene
-    from keyss.runs.files import METRICS, MODEL, STEGO
+    from keyss.runs.files import METRICS, MODEL, stego_in
     from keyss.runs.metrics import FitMetrics, HideMetrics
     from keyss.runs.records import read_record
 
-    if (path / STEGO).exists():
+    if stego_in(path).exists():
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if (path / MODEL).exists():
         return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from keyss.channels.codes.published import SUFFIXES, suffix_of
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
@@ -15,6 +16,7 @@ from keyss.runs.folder import PRIVATE, PUBLISH
 from keyss.runs.records import record_bytes
 
 STEGO, SIDECAR = f"{PUBLISH}/stego.ply", f"{PUBLISH}/decoder.sealed"
+STEGOS = (STEGO, *(f"{PUBLISH}/stego{suffix}" for suffix in SUFFIXES.values()))  # whatever the format
 MODEL = "model.ply"  # of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
@@ -27,8 +29,18 @@ def is_run(folder: Path) -> bool:
 
 def model_in(folder: Path) -> Path | None:
     """The model that a run came to, where `folder` is that of a run or the part of it that is published."""
-    names = (STEGO, MODEL, Path(STEGO).name, Path(MODEL).name)
+    names = (*STEGOS, MODEL, *(Path(each).name for each in (*STEGOS, MODEL)))
     return next((folder / name for name in names if os.path.isfile(folder / name)), None)
+
+
+def stego_name(stego: Gaussians) -> str:
+    """What the file of a published model is called in the folder of a run."""
+    return f"{PUBLISH}/stego{suffix_of(stego)}"
+
+
+def stego_in(folder: Path) -> Path:
+    """The published model of a run; where there is none, where it usually is."""
+    return folder / next((name for name in STEGOS if os.path.isfile(folder / name)), STEGO)
 
 
 def run_folder(path: Path) -> Path:

@@ -20,7 +20,7 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
 from keyss.runs.config import Background, PathLike, RunConfig, read_config, secret_ids
-from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGO, is_run, model_in, plain_names, run_folder
+from keyss.runs.files import CONFIG, METRICS, SIDECAR, is_run, model_in, plain_names, run_folder, stego_in
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 
@@ -80,7 +80,8 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    stego, sidecar = read_model(folder / STEGO), sidecar_beside(folder / STEGO)
+    published = stego_in(folder)
+    stego, sidecar = read_model(published), sidecar_beside(published)
     every = [open_file(stego, key, sidecar) for key in keys]
     names = secret_ids(config.options.fit.known_seed, every)
     found = dict(zip(names, zip(every, keys, strict=True), strict=True))

@@ -38,6 +38,25 @@ class Codes:
     __hash__ = None  # type: ignore[assignment]
 
 
+class CodedGaussians(Gaussians):
+    """The model of a file, and the codes that it has there.
+
+    Whatever makes another model of it, its own methods included, gives `Gaussians` without codes: they are
+    those of a file that nobody has changed.
+    """
+
+    __slots__ = ("codes",)  # and not in vars(), which are the tensors
+
+    codes: Codes
+
+    @staticmethod
+    def of(model: Gaussians, codes: Codes) -> CodedGaussians:
+        """`model`, which the codes stand for."""
+        found = CodedGaussians(*(getattr(model, each.name) for each in fields(model)))
+        object.__setattr__(found, "codes", codes)
+        return found
+
+
 def _same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray):
         return a.dtype == b.dtype and np.array_equal(a, b)
@@ -95,7 +114,12 @@ def gaussians_of(
 
 
 def writable(model: Gaussians) -> Gaussians:
-    """`model` on the CPU with finite opacity logits. Raises OutputError if it is empty or not finite."""
+    """`model` on the CPU with finite opacity logits. Raises OutputError if it is empty or not finite.
+
+    That of a file, which is both, stays as it is there.
+    """
+    if isinstance(model, CodedGaussians):
+        return model
     flat = model.detach().to("cpu")
     if len(flat) == 0:
         raise OutputError("it holds no Gaussians")

@@ -20,6 +20,7 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.formats.common import (
     Bytes,
+    CodedGaussians,
     Codes,
     Doubles,
     Floats,
@@ -156,13 +157,16 @@ def quantise(model: Gaussians) -> CompressedPlyCodes:
     )
 
 
-def read_compressed_ply(data: bytes) -> Gaussians:
+def read_compressed_ply(data: bytes) -> CodedGaussians:
     """The model in a file. Raises InputError."""
-    return dequantise(parse(data))
+    codes = parse(data)
+    return CodedGaussians.of(dequantise(codes), codes)
 
 
 def write_compressed_ply(model: Gaussians) -> bytes:
     """A model as a file, sorted so that the Gaussians of a chunk are near each other."""
+    if isinstance(model, CodedGaussians) and isinstance(model.codes, CompressedPlyCodes):
+        return serialise(model.codes)
     return serialise(quantise(in_morton_order(model)))
 
 

@@ -22,6 +22,7 @@ from keyss.files.formats import sog_bundle as bundle
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
     Bytes,
+    CodedGaussians,
     Codes,
     Doubles,
     Floats,
@@ -157,10 +158,7 @@ def serialise(codes: SogCodes) -> bytes:
 
 def dequantise(codes: SogCodes) -> Gaussians:
     """The model that codes stand for. Raises InputError where it is not finite."""
-    extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
-    logs = codes.mins + extent * (codes.positions / _FINEST)
-    with np.errstate(over="ignore"):
-        means = np.copysign(np.expm1(np.abs(logs)), logs)
+    means = positions_of(codes, codes.positions)
     rotations = (codes.rotations / 255 * 2 - 1) * np.sqrt(0.5)
     palette = codes.sh_codebook[codes.palette] if codes.palette.size else np.empty((1, 0, 3), np.float32)
     return gaussians_of(
@@ -171,6 +169,15 @@ def dequantise(codes: SogCodes) -> Gaussians:
         codes.color_codebook[codes.colors],
         palette[codes.labels],
     )
+
+
+def positions_of(codes: SogCodes, levels: npt.NDArray[Any]) -> Doubles:
+    """[N, 3] world positions that `levels`, 0 to 65535, stand for in a file; they need not be integers."""
+    extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
+    logs = codes.mins + extent * (levels / _FINEST)
+    with np.errstate(over="ignore"):
+        found: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
+    return found
 
 
 def quantise(model: Gaussians) -> SogCodes:
@@ -208,9 +215,10 @@ def quantise(model: Gaussians) -> SogCodes:
     )
 
 
-def read_sog(data: bytes) -> Gaussians:
+def read_sog(data: bytes) -> CodedGaussians:
     """The model in a .sog. Raises InputError."""
-    return dequantise(parse(data))
+    codes = parse(data)
+    return CodedGaussians.of(dequantise(codes), codes)
 
 
 def read_sog_folder(meta: Path | StandardInput) -> Gaussians:
@@ -228,6 +236,8 @@ def read_sog_folder(meta: Path | StandardInput) -> Gaussians:
 
 def write_sog(model: Gaussians) -> bytes:
     """A model as a .sog, sorted so that its images pack well."""
+    if isinstance(model, CodedGaussians) and isinstance(model.codes, SogCodes):
+        return serialise(model.codes)
     return serialise(quantise(in_morton_order(model)))
 
 

@@ -16,6 +16,7 @@ from keyss.core.errors import OutputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     Bytes,
+    CodedGaussians,
     Codes,
     Floats,
     Shorts,
@@ -156,13 +157,16 @@ def quantise(
     )
 
 
-def read_spz(data: bytes) -> Gaussians:
+def read_spz(data: bytes) -> CodedGaussians:
     """The model in a file. Raises InputError."""
-    return dequantise(parse(data))
+    codes = parse(data)
+    return CodedGaussians.of(dequantise(codes), codes)
 
 
 def write_spz(model: Gaussians) -> bytes:
     """A model as a file of version 3. Raises OutputError as `quantise` does."""
+    if isinstance(model, CodedGaussians) and isinstance(model.codes, SpzCodes):
+        return serialise(model.codes)
     return serialise(quantise(model))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from keyss.channels.base import Content, RecordRequest
+from keyss.channels.codes import published
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.core.errors import InputError, UsageError
@@ -15,7 +16,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import cost, dither, sampled
-from keyss.methods.records.embedding import embed_models, unpack_records
+from keyss.methods.records import whole
+from keyss.methods.records.embedding import embed_in_codes, embed_models, rooms_in_codes, unpack_records
 from keyss.methods.records.encoding import (
     CarriedSecret,
     check_degrees,
@@ -31,7 +33,9 @@ _DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
 _DITHER_AND_PRUNE = (
     f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
 )
-
+_PRUNE_OR_PLY = '`prune_to_fit=True` leaves out what is seen least, `publish="ply"` has more room'
+_BITS_IN_CODES = 18  # of a Gaussian of the cover, where it is not known yet, and of the secret's
+_BITS_OF_SECRETS = 110  # of a Gaussian of a secret, of which nothing else is known
 
 NAME = "carry"
 
@@ -52,6 +56,8 @@ class CarryMethod:
         Of models that are fitted first, sizes and low bits are not known: they are made to fit rather than
         refused after their training.
         """
+        if options.publish != "ply":
+            return _prepared_for_codes(inputs, options)
         cover, *others = (each.model for each in inputs)
         degree, *degrees = _degrees(inputs, options)
         check_degrees(LOW_BITS, degree, degrees)
@@ -75,6 +81,8 @@ class CarryMethod:
 
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
         """The cover as it is, and in it what its carriers have room for."""
+        if options.publish != "ply":
+            return _outlook_in_codes(inputs, options)
         sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
         degrees = _degrees(inputs, options)
         cover, notes = inputs[0].model, []
@@ -99,6 +107,12 @@ class CarryMethod:
         """
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
+        if options.publish != "ply":
+            room = published.prepare(cover.model, options.publish)
+            with advising(UsageError, _PRUNE_OR_PLY):
+                written = embed_in_codes(room, keys, models, NAME, prune=options.prune_to_fit)
+            seconds = time.monotonic() - start
+            return Stego(written.stego, None, written.opened, seconds, details=written.details)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
         with advising(InputError, _LEARNED if options.dither else _DITHER):
             prepared = _prepared(cover.model, options)
@@ -114,6 +128,33 @@ class CarryMethod:
     def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
         """None: without a key, low bits that carry something are as random as any."""
         return {}
+
+
+def _prepared_for_codes(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
+    """Refuses given models that will not fit; those that are fitted first are made to fit."""
+    cover, *others = (each.model for each in inputs)
+    secrets = [model for model in others if model is not None]
+    if cover is None or len(secrets) < len(others):
+        return replace(options, prune_to_fit=True)
+    room = published.prepare(cover, options.publish)
+    with advising(UsageError, _PRUNE_OR_PLY):
+        if not options.prune_to_fit:
+            for model, size in zip(secrets, rooms_in_codes(room, secrets), strict=True):
+                whole.fitted(model, size, prune=False)
+    return options
+
+
+def _outlook_in_codes(inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
+    """The room of the cover; how many Gaussians of the secrets fit is a guess until they are encoded."""
+    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
+    cover, asked = inputs[0].model, sum(sizes[1:])
+    degree = _degrees(inputs, options)[0]
+    if cover is None:
+        room, note = sizes[0] * _BITS_IN_CODES // 8, "about"
+    else:
+        room, note = published.prepare(cover, options.publish).capacity, "exactly"
+    notes = (f"the codes of the {options.publish} file have room for {note} {room:,} bytes",)
+    return Outlook(sizes[0], degree, asked, min(asked, 8 * room // _BITS_OF_SECRETS), notes=notes)
 
 
 def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:

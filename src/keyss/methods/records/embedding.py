@@ -6,13 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from keyss.channels.base import Content, Records
+from keyss.channels.base import Content, Payload, Records
+from keyss.channels.codes import CodesCover, CodesReader
+from keyss.channels.codes.published import coded
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
+from keyss.files.formats.common import CodedGaussians
 from keyss.methods.dither import cost
+from keyss.methods.records import whole
 from keyss.methods.records.encoding import CarriedSecret, decode, encode_all, most_visible, record_requests
 from keyss.methods.records.quantise import out_of_range
+
+ENCRYPTION_BYTES = 128  # that a payload takes at most beside its data
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,63 @@ def embed_models(
     return Embedded(prepared, models, kept, stego, opened)
 
 
+@dataclass(frozen=True)
+class EmbeddedInCodes:
+    """What embedding in the codes of a final file gives."""
+
+    stego: CodedGaussians
+    opened: tuple[CarriedSecret, ...]
+    details: dict[str, Any]  # numbers for metrics.json
+
+
+def embed_in_codes(
+    cover: CodesCover, keys: Sequence[str], models: Sequence[Gaussians], method: str, *, prune: bool
+) -> EmbeddedInCodes:
+    """All of each model, or with `prune` what fits, under its key, opened again; see `rooms_in_codes`.
+
+    Raises UsageError if they do not fit.
+    """
+    rooms = rooms_in_codes(cover, models)
+    fitted = [whole.fitted(model, room, prune=prune) for model, room in zip(models, rooms, strict=True)]
+    payloads = [Payload(method, data) for _, data in fitted]
+    stego = coded(cover.embed(list(zip(keys, payloads, strict=True))))
+    reader = CodesReader.of(stego.codes)
+    opened = tuple(unpack_records(reader.open(key)) for key in keys)
+    if [len(each.gaussians) for each in opened] != [len(kept) for kept, _ in fitted]:
+        raise RuntimeError("what was written does not open again as it should")
+    details = {
+        "capacity_bytes": cover.capacity,
+        "capacity_bits_per_gaussian": round(8 * cover.capacity / len(stego), 2),
+        "secret_bytes": [len(data) for _, data in fitted],
+        "gaussians_before_pruning": [len(model) for model in models],
+        "sh_degrees": [each.gaussians.sh_degree for each in opened],
+        "bits_per_gaussian": [each.bits for each in opened],
+    }
+    return EmbeddedInCodes(stego, opened, details)
+
+
+def rooms_in_codes(cover: CodesCover, models: Sequence[Gaussians]) -> list[int]:
+    """Bytes that the encoding of each model may take.
+
+    A quarter of the room, half of it or all, whichever is enough: then a secret is as precise as it would be
+    alone, and its key tells nothing of others. Where that is too much for all of them, equal shares.
+    """
+    room = int(cover.capacity * (1 - 2**-10))  # what is packed already gets longer by less
+    parts = [_parts_alone(whole.least_bytes(model), room) for model in models]
+    if sum(1 / each for each in parts) > 1:
+        parts = [len(models)] * len(models)
+    return [room // each - ENCRYPTION_BYTES for each in parts]
+
+
+def _parts_alone(size: int, room: int) -> int:
+    """Of how many parts of the room one is enough for `size` bytes."""
+    return next((parts for parts in (4, 2) if size <= room // parts - ENCRYPTION_BYTES), 1)
+
+
 def unpack_records(content: Content) -> CarriedSecret:
     """The Gaussians that are left. Raises InputError for damage."""
+    if isinstance(content, Payload):
+        return whole.decode(content.data)
     if not isinstance(content, Records):
-        raise InputError("the hidden secret is damaged: expected records, got one payload")
+        raise InputError("the hidden secret is damaged: expected records or one payload")
     return decode(content)

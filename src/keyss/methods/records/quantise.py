@@ -30,6 +30,7 @@ import torch
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
+from keyss.methods.records.packing import CHUNK, packed
 from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
 
 Floats = npt.NDArray[np.float64]
@@ -44,7 +45,6 @@ _TAIL = 0.05  # share of the numbers that says nothing of how far the bulk reach
 _EVEN_MARGIN = 0.75  # on a line divided evenly the bulk's neighbourhood ends as many of its widths from it
 _FAR = 8.0  # on one by asinh it ends at as many times the bulk's distance from the median
 _FURTHEST = 1e30  # no value that a line may give is larger
-_CHUNK = 1 << 14  # Gaussians at a time when packing: every bit takes a byte meanwhile
 _LEAST_SPREAD = 1e-9
 _HALF = 1e-3  # half precision rounds by less than this share
 _SAMPLE = 20_000  # Gaussians that a line is fitted to
@@ -132,15 +132,15 @@ class Codec:
         """[N, record_bytes] the records of N Gaussians; the bits left over are zero."""
         records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
         outlier = outliers(gaussians)
-        for start in range(0, len(gaussians), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            records[part] = _packed(self._codes(gaussians[part], outlier[part]))
+        for start in range(0, len(gaussians), CHUNK):
+            part = slice(start, start + CHUNK)
+            records[part] = packed(self._codes(gaussians[part], outlier[part]))
         return records
 
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes]: finite float32, whatever bytes they are."""
-        starts = range(0, max(len(records), 1), _CHUNK)
-        return Gaussians.cat([self._values(records[start : start + _CHUNK]) for start in starts])
+        starts = range(0, max(len(records), 1), CHUNK)
+        return Gaussians.cat([self._values(records[start : start + CHUNK]) for start in starts])
 
     def pack(self) -> bytes:
         """The codec itself: 92 to 164 bytes."""
@@ -213,15 +213,6 @@ class Codec:
             harmonics.append(np.concatenate([brightness, differences], axis=2) @ OPPONENT)
         sh = np.concatenate(harmonics, axis=1)
         return Gaussians(*(torch.from_numpy(v).float() for v in (positions, turns, sizes, logits, sh)))
-
-
-def _packed(columns: Iterator[tuple[Codes, int]]) -> Bytes:
-    """[N, bytes] the codes one after the other, the highest bit of each first."""
-    parts = []
-    for codes, bits in columns:
-        shifts = np.arange(bits - 1, -1, -1, dtype=np.uint32)
-        parts.append((codes[:, :, None] >> shifts & 1).astype(np.uint8).reshape(len(codes), -1))
-    return np.packbits(np.concatenate(parts, axis=1), axis=1)
 
 
 def _three_smallest(quats: Floats) -> tuple[Codes, Floats]:

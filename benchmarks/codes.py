@@ -1,0 +1,121 @@
+"""What carrying in the codes of published files costs and holds: the table of docs/codes.md.
+
+    python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/codes.md
+
+Each `--pair` names a folder of photos in `--data` and a model of it for the cover, then for the secret (a
+folder that is not there: pictures of the model itself are taken). The secret is as large as fits, and at most
+a sixth of the cover's Gaussians, of SH degree 0. Costs are against the untouched file of the format.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+from types import ModuleType
+
+import torch
+
+from keyss.channels.base import Payload
+from keyss.channels.codes import CodesCover, CodesReader
+from keyss.channels.codes.fields import format_of
+from keyss.channels.codes.published import coded, prepare
+from keyss.core import Gaussians, Scene
+from keyss.files.atomic import write_bytes
+from keyss.files.formats import compressed_ply, sog, spz
+from keyss.files.formats.common import in_morton_order
+from keyss.files.models import read_model
+from keyss.files.scenes import load_scene
+from keyss.measure.images import psnr
+from keyss.methods.dither import cost
+from keyss.methods.records import whole
+from keyss.methods.records.embedding import ENCRYPTION_BYTES
+from keyss.methods.records.encoding import most_visible
+from keyss.methods.records.table import Table
+from keyss.rendering import render
+from keyss.rendering.orbit import scene_of_model
+
+FORMATS: dict[str, ModuleType] = {"spz": spz, "sog": sog, "compressed-ply": compressed_ply}
+START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"
+HEAD = (
+    "| cover | Gaussians | format | bits per Gaussian | cover against photos, untouched / carrying (dB) "
+    "| untouched against carrying (dB) | secret Gaussians per cover Gaussian "
+    "| secret against its photos, in this format / carried (dB) | hide, reveal (s) |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+)
+KEY = "a key of the benchmark 4711"
+SHARE = 6
+
+
+def scene_for(folder: Path, model: Gaussians, width: int) -> Scene:
+    """The photos of a folder, or pictures of the model."""
+    return (
+        load_scene(folder, width=width) if folder.is_dir() else scene_of_model(model, folder.name, size=width)
+    )
+
+
+@torch.no_grad()
+def against_photos(model: Gaussians, scene: Scene) -> float:
+    """Mean PSNR in dB over the test views."""
+    found = []
+    for view in scene.test:
+        image = (render(model, view.camera, scene.background).clamp(0, 1) * 255).round() / 255
+        found.append(float(psnr(image, view.image.float() / 255)))
+    return statistics.mean(found)
+
+
+def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path, width: int) -> list[str]:
+    """A row of the table for each format."""
+    own = most_visible(secret[1].with_sh_degree(0), len(cover[1]) // SHARE)
+    scenes = [scene_for(data / name, model, width) for name, model in (cover, secret)]
+    found = []
+    for name, format_ in FORMATS.items():
+        model = in_morton_order(cover[1])
+        untouched = format_.dequantise(format_.quantise(model))
+        start = time.monotonic()
+        room: CodesCover = prepare(cover[1], name)
+        kept, encoded = whole.fitted(own, room.capacity * 1023 // 1024 - ENCRYPTION_BYTES, prune=True)
+        stego = coded(room.embed([(KEY, Payload("carry", encoded))]))
+        file = format_.serialise(stego.codes)
+        hiding = time.monotonic() - start
+        start = time.monotonic()
+        opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data).gaussians
+        revealing = time.monotonic() - start
+        bits = 8 * room.capacity / len(model)
+        floor = Table.floor(0).total
+        most = room.capacity * 8 / (8 * len(whole.encode(kept, floor)) / len(kept)) / len(model)
+        in_format = format_.dequantise(format_.quantise(in_morton_order(kept)))
+        numbers = [
+            *(against_photos(each, scenes[0]) for each in (untouched, stego)),
+            *(against_photos(each, scenes[1]) for each in (in_format, opened)),
+        ]
+        found.append(
+            f"| {cover[0]} | {len(model):,} | {format_of(stego.codes).name} | {bits:.1f} "
+            f"| {numbers[0]:.2f} / {numbers[1]:.2f} | {cost(untouched, stego):.1f} | 1 : {1 / most:.1f} "
+            f"| {numbers[2]:.2f} / {numbers[3]:.2f} | {hiding:.1f}, {revealing:.1f} |"
+        )
+        print(found[-1], flush=True)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--pair", action="append", required=True, metavar="NAME=FILE,NAME=FILE")
+    parser.add_argument("--width", type=int, default=200, help="of pictures, in pixels")
+    parser.add_argument("--write", type=Path, help="page that gets the table between its two marks")
+    arguments = parser.parse_args()
+    table = [HEAD]
+    for pair in arguments.pair:
+        cover, secret = (part.partition("=")[::2] for part in pair.split(","))
+        models = [(name, read_model(path)) for name, path in (cover, secret)]
+        table += rows(models[0], models[1], arguments.data, arguments.width)
+    if arguments.write:
+        before, _, rest = arguments.write.read_text().partition(START)
+        page = before + "\n".join([START, "", *table, "", END]) + rest.partition(END)[2]
+        write_bytes(arguments.write, page.encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""Codes of models as trained, in every format that can carry, and files of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from channels.low_bits.trained_like import trained_like
+from keyss.core import Gaussians
+from keyss.files.formats import compressed_ply, sog, spz
+from keyss.files.formats.common import in_morton_order
+
+FORMATS: dict[str, ModuleType] = {".spz": spz, ".sog": sog, ".compressed.ply": compressed_ply}
+
+
+@cache
+def model_of(count: int = 6000, seed: int = 0, sh_degree: int = 1) -> Gaussians:
+    """In the order of the formats that sort."""
+    model = trained_like(count, seed, sh_degree)
+    generator = torch.Generator().manual_seed(seed)
+    # As in trained models: few of nearly no opacity, and colours that reach to black and white.
+    opacity_logits = model.opacity_logits.clamp_min(-4.0) + 0.1 * torch.rand(count, generator=generator)
+    sh = torch.cat([8 * model.sh[:, :1], model.sh[:, 1:]], dim=1)
+    return in_morton_order(replace(model, opacity_logits=opacity_logits, sh=sh))
+
+
+def codes_of(suffix: str, count: int = 6000, seed: int = 0, sh_degree: int = 1) -> Any:
+    return FORMATS[suffix].quantise(model_of(count, seed, sh_degree))
+
+
+def there_and_back(suffix: str, codes: Any) -> Any:
+    """Codes as they come out of a file."""
+    return FORMATS[suffix].parse(FORMATS[suffix].serialise(codes))

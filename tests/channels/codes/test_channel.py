@@ -1,0 +1,250 @@
+"""What is written into the codes of a file comes out of the very file with its key, and with no other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from channels.codes.published import FORMATS, codes_of, model_of, there_and_back
+from keyss.channels.base import Payload
+from keyss.channels.codes import CodesCover, CodesReader, payload_size
+from keyss.channels.codes.fields import Field, format_of
+from keyss.channels.codes.layout import SLOT_BYTES
+from keyss.channels.codes.order import Counted
+from keyss.core import InputError, UsageError, WrongKeyError
+from keyss.files.formats import sog, spz
+from keyss.files.formats.common import morton_order
+from keyss.keys import DerivedKey
+
+ENTROPY = bytes(range(32))
+EVERY = pytest.mark.parametrize("suffix", FORMATS)
+
+
+def key(number: int) -> DerivedKey:
+    """A key without Argon2id."""
+    return DerivedKey.of_master(bytes([number]) * 32)
+
+
+def written(cover: CodesCover, *payloads: bytes, entropy: bytes = ENTROPY) -> Any:
+    secrets = [(key(i), Payload("carry", data)) for i, data in enumerate(payloads)]
+    return cover._embedded(secrets, cover._mixed(entropy, [each for _, each in secrets]))
+
+
+@EVERY
+def test_a_file_opens_with_each_of_its_keys(suffix: str) -> None:
+    secrets = [("first key", Payload("carry", b"one" * 400)), ("second key", Payload("learned", b"two"))]
+    file = there_and_back(suffix, CodesCover.of(codes_of(suffix)).embed(secrets))
+    assert [CodesReader.of(file).open(each) for each, _ in secrets] == [payload for _, payload in secrets]
+    with pytest.raises(WrongKeyError):
+        CodesReader.of(file).open("third key")
+
+
+@EVERY
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
+    cover = CodesCover.of(codes_of(suffix, 3000), model_of(3000) if data.draw(st.booleans()) else None)
+    sizes = data.draw(st.lists(st.integers(0, cover.capacity // 4), min_size=1, max_size=cover.room.slots))
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    payloads = [rng.bytes(size) for size in sizes]
+    fits = sum(payload_size(Payload("carry", each)) for each in payloads) <= cover.capacity
+    if not fits:
+        with pytest.raises(UsageError, match="room for"):
+            written(cover, *payloads)
+        return
+    reader = CodesReader.of(there_and_back(suffix, written(cover, *payloads, entropy=rng.bytes(32))))
+    assert [reader.extract(key(i)).data for i in range(len(payloads))] == payloads
+    with pytest.raises(WrongKeyError):
+        reader.extract(key(200))
+
+
+@EVERY
+def test_capacity_is_exact(suffix: str) -> None:
+    cover = CodesCover.of(codes_of(suffix))
+    full = np.random.default_rng(1).bytes(cover.capacity)
+    while payload_size(Payload("carry", full)) > cover.capacity:
+        full = full[:-1]
+    assert payload_size(Payload("carry", full)) == cover.capacity
+    assert CodesReader.of(there_and_back(suffix, written(cover, full))).extract(key(0)).data == full
+    with pytest.raises(UsageError, match="room for"):
+        written(cover, full + b"\x55")
+
+
+@EVERY
+def test_what_carries_is_known_from_what_stays(suffix: str) -> None:
+    """Writing ten times over what was written leaves the places where they are."""
+    codes = codes_of(suffix)
+    masks = [each.usable for each in Counted.of(codes).fields]
+    for round_ in range(10):
+        codes = written(CodesCover.of(codes), b"data", entropy=bytes([round_]) * 32)
+        assert all(map(np.array_equal, masks, (each.usable for each in Counted.of(codes).fields)))
+
+
+@EVERY
+def test_levels_move_by_as_little_as_can_be(suffix: str) -> None:
+    before, model = codes_of(suffix), model_of()
+    cover = CodesCover.of(before, model)
+    after = Counted.of(written(cover, bytes(1000)))
+    for old, new in zip(cover.fields, after.fields, strict=True):
+        moved = np.abs(new.levels - old.levels)
+        if old.name != "positions":  # which stay in their cells
+            inside = (old.levels - old.low >= 1 << old.bits) & (old.high - old.levels >= 1 << old.bits)
+            further = moved[inside] > (1 << old.bits) // 2
+            # A part of a quaternion goes the other way where it would become larger than the largest.
+            assert further.mean() < (0.01 if old.name == "rotations" else 1e-9)
+        assert moved.max() <= 1 << old.bits
+        assert not moved[~old.usable].any()
+        assert (new.levels[new.usable] >= new.low[new.usable]).all()
+
+
+@EVERY
+def test_nothing_else_changes(suffix: str) -> None:
+    before = codes_of(suffix)
+    after = written(CodesCover.of(before), b"data")
+    counted = [Counted.of(each).codes for each in (before, after)]
+    carrying = {each.name for each in Counted.of(before).fields}
+    for name in set(vars(before)) - carrying:
+        old, new = (np.asarray(getattr(each, name)) for each in counted)
+        assert np.array_equal(old, new), name
+    assert all(getattr(before, n).dtype == getattr(after, n).dtype for n in carrying)
+
+
+@EVERY
+def test_every_usable_bit_is_written(suffix: str) -> None:
+    """Each of them is 0 in half of the files and 1 in the others, however short the payload is."""
+    cover = CodesCover.of(codes_of(suffix, 3000))
+    reads = np.stack(
+        [
+            np.concatenate(CodesReader.of(written(cover, b"data", entropy=bytes([i]) * 32)).bits)
+            for i in range(64)
+        ]
+    )
+    ones = reads.mean(axis=0)
+    assert not ((ones == 0) | (ones == 1)).any()  # none is left alone: by chance 2^-63 of them
+    assert abs(float(ones.mean()) - 0.5) < 6 * 0.5 / reads.size**0.5
+    pairs = (reads[:, 1:] == reads[:, :-1]).mean()
+    assert abs(float(pairs) - 0.5) < 6 * 0.5 / reads.size**0.5
+
+
+@EVERY
+def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str) -> None:
+    cover = CodesCover.of(codes_of(suffix))
+    assert written(cover, b"a") == written(cover, b"a")
+    others = [written(cover, b"b"), written(cover, b"a", entropy=bytes(32)), written(cover, b"a", b"b")]
+    salts = {CodesReader.of(each).salt for each in [written(cover, b"a"), *others]}
+    assert len(salts) == 4
+
+
+@EVERY
+def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
+    cover = CodesCover.of(codes_of(suffix))
+    file = written(cover, bytes(range(256)) * 20)
+    colors = file.colors.copy()
+    colors[colors % 2 == 0] += 1
+    with pytest.raises(InputError, match="damaged"):
+        CodesReader.of(replace(file, colors=colors)).extract(key(0))
+
+
+def test_equal_keys_no_secrets_and_too_many() -> None:
+    cover = CodesCover.of(codes_of(".spz"))
+    payload = Payload("carry", b"")
+    for secrets in ([], [(key(0), payload)] * 2):
+        with pytest.raises(UsageError, match="each with its own"):
+            cover._embedded(secrets, ENTROPY)
+    with pytest.raises(UsageError, match="secrets, got"):
+        cover._embedded([(key(i), payload) for i in range(cover.room.slots + 1)], ENTROPY)
+    with pytest.raises(ValueError, match="32 bytes"):
+        cover.embed([("key", payload)], entropy=b"short")
+
+
+@EVERY
+def test_small_models_have_no_room(suffix: str) -> None:
+    with pytest.raises(InputError, match="no room"):
+        CodesCover.of(codes_of(suffix, 300))
+    with pytest.raises(WrongKeyError):
+        CodesReader.of(codes_of(suffix, 300))
+
+
+def test_columns_on_a_lattice_carry_nothing_and_the_rest_does() -> None:
+    codes = codes_of(".spz")
+    positions = codes.positions.copy()
+    positions[:, 0] = positions[:, 0] // 64 * 64 + 7
+    positions[:, 1] = 1000
+    colors = np.where(codes.colors > 0, 128, 0).astype(np.uint8)
+    cover = CodesCover.of(replace(codes, positions=positions, colors=colors))
+    file = written(cover, b"data" * 99)
+    # Of the first column only what holds salt and slots is written.
+    changed = (file.positions[:, 0] != positions[:, 0]).sum()
+    assert 0 < changed <= (16 + cover.room.slots * SLOT_BYTES) * 8 / 4
+    assert np.array_equal(file.positions[:, 1], positions[:, 1])
+    assert np.array_equal(file.colors, colors)
+    assert (file.positions[:, 2] != positions[:, 2]).mean() > 0.8
+    assert CodesReader.of(file).extract(key(0)).data == b"data" * 99
+
+
+def test_twins_stay_twins() -> None:
+    codes = codes_of(".spz")
+    names = ("positions", "alphas", "colors", "scales", "largest", "rotations", "sh")
+    for name in names:
+        getattr(codes, name)[100:200] = getattr(codes, name)[:100]
+    file = written(CodesCover.of(codes), b"data")
+    assert all(np.array_equal(getattr(file, n)[100:200], getattr(file, n)[:100]) for n in names)
+    assert CodesReader.of(file).extract(key(0)).data == b"data"
+
+
+def test_rotations_keep_both_zeros() -> None:
+    """SPZ has a sign and a magnitude; a number that came from below 0 does not become +0."""
+    codes = codes_of(".spz")
+    file = written(CodesCover.of(codes), b"data")
+    far = (codes.rotations & 511) > 3
+    assert np.array_equal((file.rotations & 512)[far], (codes.rotations & 512)[far])
+    zeros = file.rotations[file.rotations & 511 == 0]
+    assert 0.2 < (zeros == 512).mean() < 0.8
+
+
+@EVERY
+def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None:
+    """But for about as many as rounding alone makes."""
+    cover = CodesCover.of(codes_of(suffix, 20_000), model_of(20_000))
+    after = Counted.of(written(cover, b"data"))
+    centre, step = format_of(cover.codes).turns(cover.codes) or (0.0, 0.0)
+
+    def wrong(fields: list[Field]) -> int:
+        levels = np.stack([each.levels for each in fields if each.name == "rotations"], axis=1)
+        parts = np.abs(levels - centre) * step
+        rest = 1 - np.square(parts).sum(axis=1)
+        return int((np.square(parts.max(axis=1)) > rest).sum())
+
+    assert wrong(cover.fields) > 5
+    assert wrong(after.fields) <= wrong(cover.fields)
+    assert CodesReader.of(after.codes).extract(key(0)).data == b"data"
+
+
+def test_old_spz_carries_too() -> None:
+    codes = spz.quantise(model_of())
+    old = replace(
+        codes,
+        version=2,
+        largest=np.full(len(codes), 3, np.uint8),
+        rotations=np.random.default_rng(0).integers(1, 255, (len(codes), 3)).astype(np.uint16),
+    )
+    file = spz.parse(spz.serialise(written(CodesCover.of(old), b"data")))
+    assert CodesReader.of(file).extract(key(0)).data == b"data"
+
+
+def test_sog_stays_in_the_order_of_its_positions() -> None:
+    """As much as that of an untouched file, which was sorted before it was rounded."""
+
+    def out_of_order(codes: sog.SogCodes) -> int:
+        return int((np.diff(morton_order(sog.dequantise(codes).means.numpy())) < 0).sum())
+
+    plain = sog.quantise(model_of(20_000))
+    expected = out_of_order(plain)
+    found = out_of_order(written(CodesCover.of(plain), bytes(5000)))
+    assert expected > 0
+    assert abs(found - expected) < 6 * expected**0.5

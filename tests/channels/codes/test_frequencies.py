@@ -1,0 +1,71 @@
+"""Somebody who knows the source counts: frequencies keep their shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy import stats
+
+from channels.codes.published import FORMATS, codes_of, model_of
+from channels.codes.test_channel import written
+from keyss.channels.codes import CodesCover, CodesReader
+from keyss.channels.codes.matching import matched
+from keyss.channels.codes.order import Counted
+
+COUNT = 30_000
+EVERY = pytest.mark.parametrize("suffix", FORMATS)
+
+
+def pairs_of_values(levels: npt.NDArray[np.int32]) -> float:
+    """p-value of the attack of Westfeld and Pfitzmann (1999): tiny unless 2i and 2i + 1 are equally often."""
+    counts = np.bincount(levels - levels.min() // 2 * 2)
+    counts = np.append(counts, np.zeros(len(counts) % 2, np.int64)).reshape(-1, 2)
+    counts = counts[counts.sum(axis=1) > 10]
+    expected = counts.mean(axis=1)
+    return float(stats.chi2.sf(((counts[:, 0] - expected) ** 2 / expected).sum(), len(counts) - 1))
+
+
+@EVERY
+def test_written_bits_are_uniform(suffix: str) -> None:
+    bits = CodesReader.of(written(CodesCover.of(codes_of(suffix, COUNT)), b"x" * 5000)).bits
+    values = np.packbits(np.concatenate(bits))
+    assert stats.chisquare(np.bincount(values, minlength=256)).pvalue > 1e-4
+
+
+def test_pairs_of_values_find_overwriting_and_not_matching() -> None:
+    rng = np.random.default_rng(0)
+    # A steep and narrow distribution, as that of opacities: there pairs differ most.
+    levels = np.rint(rng.exponential(9, 60_000)).astype(np.int32) + 10
+    bits = rng.integers(0, 2, len(levels)).astype(np.int32)
+    overwritten = (levels & ~1) | bits
+    low, high = np.zeros_like(levels), np.full_like(levels, 255)
+    found = matched(levels, bits, 1, low, high, levels + rng.uniform(-0.5, 0.5, len(levels)))
+    assert np.array_equal(found & 1, bits)
+    assert max(pairs_of_values(levels), pairs_of_values(found)) < 1e-9 < 1e-3 < pairs_of_values(overwritten)
+
+
+@EVERY
+def test_columns_look_like_those_of_the_untouched_file(suffix: str) -> None:
+    """Frequencies of levels, in bins of a few, by a test of two samples of which each is random."""
+    cover = CodesCover.of(codes_of(suffix, COUNT), model_of(COUNT))
+    after = Counted.of(written(cover, b"x" * 5000))
+    other = Counted.of(codes_of(suffix, COUNT, seed=1)).fields
+    for old, new, null in zip(cover.fields, after.fields, other, strict=True):
+        plain, stego, fresh = (each.levels for each in (old, new, null))
+        size = 1 << max(0, int(np.log2(np.ptp(plain) / 50)))
+        edges = np.arange(min(plain.min(), fresh.min()), max(plain.max(), fresh.max()) + 2 * size, size)
+        counts = [np.histogram(each, edges)[0] for each in (plain, stego, fresh)]
+        moved, natural = (np.abs(each - counts[0]).sum() for each in counts[1:])
+        assert moved < natural, (new.name, new.column, moved, natural, size)
+
+
+@EVERY
+def test_ends_of_ranges_stay(suffix: str) -> None:
+    cover = CodesCover.of(codes_of(suffix, COUNT))
+    after = Counted.of(written(cover, b"x" * 5000))
+    for old, new in zip(cover.fields, after.fields, strict=True):
+        if old.name == "rotations" or (old.name, suffix) == ("colors", ".sog"):
+            continue  # whose ends are those of the format, or of a codebook
+        for end in (old.levels.min(), old.levels.max()):
+            assert np.array_equal(old.levels == end, new.levels == end), old.name

@@ -1,0 +1,83 @@
+"""Codes from strangers: typed errors in bounded time, whatever they hold."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from channels.codes.published import FORMATS, codes_of
+from channels.codes.test_channel import key, written
+from files.formats.examples import random_compressed, random_sog, random_spz
+from keyss.channels.base import Payload
+from keyss.channels.codes import CodesCover, CodesReader
+from keyss.channels.codes.layout import Header, Room, find_header
+from keyss.core import InputError, UsageError, WrongKeyError
+from keyss.methods.records.embedding import unpack_records
+
+EVERY = pytest.mark.parametrize("suffix", FORMATS)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), kind=st.sampled_from(["spz", "old spz", "sog", "compressed"]))
+def test_random_codes_open_nothing(seed: int, kind: str) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 4000))
+    codes = {
+        "spz": lambda: random_spz(rng, 3, count, 3),
+        "old spz": lambda: random_spz(rng, 2, count, 0),
+        "sog": lambda: random_sog(rng, count, 3),
+        "compressed": lambda: random_compressed(rng, count, 3),
+    }[kind]()
+    with pytest.raises(WrongKeyError):
+        CodesReader.of(codes).extract(key(0))
+    try:
+        file = written(CodesCover.of(codes), b"data")
+    except (InputError, UsageError):  # no room, or none but for the headers: all fields are left alone
+        return
+    assert CodesReader.of(file).extract(key(0)).data == b"data"
+
+
+@EVERY
+def test_mutated_files_open_or_are_refused(suffix: str) -> None:
+    format_, rng = FORMATS[suffix], np.random.default_rng(0)
+    cover = CodesCover.of(codes_of(suffix, 2500))
+    file = format_.serialise(written(cover, bytes(range(200))))
+    start = time.monotonic()
+    for _ in range(60):
+        changed = bytearray(file)
+        for at in rng.integers(0, len(file), int(rng.integers(1, 4))):
+            changed[at] ^= 1 << int(rng.integers(8))
+        if rng.random() < 0.3:
+            del changed[int(rng.integers(len(changed))) :]
+        try:
+            found = CodesReader.of(format_.parse(bytes(changed))).extract(key(0))
+        except (InputError, WrongKeyError):
+            continue
+        assert found.data == bytes(range(200))
+    assert time.monotonic() - start < 60
+
+
+@pytest.mark.parametrize(
+    "header",
+    [Header(1, 0, 0), Header(1, 0, 2**32 - 1), Header(1, 2**32 - 1, 1), Header(0, 0, 1), Header(1024, 0, 1)],
+)
+def test_a_header_that_names_more_than_there_is(header: Header) -> None:
+    room = Room((16_000, 2000, 2000))
+    zone = bytes(16) + header.encrypt(key(0), 0) + bytes(28 * (room.slots - 1))
+    with pytest.raises(InputError, match="more than there is"):
+        find_header(zone, key(0), room)
+
+
+def test_payloads_that_are_no_models() -> None:
+    for data in (b"", b"\0" * 3, b"\x01\0\0\0", bytes(300), b"\xff" * 300):
+        with pytest.raises(InputError, match="damaged"):
+            unpack_records(Payload("carry", data))
+
+
+def test_formats_whose_codes_carry_nothing() -> None:
+    with pytest.raises(InputError, match="expected spz, sog, compressed-ply"):
+        CodesReader.of(object())  # type: ignore[arg-type]

@@ -1,0 +1,100 @@
+"""Carrying in published .spz, .sog and compressed .ply files, from `hide` to `reveal`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import keyss
+from channels.codes.published import model_of
+from keyss import CarryOptions
+from keyss.channels.codes.order import Counted
+from keyss.channels.codes.published import SUFFIXES, prepare
+from keyss.core import InputError, UsageError
+from keyss.files import read_model, write_model
+from keyss.methods.dither import cost
+from keyss.methods.records import whole
+from keyss.methods.records.table import Table
+
+EVERY = pytest.mark.parametrize("publish", SUFFIXES)
+
+
+@EVERY
+def test_hide_reveal_verify_and_info(publish: str, tmp_path: Path) -> None:
+    cover, secrets = model_of(4000), [model_of(150, seed) for seed in (1, 2)]
+    options = CarryOptions(publish=publish)  # type: ignore[arg-type]
+    asked = [keyss.Secret(model, f"key number {i}") for i, model in enumerate(secrets)]
+    keyss.hide(cover, asked, method=options, width=32, min_psnr=0, out=tmp_path / "run")
+    (stego,) = (tmp_path / "run" / "publish").iterdir()
+    assert stego.name == f"stego{SUFFIXES[publish]}"
+    for index, secret in enumerate(secrets):
+        found = keyss.reveal(stego, f"key number {index}")
+        assert len(found) == 150
+        # In another order: sorted, as they were packed.
+        nearest = torch.cdist(found.means, secret.means).min(dim=1).values
+        assert float(nearest.max()) < 0.01
+        assert keyss.verify(stego, f"key number {index}").secret is not None
+    with pytest.raises(keyss.WrongKeyError):
+        keyss.reveal(stego, "another key")
+    assert keyss.info(stego).kind == "3DGS model"
+    assert keyss.info(tmp_path / "run").kind == "hiding"
+
+
+@EVERY
+def test_too_large_secrets_are_refused_or_pruned(publish: str) -> None:
+    cover, secret = model_of(2500), model_of(1500, 1)
+    with pytest.raises(UsageError, match=r"room for .*prune_to_fit"):
+        keyss.hide(
+            cover,
+            [keyss.Secret(secret, "key one")],
+            method=CarryOptions(publish=publish),  # type: ignore[arg-type]
+            width=32,
+            min_psnr=0,
+        )
+    hidden = keyss.hide(
+        cover,
+        [keyss.Secret(secret, "key one")],
+        method=CarryOptions(publish=publish, prune_to_fit=True),  # type: ignore[arg-type]
+        width=32,
+        min_psnr=0,
+    )
+    assert 250 < hidden.metrics.secret_gaussians[0] < 1000
+
+
+def test_a_whole_model_comes_back_as_its_records_would() -> None:
+    model = model_of(3000, sh_degree=2)
+    for more in (0, 7, 20):
+        data = whole.encode(model, Table.floor(2).total + more)
+        opened = whole.decode(data)
+        assert opened.count == len(opened.gaussians) == 3000
+        assert cost(model, opened.gaussians) > 40
+    assert len(whole.encode(model, Table.floor(2).total)) * 8 < 3000 * Table.floor(2).total
+
+
+def test_damaged_encodings_end_in_an_input_error() -> None:
+    data = whole.encode(model_of(500), Table.floor(1).total)
+    generator = torch.Generator().manual_seed(0)
+    for cut in (0, 3, 50, 200, len(data) - 1):
+        with pytest.raises(InputError):
+            whole.decode(data[:cut])
+    with pytest.raises(InputError, match="announces"):
+        whole.decode(b"\xff\xff\xff\x7f" + data[4:])
+    for _ in range(200):
+        changed = bytearray(data)
+        at = int(torch.randint(len(data), (), generator=generator))
+        changed[at] ^= 1 << int(torch.randint(8, (), generator=generator))
+        try:
+            found = whole.decode(bytes(changed)).gaussians
+        except InputError:
+            continue
+        assert all(bool(getattr(found, name).isfinite().all()) for name in ("means", "quats", "sh"))
+
+
+@EVERY
+def test_a_published_file_as_cover_is_taken_as_it_is(publish: str, tmp_path: Path) -> None:
+    path = tmp_path / f"cover{SUFFIXES[publish]}"
+    write_model(path, model_of(3000))
+    model = read_model(path)
+    assert prepare(model, publish).codes == Counted.of(model.codes).codes  # type: ignore[attr-defined]
