@@ -22,8 +22,7 @@ class CarryOptions(MethodOptions):
     publish: Annotated[
         Literal["ply", "spz", "sog", "compressed-ply"],
         CommandLineOption(
-            "Format of the published file, which has to be passed on as it is; all but ply have room for "
-            "small secrets only.",
+            "Format of the published file, to be passed on as it is; ply, the default, has most room.",
         ),
     ] = "ply"
 
