@@ -340,7 +340,8 @@ def _signatures() -> str:
     lines = []
     # What shares its name with a package is in `keyss.api` alone.
     named = [(name, getattr(keyss, name)) for name in sorted(keyss.__all__)]
-    named += [(f"api.{name}", getattr(keyss.api, name)) for name in ("audit", "convert", "write_report")]
+    others = sorted({*keyss.api.__all__} - {*keyss.__all__})
+    named += [(f"api.{name}", getattr(keyss.api, name)) for name in others]
     for name, value in named:
         lines.append(name)
         if (inspect.isclass(value) and not is_dataclass(value)) or not callable(value):

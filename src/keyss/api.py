@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from keyss._verbs.asking import Secret
     from keyss._verbs.converting import Conversion, convert
+    from keyss._verbs.filing import HideFilesResult, SecretFile, hide_files, reveal_file
     from keyss._verbs.fitting import fit
     from keyss._verbs.hiding import HideResult, hide
     from keyss._verbs.looking import evaluate, render
@@ -18,33 +19,27 @@ if TYPE_CHECKING:
     from keyss.audit.run import audit
     from keyss.report.page import write_report
 
-__all__ = [
-    "Conversion",
-    "HideResult",
-    "Secret",
-    "audit",
-    "convert",
-    "evaluate",
-    "fit",
-    "hide",
-    "plan",
-    "render",
-]
-__all__ += ["reveal", "reveal_counted", "verify", "write_report"]
+__all__ = ["Conversion", "HideResult", "Secret", "audit", "convert", "evaluate", "fit", "hide", "plan"]
+__all__ += ["render", "reveal", "reveal_counted", "verify", "write_report"]
+__all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
 
 _HOMES = {
     "Conversion": "_verbs.converting",
+    "HideFilesResult": "_verbs.filing",
     "HideResult": "_verbs.hiding",
     "Secret": "_verbs.asking",
+    "SecretFile": "_verbs.filing",
     "audit": "audit.run",
     "convert": "_verbs.converting",
     "evaluate": "_verbs.looking",
     "fit": "_verbs.fitting",
     "hide": "_verbs.hiding",
+    "hide_files": "_verbs.filing",
     "plan": "_verbs.planning",
     "render": "_verbs.looking",
     "reveal": "_verbs.opening",
     "reveal_counted": "_verbs.opening",
+    "reveal_file": "_verbs.filing",
     "verify": "_verbs.opening",
     "write_report": "report.page",
 }

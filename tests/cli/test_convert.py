@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import keyss as package
+from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused
 from keyss import api
 from keyss.files import read_model, write_model
@@ -85,6 +86,16 @@ def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Pa
     assert said.status == 0
     assert "Gaussians, opens as before" in said.out
     assert keyss("reveal", out, "--key-file", files / "key", "-o", tmp_path / "secret.ply").status == 0
+
+
+def test_a_hidden_file_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
+    stego = api.hide_files(trained_like(2500), [api.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]).stego
+    write_model(tmp_path / "stego.ply", stego)
+    key = ("--key-file", files / "other")
+    refused = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.sog", *key)
+    assert_refused(refused, 7, "0 of its 160 bytes would open from")
+    said = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.ply", *key)
+    assert "160 bytes, opens as before" in said.out
 
 
 def test_a_key_that_opens_nothing(keyss: Run, files: Path, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[
         raise UsageError(
             f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
         )
-    _check_keys([secret.key for secret in secrets])
+    check_keys([secret.key for secret in secrets])
     return method, options
 
 
@@ -62,7 +62,7 @@ def inputs_of(
     return inputs
 
 
-def _check_keys(keys: Sequence[str]) -> None:
+def check_keys(keys: Sequence[str]) -> None:
     """Raise UsageError for keys that cannot be, or are the same to key derivation, before any work."""
     cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
     derived = [DerivedKey(key, cheap) for key in keys]

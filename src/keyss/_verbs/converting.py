@@ -8,7 +8,8 @@ from pathlib import Path
 
 import torch
 
-from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
+from keyss._verbs.filing import open_file_in
+from keyss.core.errors import InputError, KeyssError, QualityError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.models import (
@@ -33,8 +34,9 @@ _KEPT = 0.99
 class KeptSecret:
     """What a key opens before and after."""
 
-    before: int  # Gaussians
+    before: int  # Gaussians, or bytes of a hidden file
     after: int
+    unit: str = "Gaussians"
 
     @property
     def kept(self) -> bool:
@@ -79,11 +81,12 @@ def convert(
         check_not_published(path)
     before = as_model(model)
     beside = None if source is None else sidecar_beside(source)
-    opened = [reveal_model(before, key, device=target, beside=beside).remains.found for key in keys]
+    opened = [_opened(before, key, target, beside) for key in keys]
     data = model_bytes(path, before)
     after = model_of_bytes(path, data)
     secrets = tuple(
-        KeptSecret(count, _left(after, key, target, beside)) for key, count in zip(keys, opened, strict=True)
+        KeptSecret(count, _left(after, key, target, beside), unit)
+        for key, (count, unit) in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
     psnr = cost(before.to(target), after.to(target))
@@ -100,10 +103,21 @@ def convert(
     return result
 
 
-def _left(model: Gaussians, key: str, device: torch.device, beside: Path | None) -> int:
-    """How many Gaussians of its secret a key opens in a converted model, with the sidecar that there was."""
+def _opened(model: Gaussians, key: str, device: torch.device, beside: Path | None) -> tuple[int, str]:
+    """How much a key opens: Gaussians of a scene, or bytes of a file. Raises WrongKeyError, InputError."""
     try:
-        return reveal_model(model, key, device=device, beside=beside).remains.found
+        return reveal_model(model, key, device=device, beside=beside).remains.found, "Gaussians"
+    except (InputError, WrongKeyError) as error:
+        try:
+            return len(open_file_in(model, key).data), "bytes"
+        except KeyssError:
+            raise error from None
+
+
+def _left(model: Gaussians, key: str, device: torch.device, beside: Path | None) -> int:
+    """How much a key opens in a converted model, with the sidecar that there was."""
+    try:
+        return _opened(model, key, device, beside)[0]
     except (WrongKeyError, InputError, UsageError):
         return 0
 
@@ -112,7 +126,7 @@ def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
     """Why nothing was written."""
     first = result.secrets[lost[0] - 1]
     which = "the secret that the key opens" if len(result.secrets) == 1 else f"what key {lost[0]} opens"
-    left = f"{first.after:,} of its {first.before:,} Gaussians would open from {path}"
+    left = f"{first.after:,} of its {first.before:,} {first.unit} would open from {path}"
     why = (
         ""
         if result.keeps_low_bits

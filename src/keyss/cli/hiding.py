@@ -45,8 +45,19 @@ def hide(
     ],
     secret: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        arg(metavar="SCENE", help="Scene or model to hide in it; at least one."),
-    ],
+        optional("SCENE", "Scene or model to hide in it, once for each secret.", "files are hidden"),
+    ] = (),
+    secret_file: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Any file to hide, in a cover that is a model; once for each.", "scenes are hidden"),
+    ] = (),
+    publish: Annotated[
+        Literal["ply", "any"],
+        arg(
+            help="Formats that hidden files are to survive: any for those that round, too, at 45 dB between "
+            "pictures before and after."
+        ),
+    ] = "ply",
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
     out: OutFolder,
@@ -82,6 +93,8 @@ def hide(
     example: keyss hide --cover SCENE_A --secret SCENE_B --key-file key.txt -o runs/hidden
 
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
+
+    example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
@@ -92,8 +105,23 @@ def hide(
     from keyss.rendering.orbit import is_model
     from keyss.runs.files import STEGOS
 
+    if secret_file:
+        unused: dict[str, object] = {
+            "--secret": secret,
+            "--secret-model": secret_model,
+            "--cover-model": cover_model,
+        }
+        unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
+        if given_too := [flag for flag, value in unused.items() if value]:
+            raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
+        _hide_files(cover, secret_file, publish, key_file, out, overwrite)
+        return
+    if publish != "ply":
+        raise UsageError(
+            "--publish any is for files (--secret-file); scenes take --sidecar for other formats"
+        )
     if not secret:
-        raise UsageError("nothing to hide: give --secret SCENE, once for each secret")
+        raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
     if secret_model and len(secret_model) != len(secret):
         raise UsageError(
             f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
@@ -167,6 +195,36 @@ def hide(
         "The key: send it over another channel than the file, and keep a copy: without it nothing is opened. "
         "Whoever has file and key runs `keyss reveal`."
     )
+
+
+def _hide_files(
+    cover: Path,
+    files: Sequence[Path],
+    publish: Literal["ply", "any"],
+    key_file: Sequence[Path],
+    out: Path,
+    overwrite: bool,
+) -> None:
+    """`keyss hide --secret-file`."""
+    from keyss import api
+    from keyss.cli.keys import keys, warn_of_doubtful_keys
+    from keyss.cli.tables import print_files
+    from keyss.core.errors import UsageError
+    from keyss.rendering.orbit import is_model
+
+    if not is_model(cover):
+        raise UsageError(
+            f"--secret-file needs a model as the cover, and {cover} is none; `keyss fit` makes one of photos"
+        )
+    opening = keys(key_file, len(files), confirm=True)
+    warn_of_doubtful_keys(opening)
+    secrets = [api.SecretFile(file, key) for file, key in zip(files, opening, strict=True)]
+    result = api.hide_files(cover, secrets, publish=publish, out=out, overwrite=overwrite)
+    for file, size in zip(files, result.sizes, strict=True):
+        print(f"{file.name}: {size:,} bytes, opened again from what was written")
+    print(f"The cover's views changed by {result.psnr:.0f} dB PSNR")
+    how = "as it is, or converted" if publish == "any" else "byte for byte as it is"
+    print_files(out, {"publish/stego.ply": f"publish this, {how}"})
 
 
 def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
@@ -264,7 +322,11 @@ def reveal(
     ] = (),
     out: Annotated[
         Path,
-        arg(aliases=["-o"], metavar="FILE", help="The model to write (.ply, .spz, ...), or - for stdout."),
+        arg(
+            aliases=["-o"],
+            metavar="FILE",
+            help="The model to write (.ply, .spz, ...), or - for stdout; a hidden file gets any other name.",
+        ),
     ],
     decoder: Annotated[
         Path | None,
@@ -292,9 +354,21 @@ def reveal(
     """
     from keyss import api
     from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.core.errors import UsageError
+    from keyss.files.models import is_model_path
     from keyss.files.streams import is_standard
 
     (key,) = keys(key_file, 1)
+    if not is_standard(out) and not is_model_path(out):
+        if decoder or decoy or force or frame != "secret":
+            raise UsageError(
+                f"{out} is not the name of a model: expected one that ends in .ply, or a hidden file's, for "
+                "which there is no --decoder, --decoy, --force or --frame"
+            )
+        with hinting_at_white_space([key]):
+            found = api.reveal_file(stego, key, out=out, overwrite=overwrite)
+        print(f"{out}: {found.name!r}, {len(found.data):,} bytes")
+        return
     with hinting_at_white_space([key]):
         revealed = api.reveal_counted(
             stego,

@@ -158,8 +158,8 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
     )
     for number, secret in enumerate(found.secrets, 1):
         which = "what the key opens" if len(found.secrets) == 1 else f"what key {number} opens"
-        state = "opens as before" if secret.kept else f"is lost: {secret.after:,} Gaussians of it open"
-        print(f"{which}, {secret.before:,} Gaussians, {state}", file=file)
+        state = "opens as before" if secret.kept else f"is lost: {secret.after:,} {secret.unit} of it open"
+        print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
     if not found.secrets and not found.keeps_low_bits:
         print("what may lie in low bits does not survive this format; with a key, keyss looks", file=file)
     if dry_run:

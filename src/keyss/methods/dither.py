@@ -18,14 +18,14 @@ import torch
 from keyss.channels.low_bits.usable import chance_of_bits, is_uniform
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
-from keyss.rendering import render
-from keyss.rendering.orbit import orbit
+from keyss.rendering.difference import cost
+
+__all__ = ["cost", "dither", "raised", "sampled"]
 
 _BITS, _CHANCE = 9, 1e-6  # low bits that depend on each other are not random
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
 _SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
 _TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
-_VIEWS, _SIZE = 4, 256
 _SAMPLE = 20_000  # Gaussians
 _UNIT = 1e-5  # by which the length of a unit quaternion may differ from 1
 _FAINT = 1e-3  # standard deviation of harmonics that a model does not have
@@ -73,18 +73,6 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     # Scaled before they are rounded: a product of single precision keeps a trace of its factor.
     noise = _FAINT * torch.randn(len(model), count // 3, 3, generator=generator, dtype=torch.float64)
     return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
-
-
-def cost(before: Gaussians, after: Gaussians) -> float:
-    """PSNR in dB of views around a model, between before and after; at most 120."""
-    cameras = orbit(before, _SIZE, _VIEWS)
-    error = torch.stack(
-        [
-            (render(before, camera).clamp(0, 1) - render(after, camera).clamp(0, 1)).square().mean()
-            for camera in cameras
-        ]
-    )
-    return float(-10 * torch.log10(error.mean().clamp_min(1e-12)))
 
 
 def _is_natural(values: Floats) -> bool:

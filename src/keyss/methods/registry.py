@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from keyss.channels.base import Content
 from keyss.channels.codes import CodesReader
 from keyss.channels.low_bits import LowBitsReader
@@ -10,10 +12,12 @@ from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation
+from keyss.methods import hidden_file
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
 from keyss.methods.carry.options import CarryOptions as CarryOptions
 from keyss.methods.decoy import Decoy
+from keyss.methods.hidden_file import HiddenFile
 from keyss.methods.learned.method import LearnedMethod
 from keyss.methods.learned.options import LearnedOptions as LearnedOptions
 
@@ -50,19 +54,9 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
             if not decoy:
                 raise
             return Decoy.of(stego, derived)
-    if isinstance(stego, CodedGaussians):
-        coded = CodesReader.of(stego.codes)
-        own = DerivedKey(key, KeyDerivation(salt=coded.salt))
-        try:
-            return _unpacked(coded.extract(own))
-        except WrongKeyError:
-            if not decoy:
-                raise
-            return Decoy.of(stego, own)
-    reader = LowBitsReader.of(stego)
     if not decoy:
-        return _unpacked(reader.open(key))
-    for derived in reader.keys(key, 1):
+        return _unpacked(open_content(stego, key))
+    for derived, reader in _one_way(stego, key):
         try:
             return _unpacked(reader.extract(derived))
         except WrongKeyError:
@@ -70,7 +64,33 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
     raise WrongKeyError("this key opens nothing here")
 
 
+def open_content(stego: Gaussians, key: str) -> Content:
+    """What `key` opens in the codes of a file's model, or in the low bits of another, whoever reads it.
+
+    Raises WrongKeyError and InputError.
+    """
+    if isinstance(stego, CodedGaussians):
+        return CodesReader.of(stego.codes).open(key)
+    return LowBitsReader.of(stego).open(key)
+
+
+def _one_way(stego: Gaussians, key: str) -> Iterator[tuple[DerivedKey, CodesReader | LowBitsReader]]:
+    """What the key becomes under the likeliest salt, and what reads with it; nothing where there is no salt."""
+    if isinstance(stego, CodedGaussians):
+        codes = CodesReader.of(stego.codes)
+        yield DerivedKey(key, KeyDerivation(salt=codes.salt)), codes
+    else:
+        bits = LowBitsReader.of(stego)
+        yield from ((derived, bits) for derived in bits.keys(key, 1))
+
+
 def _unpacked(content: Content) -> Opened:
+    if content.method == hidden_file.NAME:
+        size = len(HiddenFile.of(content).data)
+        raise InputError(
+            f"this key opens a file of {size:,} bytes, not a scene: take a name for it that does not end as "
+            "that of a model (keyss.api.reveal_file)"
+        )
     if content.method not in METHODS:
         raise InputError(
             f"the secret was hidden by the method {content.method!r}; this program has {', '.join(METHODS)}"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,7 +28,8 @@ MOST_SIDECAR_BYTES = 1 << 30
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
     "(converted or quantised, moved, scaled, pruned, edited or trained on); its sidecar "
-    f"({Path(SIDECAR).name}) may be missing or another one; or nothing is hidden here"
+    f"({Path(SIDECAR).name}) may be missing or another one; it may be a file that is hidden, which comes out "
+    "under a name that is no model's; or nothing is hidden here"
 )
 
 
@@ -99,13 +101,21 @@ def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, d
     """
     data = read_sidecar(Path(sidecar)) if isinstance(sidecar, str | Path) else sidecar
     try:
-        return registry.open_model(stego, key, sidecar=data, decoy=decoy)
-    except WrongKeyError as error:
-        raise WrongKeyError(OPENS_NOTHING) from error
+        with naming_what_opens_nothing():
+            return registry.open_model(stego, key, sidecar=data, decoy=decoy)
     except InputError as error:
         if isinstance(sidecar, str | Path):
             raise InputError(f"{sidecar}: {error}") from error
         raise
+
+
+@contextmanager
+def naming_what_opens_nothing() -> Iterator[None]:
+    """A key that opens nothing is told so in the same words whatever there is."""
+    try:
+        yield
+    except WrongKeyError as error:
+        raise WrongKeyError(OPENS_NOTHING) from error
 
 
 def read_sidecar(path: Path) -> bytes:

@@ -1,0 +1,121 @@
+"""`hide_files` and `reveal_file`: any files in a model's low bits, or in colours that survive rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from keyss._verbs.asking import check_keys
+from keyss.channels import robust
+from keyss.channels.low_bits import LOW_BITS
+from keyss.core.errors import UsageError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import write_bytes
+from keyss.files.models import read_model
+from keyss.files.output import check_not_an_input, check_output_file
+from keyss.files.reading import read_file
+from keyss.keys.encryption import MAX_PAYLOAD_BYTES
+from keyss.methods import registry
+from keyss.methods.dither import cost
+from keyss.methods.hidden_file import HiddenFile
+from keyss.runs.config import PathLike
+from keyss.runs.files import STEGO, writers
+from keyss.runs.folder import RunFolder, check_not_published
+from keyss.runs.opening import as_model, naming_what_opens_nothing
+
+Publish = Literal["ply", "any"]
+
+
+@dataclass(frozen=True)
+class SecretFile:
+    """A file, or its bytes, and the key that is to open it."""
+
+    file: PathLike | bytes
+    key: str = field(repr=False)
+    name: str = ""  # to be shown with it, by default the file's
+
+    def read(self) -> HiddenFile:
+        """Raises InputError for a file that is missing or larger than any that could be hidden."""
+        if isinstance(self.file, bytes):
+            return HiddenFile(self.name, self.file)
+        path = Path(self.file)
+        return HiddenFile(self.name or path.name, read_file(path, MAX_PAYLOAD_BYTES))
+
+
+@dataclass(frozen=True)
+class HideFilesResult:
+    """A model with files in it, and what that changed."""
+
+    stego: Gaussians  # to be published
+    psnr: float  # dB, of views around it against those of the cover; at most 120
+    sizes: tuple[int, ...]  # bytes of the files
+
+
+def hide_files(
+    cover: PathLike | Gaussians,
+    files: Sequence[SecretFile],
+    *,
+    publish: Publish = "ply",
+    strength: float = robust.STRENGTH,
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> HideFilesResult:
+    """Hide files in a model, each under its own key, and open them again as a reader will.
+
+    `publish`: "ply" writes into low bits, for a file that is passed on as it is; "any" into colours, which
+    survive formats that round, at a cost of `strength` (dB PSNR that views of the model keep at least). `out`
+    (a folder) gets `publish/stego.ply`. Raises InputError for a cover whose low bits are not random, or that
+    has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal keys.
+    """
+    if not files:
+        raise UsageError("expected at least one file to hide")
+    check_keys([each.key for each in files])
+    folder = None
+    if out is not None:
+        read = [cover, *(each.file for each in files)]
+        inputs = [Path(each) for each in read if isinstance(each, str | Path)]
+        folder = RunFolder(out, "hide files", writes=(STEGO,), inputs=inputs, overwrite=overwrite)
+    hidden, model = [each.read() for each in files], as_model(cover)
+    keys = [each.key for each in files]
+    if publish == "any":
+        packed = [(key, each.packed()) for key, each in zip(keys, hidden, strict=True)]
+        stego = robust.embed(model, packed, strength=strength)
+    else:
+        payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
+        stego = LOW_BITS.prepare(model).embed(payloads)
+    with folder.work() if folder else nullcontext():
+        there = folder.write(writers({STEGO: stego})) if folder else None
+        as_read = read_model(there / STEGO) if there else stego
+        if [open_file_in(as_read, key) for key in keys] != hidden:
+            raise RuntimeError("what was written does not open again as it should")
+    return HideFilesResult(stego, cost(model, stego), tuple(len(each.data) for each in hidden))
+
+
+def reveal_file(
+    stego: PathLike | Gaussians, key: str, *, out: PathLike | None = None, overwrite: bool = False
+) -> HiddenFile:
+    """The file that `key` opens in a model; `out` (a file) gets its bytes.
+
+    Raises WrongKeyError for a key that opens nothing, InputError for one that opens a scene and for damage.
+    """
+    path = None
+    if out is not None:
+        check_not_an_input(out, [Path(stego)] if isinstance(stego, str | Path) else [])
+        path = check_output_file(out, overwrite)
+        check_not_published(path)
+    with naming_what_opens_nothing():
+        found = open_file_in(as_model(stego), key)
+    if path is not None:
+        write_bytes(path, found.data)
+    return found
+
+
+def open_file_in(stego: Gaussians, key: str) -> HiddenFile:
+    """What `key` opens in low bits, or else in colours. Raises WrongKeyError and InputError."""
+    try:
+        return HiddenFile.of(registry.open_content(stego, key))
+    except WrongKeyError:
+        return HiddenFile.unpacked(robust.extract(stego, key))

@@ -1,0 +1,6 @@
+"""Colours of Gaussians that are known by their other numbers: survives formats that round, and much else."""
+
+from keyss.channels.robust.channel import STRENGTH, Key, RobustCover, capacity, embed
+from keyss.channels.robust.reading import extract
+
+__all__ = ["STRENGTH", "Key", "RobustCover", "capacity", "embed", "extract"]

@@ -1,0 +1,248 @@
+"""Bytes in a model and out again, after what becomes of published models."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from channels.robust.made import cover, key
+from keyss.channels.robust import RobustCover, capacity, embed, extract
+from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.similarity import Similarity
+from keyss.measure.robustness.changes import cropping, half_floats, noise, opacity_pruning, random_pruning
+from keyss.measure.robustness.conversions import converters
+from keyss.rendering.difference import cost
+
+ENTROPY = bytes(range(32))
+STRENGTH = 45.0
+
+
+@pytest.fixture(scope="module")
+def prepared() -> RobustCover:
+    return RobustCover.of(cover(6000))
+
+
+@pytest.fixture(scope="module")
+def payload(prepared: RobustCover) -> bytes:
+    return np.random.default_rng(0).bytes(prepared.capacity(STRENGTH))
+
+
+@pytest.fixture(scope="module")
+def stego(prepared: RobustCover, payload: bytes) -> Gaussians:
+    return prepared.embed([(key("a"), payload)], strength=STRENGTH, entropy=ENTROPY)
+
+
+def test_text_keys_open_what_they_were_given(prepared: RobustCover) -> None:
+    """With Argon2id, which all other tests skip."""
+    stego = prepared.embed([("Rosebud, 1941", b"snow")], strength=STRENGTH, entropy=ENTROPY)
+    assert extract(stego, "Rosebud, 1941") == b"snow"
+    with pytest.raises(WrongKeyError):
+        extract(stego, "Rosebud, 1942")
+
+
+@settings(max_examples=12, deadline=None)
+@given(share=st.floats(0, 1), seed=st.integers(0, 2**32))
+def test_every_size_up_to_capacity_comes_back(prepared: RobustCover, share: float, seed: int) -> None:
+    data = np.random.default_rng(seed).bytes(int(share * prepared.capacity(STRENGTH)))
+    stego = prepared.embed([(key("a"), data)], strength=STRENGTH, entropy=seed.to_bytes(32, "little"))
+    assert extract(stego, key("a")) == data
+
+
+def test_what_does_not_fit_is_refused_with_what_would(prepared: RobustCover, payload: bytes) -> None:
+    with pytest.raises(UsageError, match=f"{len(payload):,} bytes in all"):
+        prepared.embed([(key("a"), payload + b"x")], strength=STRENGTH)
+    with pytest.raises(UsageError, match="`strength`"):
+        prepared.capacity(math.nan)
+    with pytest.raises(UsageError, match="`spacing`"):
+        capacity(prepared.model, spacing=0.02)
+
+
+def test_only_green_and_blue_of_some_gaussians_change(prepared: RobustCover, stego: Gaussians) -> None:
+    model = prepared.model
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        assert torch.equal(getattr(model, name), getattr(stego, name))
+    assert torch.equal(model.sh[:, 0, 0], stego.sh[:, 0, 0])
+    assert torch.equal(model.sh[:, 1:], stego.sh[:, 1:])
+    assert (model.sh != stego.sh).any(dim=2).any(dim=1).float().mean() > 0.5
+
+
+def test_it_costs_no_more_than_was_asked_for(prepared: RobustCover, stego: Gaussians) -> None:
+    assert cost(prepared.model, stego) > STRENGTH
+    sizes = [prepared.capacity(strength) for strength in (40.0, 50.0, 60.0)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > 1.3 * sizes[2]
+
+
+def _spz(model: Gaussians) -> Gaussians:
+    return next(each for each in converters() if (each.format, each.tool) == (".spz", "gsply"))(
+        model
+    ).gaussians
+
+
+def _turned(scale: float) -> Callable[[Gaussians], Gaussians]:
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    move = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
+    return Similarity(scale, rotation, move).apply_gaussians
+
+
+def _shuffled(model: Gaussians) -> Gaussians:
+    return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(1))]
+
+
+CHANGES: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "nothing": lambda model: model,
+    "spz": _spz,
+    "spz, order and a quarter": lambda model: random_pruning(0.25, 3)(_shuffled(_spz(model))),
+    "rotation and translation": _turned(1.0),
+    "scaling": _turned(1.37),
+    "half floats": half_floats(),
+    "noise on colour": noise("colour", 0.005),
+    "noise on log scales": noise("log scale", 0.005),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_full_model_opens_after(name: str, stego: Gaussians, payload: bytes) -> None:
+    if "spz" in name:
+        pytest.importorskip("gsply")
+    assert extract(CHANGES[name](stego), key("a")) == payload
+
+
+HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "one half": cropping(1),
+    "another half": cropping(2),
+    "a random half": random_pruning(0.5),
+    "without the faintest": opacity_pruning(0.25),
+    "scaling before spz": lambda model: _spz(_turned(0.4)(model)),
+    "another scene beside it": lambda model: Gaussians.cat([cover(2000, seed=5), model]),
+}
+
+
+@pytest.mark.parametrize("name", HARDER)
+def test_a_fifth_of_the_capacity_opens_after(prepared: RobustCover, name: str) -> None:
+    if "spz" in name:
+        pytest.importorskip("gsply")
+    data = np.random.default_rng(1).bytes(prepared.capacity(STRENGTH) // 5)
+    stego = prepared.embed([(key("a"), data)], strength=STRENGTH, entropy=ENTROPY)
+    assert extract(HARDER[name](stego), key("a")) == data
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes) -> None:
+    converter = converters()[index]
+    try:
+        back = converter(stego).gaussians
+    except KeyssError as error:
+        pytest.skip(str(error))
+    assert extract(back, key("a")) == payload
+
+
+def test_two_keys_open_their_own_and_a_third_nothing(prepared: RobustCover) -> None:
+    data = {name: os.urandom(prepared.capacity(STRENGTH) // 10) for name in "ab"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        stego = prepared.embed([(key(name), data[name]) for name in "ab"], strength=STRENGTH, entropy=ENTROPY)
+    for name in "ab":
+        assert extract(stego, key(name)) == data[name]
+    with pytest.raises(WrongKeyError):
+        extract(stego, key("c"))
+
+
+def test_who_could_notice_other_secrets_is_said(prepared: RobustCover, payload: bytes) -> None:
+    large, small = payload[: len(payload) // 2], payload[: len(payload) // 4]
+    with pytest.warns(KeyssWarning, match="notice that there are other secrets"):
+        stego = prepared.embed([(key("a"), large), (key("b"), small)], strength=STRENGTH, entropy=ENTROPY)
+    assert extract(stego, key("a")) == large
+
+
+def test_equal_keys_and_none_are_refused(prepared: RobustCover) -> None:
+    with pytest.raises(UsageError, match="same key"):
+        prepared.embed([(key("a"), b"1"), (key("a"), b"2")], strength=STRENGTH)
+    with pytest.raises(UsageError, match="at least one"):
+        prepared.embed([], strength=STRENGTH)
+
+
+def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: RobustCover) -> None:
+    first, second = (prepared.embed([(key("a"), b"same")], strength=STRENGTH) for _ in range(2))
+    written = [(each.sh[:, 0] - prepared.model.sh[:, 0])[:, 1:].flatten() for each in (first, second)]
+    both = (written[0] != 0) & (written[1] != 0)
+    assert abs(np.corrcoef(written[0][both], written[1][both])[0, 1]) < 0.1
+    assert float((written[0] == written[1])[both].float().mean()) < 0.01
+
+
+def test_entropy_decides_everything(prepared: RobustCover) -> None:
+    one, same = (prepared.embed([(key("a"), b"x")], strength=STRENGTH, entropy=ENTROPY) for _ in range(2))
+    assert torch.equal(one.sh, same.sh)
+
+
+def test_what_was_destroyed_is_told_from_what_was_never_there(
+    stego: Gaussians, prepared: RobustCover
+) -> None:
+    with pytest.raises(InputError, match="the key is right, but too much"):
+        extract(random_pruning(0.45, 1)(stego), key("a"))
+    with pytest.raises(WrongKeyError):
+        extract(prepared.model, key("a"))
+
+
+def test_a_changed_bit_of_the_payload_is_never_handed_out(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from keyss.channels.robust.fountain import Fountain
+
+    decode = Fountain.decode
+
+    def wrong(self: Fountain, *arguments: object) -> tuple[np.ndarray, bool]:
+        bits, done = decode(self, *arguments)  # type: ignore[arg-type]
+        if self.size > 1000:
+            bits[777] ^= 1
+        return bits, done
+
+    monkeypatch.setattr(Fountain, "decode", wrong)
+    with pytest.raises(InputError, match="the key is right"):
+        extract(stego, key("a"))
+
+
+@pytest.mark.parametrize("count", [0, 1, 30, 200])
+def test_small_models_are_refused_or_carry(count: int) -> None:
+    model = cover(max(count, 1))[:count]
+    with pytest.raises((UsageError, InputError)):
+        embed(model, [(key("a"), bytes(100))], strength=STRENGTH)
+    assert capacity(model, strength=STRENGTH) < 100
+    with pytest.raises(WrongKeyError):
+        extract(model, key("a"))
+
+
+def test_hostile_numbers_end_in_a_typed_error(stego: Gaussians) -> None:
+    values = torch.tensor([math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-45, 0.0])
+    generator = torch.Generator().manual_seed(0)
+
+    def garbled(tensor: torch.Tensor) -> torch.Tensor:
+        hit = torch.rand(tensor.shape, generator=generator) < 0.6
+        return torch.where(hit, values[torch.randint(7, tensor.shape, generator=generator)], tensor)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(3):
+            with pytest.raises((WrongKeyError, InputError)):
+                extract(stego[:800].map(garbled), key("a"))
+
+
+def test_equal_gaussians_cost_nothing_but_themselves(stego: Gaussians, payload: bytes) -> None:
+    """Each a second time, as where a model is put together with itself."""
+    assert extract(Gaussians.cat([stego, stego]), key("a")) == payload
+
+
+def test_a_model_of_one_gaussian_many_times_is_refused() -> None:
+    model = replace(cover(1)[torch.zeros(3000, dtype=torch.int64)])
+    with pytest.raises((UsageError, InputError)):
+        embed(model, [(key("a"), b"x")], strength=STRENGTH)

@@ -1,0 +1,133 @@
+"""Files hidden by `keyss hide --secret-file` and brought back by `keyss reveal`."""
+
+from __future__ import annotations
+
+import os
+import stat
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from channels.low_bits.trained_like import trained_like
+from channels.robust.made import cover
+from cli.said import Said, assert_refused, listing
+from keyss import api, write_model
+from keyss.channels.base import Payload
+from keyss.cli import main
+from keyss.core import InputError, UsageError
+from keyss.methods.hidden_file import NAME, HiddenFile
+from methods.carry.carried import embed
+
+Keyss = Callable[..., Said]
+KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cover, two files, two keys, and `out`, where both are hidden in it."""
+    made = tmp_path_factory.mktemp("files")
+    write_model(made / "cover.ply", trained_like(3000))
+    (made / "letter.pdf").write_bytes(os.urandom(3000))
+    (made / "empty").write_bytes(b"")
+    for index, key in enumerate(KEYS):
+        (made / f"key{index}").write_text(key)
+        (made / f"key{index}").chmod(0o600)
+    assert main([str(each) for each in _arguments(made, made / "out")]) == 0
+    return made
+
+
+def _arguments(folder: Path, out: Path) -> list[object]:
+    keys = ["--key-file", folder / "key0", "--key-file", folder / "key1"]
+    files = ["--secret-file", folder / "letter.pdf", "--secret-file", folder / "empty"]
+    return ["hide", "--cover", folder / "cover.ply", *files, *keys, "-o", out]
+
+
+def test_files_come_back_byte_for_byte(keyss: Keyss, folder: Path, tmp_path: Path) -> None:
+    stego = folder / "out" / "publish" / "stego.ply"
+    assert stego.stat().st_size == (folder / "cover.ply").stat().st_size
+    for index, name in enumerate(("letter.pdf", "empty")):
+        out = tmp_path / f"back{index}"
+        said = keyss("reveal", stego, "--key-file", folder / f"key{index}", "-o", out)
+        assert said.status == 0
+        assert repr(name) in said.out
+        assert out.read_bytes() == (folder / name).read_bytes()
+        assert stat.S_IMODE(out.stat().st_mode) == 0o600
+
+
+def test_what_does_not_go_together_is_refused(
+    keyss: Keyss, folder: Path, world: Path, tmp_path: Path
+) -> None:
+    out, back = tmp_path / "out", tmp_path / "back"
+    hide = _arguments(folder, out)
+    assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "leave out --secret")
+    assert_refused(keyss(*hide, "--dry-run"), 2, "leave out --dry-run")
+    photos = ("hide", "--cover", world / "a", "--secret-file", folder / "empty", "-o", out)
+    assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
+    stego, key = folder / "out" / "publish" / "stego.ply", ("--key-file", folder / "key0")
+    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 4, "a file of 3,000 bytes")
+    assert_refused(keyss("reveal", stego, *key, "-o", back, "--decoy"), 2, "no --decoder")
+    assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
+    assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
+    assert listing(tmp_path) == {}
+
+
+def test_a_scene_is_not_taken_for_a_file() -> None:
+    stego = embed(trained_like(2000), [(KEYS[0], trained_like(500, 1))])
+    with pytest.raises(InputError, match="opens a scene, not a file"):
+        api.reveal_file(stego, KEYS[0])
+
+
+def test_a_file_too_large_for_its_cover_is_told_what_would_do(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do"):
+        api.hide_files(trained_like(2000), [api.SecretFile(os.urandom(90_000), KEYS[0])])
+
+
+def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
+    keyss: Keyss, folder: Path, tmp_path: Path
+) -> None:
+    write_model(tmp_path / "cover.ply", cover(6000))
+    (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)
+    key, out = ("--key-file", folder / "key0"), tmp_path / "out"
+    hide = ("hide", "--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "note.txt", *key)
+    said = keyss(*hide, "--publish", "any", "-o", out)
+    assert (said.status, said.err) == (0, "")
+    assert "or converted" in said.out
+    said = keyss("convert", out / "publish" / "stego.ply", tmp_path / "web.spz", *key)
+    assert (said.status, said.err) == (0, "")
+    assert keyss("reveal", tmp_path / "web.spz", *key, "-o", tmp_path / "back").status == 0
+    assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()
+    said = keyss("reveal", tmp_path / "web.spz", "--key-file", folder / "key1", "-o", tmp_path / "none")
+    assert_refused(said, 3, "opens nothing")
+    scene = ("hide", "--cover", tmp_path / "cover.ply", "--secret", tmp_path / "cover.ply", *key)
+    assert_refused(keyss(*scene, "--publish", "any", "-o", tmp_path / "x"), 2, "is for files")
+
+
+@given(st.binary(max_size=400), st.text(max_size=60))
+def test_any_bytes_and_any_name_come_back(data: bytes, name: str) -> None:
+    file = HiddenFile(name.encode(errors="replace").decode(), data)
+    assert HiddenFile.of(file.payload()) == file
+    assert HiddenFile.unpacked(file.packed()) == file
+
+
+@pytest.mark.parametrize("data", [b"", b"\1", b"\1junk", b"\1" + zlib.compress(bytes(10**6)), b"\0"])
+def test_what_no_writer_packed_is_refused(data: bytes) -> None:
+    with pytest.raises(InputError):
+        HiddenFile.unpacked(data)
+
+
+@given(st.binary(max_size=300))
+def test_payloads_of_others_are_read_or_refused(data: bytes) -> None:
+    try:
+        found = HiddenFile.of(Payload(NAME, data))
+    except InputError:
+        return
+    assert len(found.data) <= len(data)
+
+
+def test_a_name_beyond_measure_is_refused() -> None:
+    with pytest.raises(UsageError, match="255 bytes"):
+        HiddenFile("n" * 256, b"").payload()
