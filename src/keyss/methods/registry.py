@@ -75,7 +75,7 @@ def open_content(stego: Gaussians, key: str) -> Content:
 
 
 def _one_way(stego: Gaussians, key: str) -> Iterator[tuple[DerivedKey, CodesReader | LowBitsReader]]:
-    """What the key becomes under the likeliest salt, and what reads with it; nothing where there is no salt."""
+    """What the key becomes under the likeliest salt, and what reads with it; none where there is no salt."""
     if isinstance(stego, CodedGaussians):
         codes = CodesReader.of(stego.codes)
         yield DerivedKey(key, KeyDerivation(salt=codes.salt)), codes
