@@ -70,8 +70,9 @@ def hide_files(
     `publish`: "ply" writes into low bits, and "spz", "sog" and "compressed-ply" into the codes of such a
     file, which have to be passed on as they are; "any" writes into colours of a `.ply`, which survive formats
     that round, at a cost of `strength` (dB PSNR that views of the model keep at least). `out` (a folder) gets
-    `publish/stego.ply`, or `.spz` and so on. Raises InputError for a cover whose low bits are not random, or that
-    has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal keys.
+    `publish/stego.ply`, or `.spz` and so on. Raises InputError for a cover whose low bits are not random, or
+    that has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal
+    keys.
     """
     if not files:
         raise UsageError("expected at least one file to hide")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from keyss.channels.base import Content
 from keyss.channels.codes import CodesReader
 from keyss.channels.low_bits import LowBitsReader
@@ -54,14 +56,7 @@ def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, deco
             return Decoy.of(stego, derived)
     if not decoy:
         return _unpacked(open_content(stego, key))
-    if isinstance(stego, CodedGaussians):
-        own = DerivedKey(key, KeyDerivation(salt=CodesReader.of(stego.codes).salt))
-        try:
-            return _unpacked(CodesReader.of(stego.codes).extract(own))
-        except WrongKeyError:
-            return Decoy.of(stego, own)
-    reader = LowBitsReader.of(stego)
-    for derived in reader.keys(key, 1):
+    for derived, reader in _one_way(stego, key):
         try:
             return _unpacked(reader.extract(derived))
         except WrongKeyError:
@@ -77,6 +72,16 @@ def open_content(stego: Gaussians, key: str) -> Content:
     if isinstance(stego, CodedGaussians):
         return CodesReader.of(stego.codes).open(key)
     return LowBitsReader.of(stego).open(key)
+
+
+def _one_way(stego: Gaussians, key: str) -> Iterator[tuple[DerivedKey, CodesReader | LowBitsReader]]:
+    """What the key becomes under the likeliest salt, and what reads with it; none where there is no salt."""
+    if isinstance(stego, CodedGaussians):
+        codes = CodesReader.of(stego.codes)
+        yield DerivedKey(key, KeyDerivation(salt=codes.salt)), codes
+    else:
+        bits = LowBitsReader.of(stego)
+        yield from ((derived, bits) for derived in bits.keys(key, 1))
 
 
 def _unpacked(content: Content) -> Opened:
