@@ -117,9 +117,10 @@ def hide(
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         _hide_files(cover, secret_file, publish, key_file, out, overwrite)
         return
-    if publish != "ply":
+    if publish == "any":
         raise UsageError(
-            "--publish any is for files (--secret-file); scenes take --sidecar for other formats"
+            "--publish any is for files (--secret-file) so far; scenes take the format that is published, "
+            "or --sidecar"
         )
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
