@@ -52,10 +52,10 @@ def hide(
         optional("FILE", "Any file to hide, in a cover that is a model; once for each.", "scenes are hidden"),
     ] = (),
     publish: Annotated[
-        Literal["ply", "any"],
+        Literal["ply", "spz", "sog", "compressed-ply", "any"],
         arg(
-            help="Formats that hidden files are to survive: any for those that round, too, at 45 dB between "
-            "pictures before and after."
+            help="Format of the published file, to be passed on as it is; all but ply with --method carry. "
+            "any: hidden files survive formats that round, too, at 45 dB between pictures before and after."
         ),
     ] = "ply",
     method: str = DEFAULT_METHOD,
@@ -114,12 +114,16 @@ def hide(
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
+        if publish not in ("ply", "any"):
+            raise UsageError(f"--publish {publish} is for scenes; --secret-file takes ply or any")
         _hide_files(cover, secret_file, publish, key_file, out, overwrite)
         return
-    if publish != "ply":
+    if publish == "any":
         raise UsageError(
             "--publish any is for files (--secret-file); scenes take --sidecar for other formats"
         )
+    if publish != "ply" and method != "carry":
+        raise UsageError(f"--publish {publish} needs --method carry")
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
     if secret_model and len(secret_model) != len(secret):
@@ -133,6 +137,8 @@ def hide(
         for name, value in own.items()
         if value is not None and value is not False
     }
+    if publish != "ply":
+        changes["publish"] = publish
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     given = [cover_model or cover, *(secret_model or secret)]

@@ -19,12 +19,7 @@ class CarryOptions(MethodOptions):
     dither: Annotated[bool, CommandLineOption("Give the cover new low bits where they are not random.")] = (
         False
     )
-    publish: Annotated[
-        Literal["ply", "spz", "sog", "compressed-ply"],
-        CommandLineOption(
-            "Format of the published file, to be passed on as it is; ply, the default, has most room.",
-        ),
-    ] = "ply"
+    publish: Literal["ply", "spz", "sog", "compressed-ply"] = "ply"  # to be passed on as it is
 
 
 PRESETS: dict[str, CarryOptions] = {
