@@ -115,6 +115,8 @@ def hide(
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
+        if publish not in ("ply", "any"):
+            raise UsageError(f"--publish {publish} is for scenes; --secret-file takes ply or any")
         _hide_files(cover, secret_file, publish, key_file, out, overwrite)
         return
     if publish == "any":
@@ -122,6 +124,8 @@ def hide(
             "--publish any is for files (--secret-file) so far; scenes take the format that is published, "
             "or --sidecar"
         )
+    if publish != "ply" and method != "carry":
+        raise UsageError(f"--publish {publish} needs --method carry: leave out --method {method}")
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
     if secret_model and len(secret_model) != len(secret):
@@ -136,8 +140,6 @@ def hide(
         if value is not None and value is not False
     }
     if publish != "ply":
-        if method != "carry":
-            raise UsageError(f"--publish {publish} carries models: leave out --method {method}")
         changes["publish"] = publish
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))

@@ -52,11 +52,14 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
     """The codes as a writer of the format sorts them.
 
     It sorts before it rounds, so that a few neighbours seem to be out of order. `within` [N, 3]: where
-    between half a level below and above the numbers lay, at random.
+    between half a level below and above the numbers lay, at random; extremes lie on their levels, and the
+    curve goes between them.
     """
     if not isinstance(codes, SogCodes):
         return codes
-    means: Floats = positions_of(codes, codes.positions + within).astype(np.float32)
+    levels = codes.positions
+    extreme = (levels == levels.min(axis=0)) | (levels == levels.max(axis=0))
+    means: Floats = positions_of(codes, levels + np.where(extreme, 0.0, within)).astype(np.float32)
     return taken(codes, morton_order(means))
 
 
