@@ -350,7 +350,7 @@ class TestVerify:
         said = keyss("verify", files / "whole.ply", "--key-file", files / "key", "--json")
         assert (said.status, said.err) == (0, "")
         secret = json.loads(said.out)["secret"]
-        assert (secret["where"], secret["found"], secret["hidden"]) == ("low bits", 500, 500)
+        assert (secret["where"], secret["found"], secret["hidden"]) == ("model", 500, 500)
         said = keyss("verify", files / "learned" / "stego.ply", "--key-file", files / "key")
         assert said.status == 0
         assert "sidecar" in said.out

@@ -130,6 +130,6 @@ def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
     why = (
         ""
         if result.keeps_low_bits
-        else ": low bits, which hold it, do not survive that format, and .ply keeps them"
+        else ": the bits that hold it do not survive writing the model in that format"
     )
     return f"{which} would be lost: {left}{why}; nothing was written; `force=True` writes it all the same"

@@ -12,9 +12,10 @@ from tyro.conf import arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
-from keyss.cli.hiding import hide, reveal, verify
+from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
+from keyss.cli.revealing import reveal, verify
 
 
 def keygen(

@@ -37,7 +37,7 @@ class ModelCheck:
 class SecretCheck:
     """The secret of a key, in a model or in its sidecar."""
 
-    where: str  # "low bits" or "sidecar"
+    where: str  # "model" or "sidecar"
     found: int  # Gaussians
     hidden: int  # Gaussians that there were; 0: not known
     share: float  # the one of the other
@@ -106,7 +106,7 @@ def check_secret(found: RevealResult) -> SecretCheck:
     if lost:
         problems.append(f"{lost:,} of {chunks:,} chunks of its payload are lost; the others make up for them")
     return SecretCheck(
-        where="sidecar" if found.from_sidecar else "low bits",
+        where="sidecar" if found.from_sidecar else "model",
         found=remains.found,
         hidden=remains.hidden,
         share=round(remains.share, 4),
