@@ -6,9 +6,16 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
+
+# What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
+# it; on other machines it goes on searching.
+settings.register_profile("ci", derandomize=True)
+if "CI" in os.environ:
+    settings.load_profile("ci")
 
 
 @pytest.fixture(scope="session")

@@ -89,6 +89,17 @@ def test_hostile_gaussians_give_finite_images_and_gradients(data: st.DataObject)
     check_finite(scene.results({name: leaf.requires_grad_() for name, leaf in leaves.items()}))
 
 
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("size", [1e14, 1e15, 1e16, 1e18])
+def test_gradients_of_needles_of_absurd_size_are_finite(seed: int, size: float) -> None:
+    """So opaque that the antialiased footprint of next to no area is drawn."""
+    modes = {"render_mode": "D", "rasterize_mode": "antialiased"}
+    scene = random_scene(count=1, width=1, height=1, size=0.3, seed=seed, sh_degree=0, **modes)
+    leaves = {name: leaf.detach().clone() for name, leaf in scene.leaves().items()}
+    leaves["means"][0, 2], leaves["opacities"][0], leaves["scales"][0, 0] = 1e8, 1e8, size
+    check_finite(scene.results({name: leaf.requires_grad_() for name, leaf in leaves.items()}))
+
+
 @settings(max_examples=120, deadline=None)
 @given(st.data())
 def test_hostile_cameras_give_finite_images_or_an_error_by_name(data: st.DataObject) -> None:

@@ -16,6 +16,7 @@ from keyss.rendering.cpu.layout import (
     CHUNK,
     GREEN,
     HALF,
+    HUGE,
     MOMENTS,
     NORM_MIN,
     ONE,
@@ -29,6 +30,7 @@ from keyss.rendering.cpu.projection import PREFETCH, dot, linearised, squared_ar
 from keyss.rendering.cpu.rows import gather1, gather3, gather4, gather8, load_transposed, scatter
 from keyss.rendering.cpu.shading import prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
+    absolute,
     at,
     divide,
     fetch_add,
@@ -280,10 +282,10 @@ def _gaussian_gradients(
     # A zero quaternion is drawn without a rotation, and stays so.
     norm = select_gt(linear.square, NORM_MIN, linear.norm, ZERO)
     quat_gradient = (
-        (ew - along * qw) * norm,
-        (ex - along * qx) * norm,
-        (ey - along * qy) * norm,
-        (ez - along * qz) * norm,
+        _finite((ew - along * qw) * norm),
+        _finite((ex - along * qx) * norm),
+        _finite((ey - along * qy) * norm),
+        _finite((ez - along * qz) * norm),
     )
     if not first_camera:
         w, x, y, z = gather4(gradients.quats, ids, start, 4, 0)
@@ -291,8 +293,8 @@ def _gaussian_gradients(
         quat_gradient = (w_new + w, x_new + x, y_new + y, z_new + z)
     scatter(gradients.quats, ids, start, 4, 0, quat_gradient)
     r = linear.rotation
-    da = (dot(du, r[0]), dot(du, r[1]), dot(du, r[2]))
-    db = (dot(dv, r[0]), dot(dv, r[1]), dot(dv, r[2]))
+    da = (_finite(dot(du, r[0])), _finite(dot(du, r[1])), _finite(dot(du, r[2])))
+    db = (_finite(dot(dv, r[0])), _finite(dot(dv, r[1])), _finite(dot(dv, r[2])))
 
     # Through J and the projected centre to the mean in camera space (tx, ty, tz). Where the slope was
     # clamped, J does not depend on it.
@@ -313,6 +315,7 @@ def _gaussian_gradients(
     tz = tz + djxz * clamped_x * (free_x + ONE) + djyz * clamped_y * (free_y + ONE)
     if with_depth:
         tz = tz + load8(sums, DEPTH)
+    tx, ty, tz = _finite(tx), _finite(ty), _finite(tz)
     dx, dy, dz = through_color
     mean_gradient = (
         tx * camera[0] + ty * camera[3] + tz * camera[6] + dx,
@@ -346,6 +349,12 @@ def _add_to_camera(camera_sums, k, valid, jacobian, da, db, t, t_k, mean, throug
 def _combined(x, p, y, q):
     """x p + y q, for vectors x and y and 3 vectors each in p and q."""
     return x * p[0] + y * q[0], x * p[1] + y * q[1], x * p[2] + y * q[2]
+
+
+@inlined
+def _finite(a):
+    """`a`; 0 where it is beyond what can be multiplied, or no number, as for Gaussians of absurd sizes."""
+    return select_gt(HUGE, absolute(a), a, ZERO)
 
 
 @inlined
