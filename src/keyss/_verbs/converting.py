@@ -32,7 +32,7 @@ _KEPT = 0.99
 
 @dataclass(frozen=True)
 class KeptSecret:
-    """What a key opens before and after."""
+    """How much of a secret opens with its key, before and after the conversion."""
 
     before: int  # Gaussians, or bytes of a hidden file
     after: int

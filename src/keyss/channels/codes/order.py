@@ -32,12 +32,12 @@ class Counted:
 
     @staticmethod
     def of(codes: Codes) -> Counted:
-        """Twins carry nothing, for cloning leaves them alike and they would differ."""
+        """Clones carry nothing: their codes are equal, and would differ afterwards."""
         rows = (
             _sog_order(codes) if isinstance(codes, SogCodes) else np.arange(len(fields_of(codes)[0].levels))
         )
         codes = taken(codes, rows)
-        alone = ~_twins(codes)
+        alone = ~_clones(codes)
         return Counted(codes, rows, [replace(each, usable=each.usable & alone) for each in fields_of(codes)])
 
 
@@ -64,12 +64,12 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
 
 
 def _sog_order(codes: SogCodes) -> Rows:
-    """By the cells that positions stay in; of several in one cell, which are twins, none carries."""
+    """By the cells that positions stay in; of several in one cell, which are clones, none carries."""
     x, y, z = (position_cells(codes)).T
     return np.lexsort((z, y, x))
 
 
-def _twins(codes: Codes) -> Flags:
+def _clones(codes: Codes) -> Flags:
     """[N] which Gaussians are like another one in everything that writing leaves as it is."""
     if isinstance(codes, (SogCodes, SpzCodes)):
         names = _hashed(position_cells(codes))
