@@ -2,11 +2,19 @@
 
 python benchmarks/robust.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
                                 [--only FORMAT]
+python benchmarks/robust.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
+python benchmarks/robust.py MODEL.ply --speed [--gaussians N]
 
 For each model and strength: net bits per Gaussian and the cost of a full model, and how many of P payloads,
 each with a new key and new entropy, do not come back from each format, alone and with a quarter of the
 Gaussians removed at random on top. With --changes also other changes, at full capacity and at a fifth of it.
-`--gaussians` draws so many of each model. Keys skip Argon2id, which has nothing to do with what is measured.
+Keys skip Argon2id, which has nothing to do with what is measured.
+
+With --pairs nothing is measured: each model, and each with a payload of so much of its capacity, is written
+as it comes back from each format, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` names them for
+`xargs python benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200
+bytes and of reading with a right key and a wrong one, Argon2id included. `--gaussians` draws so many of each
+model, and with --speed more than it has.
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -15,20 +23,24 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import re
+import resource
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from keyss.channels.robust import RobustCover, extract
+from keyss.channels.robust import RobustCover, embed, extract
 from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.files.models import read_model
+from keyss.files.models import read_model, write_model
 from keyss.keys import DerivedKey
 from keyss.measure.robustness import changes
 from keyss.measure.robustness.conversions import converters
@@ -47,17 +59,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of keys, payloads and what is removed")
     parser.add_argument("--changes", action="store_true")
     parser.add_argument("--only", default="", help="formats with this in their name")
+    parser.add_argument("--pairs", type=Path, metavar="FOLDER")
+    parser.add_argument("--shares", type=float, nargs="+", default=[1.0, 0.5, 0.2, 0.05])
+    parser.add_argument("--speed", action="store_true")
     asked = parser.parse_args()
+    if asked.pairs:
+        for strength in asked.strengths:
+            _write_pairs(asked.models, asked.pairs, asked.shares, strength, asked.only)
+        return
+    if asked.speed:
+        _measure_speed(asked.models, asked.gaussians)
+        return
     print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for path in asked.models:
-        model = read_model(path)
-        if asked.gaussians is not None:
-            order = torch.randperm(len(model), generator=torch.Generator().manual_seed(0))
-            model = model[order[: asked.gaussians]]
-        prepared = RobustCover.of(model)
+        prepared = RobustCover.of(_drawn(read_model(path), asked.gaussians))
         for strength in asked.strengths:
-            name = f"{path.stem} | {len(model):,} | {strength:.0f}"
+            name = f"{path.stem} | {len(prepared.model):,} | {strength:.0f}"
             formats = {what: change for what, change in FORMATS.items() if asked.only in what}
             _measure(prepared, strength, name, formats, asked.payloads, asked.seed, pruned=True)
             if asked.changes:
@@ -101,6 +119,67 @@ def _measure(
         rows = (what, f"{what}, 25 % removed") if pruned else (what,)
         for row in rows:
             print(f"{start} | {row} | {failures[row]} of {payloads} |", flush=True)
+
+
+def _write_pairs(
+    models: Sequence[Path], folder: Path, shares: Sequence[float], strength: float, only: str
+) -> None:
+    wanted = {what: change for what, change in FORMATS.items() if only in what}
+    lines: dict[str, list[str]] = {}
+    for number, path in enumerate(models):
+        scene, prepared = path.stem.rsplit("-", 1)[0], RobustCover.of(read_model(path))
+        made = {"plain": prepared.model}
+        for share in shares:
+            size = int(share * prepared.capacity(strength))
+            data, entropy = np.random.default_rng(number).bytes(size), number.to_bytes(32, "big")
+            stego = made[f"{share:g}"] = prepared.embed(
+                [(_key(number), data)], strength=strength, entropy=entropy
+            )
+            print(f"{path.stem} {share:g}: {size:,} bytes, {cost(prepared.model, stego):.1f} dB", flush=True)
+        for what, change in wanted.items():
+            own = folder / f"{strength:g}-{re.sub('[^a-z]+', '-', what).strip('-')}"
+            own.mkdir(parents=True, exist_ok=True)
+            for name, model in made.items():
+                write_model(own / f"{path.stem}-{name}.ply", change(model))
+                if name != "plain":
+                    pair = f"{scene}={own}/{path.stem}-plain.ply:{own}/{path.stem}-{name}.ply"
+                    lines.setdefault(f"{own.name}-{name}", []).append(pair)
+    for name, pairs in lines.items():
+        (folder / f"{name}.txt").write_text("\n".join(pairs) + "\n")
+
+
+def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
+    print("| model | Gaussians | embed | extract | wrong key | most memory |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for path in models:
+        model = _drawn(read_model(path), gaussians)
+        seconds = []
+        stego = model
+        for step in ("embed", "right", "wrong"):
+            start = time.monotonic()
+            if step == "embed":
+                stego = embed(model, [("a key of some length", bytes(200))])
+            elif step == "right":
+                extract(stego, "a key of some length")
+            else:
+                with suppress(WrongKeyError):
+                    extract(stego, "another key of some length")
+            seconds.append(f"{time.monotonic() - start:.1f} s")
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
+
+
+def _drawn(model: Gaussians, count: int | None) -> Gaussians:
+    """So many of a model; where it has fewer, each as often as it takes, scaled at random by a little."""
+    if count is None:
+        return model
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randperm(len(model), generator=generator)
+    if count > len(model):
+        rows = torch.randint(len(model), (count,), generator=generator)
+        jitter = 0.2 * torch.randn(count, 3, generator=generator)
+        return replace(model[rows], log_scales=model.log_scales[rows] + jitter)
+    return model[rows[:count]]
 
 
 def _opens(model: Gaussians, seed: int, data: bytes) -> bool:

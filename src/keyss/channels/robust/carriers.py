@@ -90,6 +90,11 @@ class Carriers:
     def __getitem__(self, which: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Carriers:
         return Carriers(self.rows[which], self.names[which], self.doubt[which], self.values[which])
 
+    def shifted(self, cells: int) -> Carriers:
+        """As with an offset that is larger by so many cells."""
+        moved = self.names - np.array([cells] * 3 + [0] * 2, np.int16)
+        return Carriers(self.rows, moved, self.doubt, self.values)
+
     @property
     def impact(self) -> Doubles:
         """[C] how much a change of colour shows, from the name: log of area times squared opacity."""

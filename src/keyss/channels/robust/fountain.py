@@ -21,8 +21,12 @@ from keyss.rendering.cpu.jit import kernel
 
 # Shares of code bits that are sums of 1, 2, ... intermediate bits (Shokrollahi 2006, table I, k = 65,536),
 # with more single ones, which belief propagation starts from where code bits are noisy.
-_DEGREES = ((1, 0.020), (2, 0.486), (3, 0.163), (4, 0.072), (5, 0.081), (8, 0.055), (9, 0.037), (19, 0.055))
-_LARGEST = 65  # degree of the remaining ones
+_RAPTOR = (
+    *((1, 0.020), (2, 0.486), (3, 0.163), (4, 0.072), (5, 0.081), (8, 0.055), (9, 0.037), (19, 0.055)),
+    (65, 0.031),
+)
+# For a few hundred bits of which most code bits are lost or wrong: found by trying.
+NOISY = ((1, 0.15), (2, 0.50), (3, 0.25), (4, 0.10))
 _REPEATS = 4  # parity checks that each data bit takes part in
 _SURE = 25.0  # log-likelihood ratio of what is known
 _MOST = 30.0  # of any message
@@ -41,11 +45,12 @@ class Fountain:
 
     size: int
     parity: int
+    degrees: tuple[tuple[int, float], ...] = _RAPTOR  # shares of code bits that are sums of so many
 
     @staticmethod
-    def of(size: int) -> Fountain:
+    def of(size: int, degrees: tuple[tuple[int, float], ...] = _RAPTOR) -> Fountain:
         """Half as many parity bits for a few hundred data bits, 4 % and some for many."""
-        return Fountain(size, 64 + size // 25)
+        return Fountain(size, 64 + size // 25, degrees)
 
     @property
     def length(self) -> int:
@@ -64,22 +69,31 @@ class Fountain:
             others = checks[1][start:end]
             previous = int(every[others[others < self.size]].sum() & 1) ^ previous
             every[self.size + index] = previous
-        starts, members = equations(seeds, self.length)
+        return self.sums(every, seeds)
+
+    def sums(self, every: Bits, seeds: Words) -> Bits:
+        """[n] the code bits of `seeds` [n] for intermediate bits [length]."""
+        starts, members = equations(seeds, self.length, self.degrees)
         return (np.add.reduceat(every[members], starts[:-1]) & 1).astype(np.uint8)
 
     def decode(self, seeds: Words, ratios: Ratios, rounds: int) -> tuple[Bits, bool]:
-        """The likeliest data [size], and whether all checks hold.
+        """The likeliest data [size], and whether all checks hold; see `likeliest`."""
+        every, done = self.likeliest(seeds, ratios, rounds)
+        return every[: self.size], done
+
+    def likeliest(self, seeds: Words, ratios: Ratios, rounds: int) -> tuple[Bits, bool]:
+        """The likeliest intermediate bits [length], and whether all checks hold.
 
         `ratios` [n]: natural logarithms of P(0) / P(1) of the code bits of `seeds` [n]. Takes at most
         `rounds` passes, each of about 40 ns for each member of an equation.
         """
-        starts, members = equations(seeds, self.length)
+        starts, members = equations(seeds, self.length, self.degrees)
         own_starts, own_members = _parity_checks(self.size, self.parity)
         starts = np.concatenate([starts, starts[-1] + own_starts[1:]])
         members = np.concatenate([members, own_members])
         given = np.concatenate([ratios, np.full(self.parity, _SURE)]).astype(np.float32).clip(-_SURE, _SURE)
         total, done = _propagate(starts, members, given, self.length, self.parity, rounds)
-        return (total[: self.size] < 0).astype(np.uint8), bool(done)
+        return (total < 0).astype(np.uint8), bool(done)
 
 
 def mixed(words: Words) -> Words:
@@ -91,15 +105,17 @@ def mixed(words: Words) -> Words:
     return result
 
 
-def equations(seeds: Words, length: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+def equations(
+    seeds: Words, length: int, degrees: tuple[tuple[int, float], ...] = _RAPTOR
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
     """[n + 1] where each equation starts among the members, and the members, numbers below `length`.
 
     A member that is drawn twice cancels itself, in writing as in reading.
     """
-    shares = np.cumsum([share for _, share in _DEGREES])
-    degrees = np.minimum(np.array([degree for degree, _ in _DEGREES] + [_LARGEST]), max(1, length // 4))
+    shares = np.cumsum([share for _, share in degrees])[:-1]
+    most = np.minimum([degree for degree, _ in degrees], max(1, length // 4))
     uniform = mixed(seeds) / 2.0**64
-    chosen = degrees[np.searchsorted(shares, uniform, side="right")]
+    chosen = most[np.searchsorted(shares, uniform, side="right")]
     starts = np.concatenate([[0], np.cumsum(chosen)]).astype(np.int64)
     members = np.empty(starts[-1], np.int32)
     for first in range(0, len(seeds), _BLOCK):  # what lies between takes ten times the memory of the result

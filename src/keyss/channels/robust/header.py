@@ -1,126 +1,253 @@
-"""What a key opens first: a data key and how to read the rest, in a few Gaussians that the key chooses."""
+"""What a key opens first: a file key and how to read the rest, in a few Gaussians that the key chooses.
+
+There is a *header* under each of a few salts, and all say the same. So they are parts of one code
+(`fountain`) and are read together: what one salt's Gaussians have lost, another's make up for. Salts that
+were lost are told by *pilots*, a few bits of each part that are known.
+
+Which Gaussians hold a part, the key says in numbers that are held against a public hash of each name: the
+next one above counts (consistent hashing, Karger et al. 1997). Where a Gaussian was lost, its own place is
+lost and no other; a place is found in a sorted list, so that a wrong key costs next to nothing.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import hmac
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.robust.carriers import Carriers, Doubles
-from keyss.channels.robust.fountain import Bits, Fountain
-from keyss.channels.robust.lattice import COLUMNS, SPACINGS, Lattice, rank
+from keyss.channels.robust.carriers import Carriers, Doubles, Names
+from keyss.channels.robust.fountain import NOISY, Bits, Fountain, Words, mixed
+from keyss.channels.robust.lattice import COLUMNS, LEVELS, SPACINGS, Lattice, dithers, rank
 from keyss.channels.robust.salts import SALTS
-from keyss.keys.derivation import expand
+from keyss.keys.derivation import expand, stream
 
-DATA_KEY_BYTES = 16
-BITS = 1100  # of the code of a header
-UNNOTICED = 2  # secrets whose headers are always there, if only as noise
-CLASSES = 8  # of carriers, of which a payload has some
-LATTICE = Lattice(40, SPACINGS[0])  # of headers
-_LEAST_BITS = 2  # of a number that holds some of a header
+FILE_KEY_BYTES = 5
+_PILOTS = 16  # numbers of these that are known beforehand
+UNNOTICED = 2  # secrets whose headers are always there, if only as noise, unless one gets all carriers
+SHARES = 256  # parts of the carriers, of which a payload has some
+IDLE = 1 / 32  # unit of the share of carriers that were left alone
 _CHECK_BYTES = 2
-_BYTES = DATA_KEY_BYTES + 3 + _CHECK_BYTES
-_ROUNDS = 16
-# How a header is looked at: bits (of BITS), those of them that are likely to hold what was written, how
-# likely that is, and how likely for the rest. Where Gaussians were lost, others have taken their places, at
-# the end; where two models were put together, half of the places are the other's.
-_VIEWS = ((1.0, 1.0, 0.85, 0.85), (1.0, 0.73, 0.85, 0.1), (1.0, 0.48, 0.85, 0.05), (2.0, 2.0, 0.45, 0.45))
-_PUBLIC = hashlib.sha256(b"keyss/v1/robust-class").digest()
+_FIELDS = (("level", 6), ("spacing", 2), ("depth", 3), ("first", 8), ("last", 8), ("bucket", 8), ("idle", 5))
+_FIELD_BYTES = 5
+_PARTITION_BYTES = 2
+_BYTES = FILE_KEY_BYTES + _PARTITION_BYTES + _FIELD_BYTES + _CHECK_BYTES
+_ROUNDS = 20
+_TRIES = 3  # to tell salts that were lost
+_PRIOR = 0.4  # logarithm of the odds that a salt is one, before anything else is known
+_LEAST_TRUST, _MOST_TRUST = 0.02, 0.95
+_DECODED = 0.3  # weight of a bit that was decoded beside one that was known
+_PUBLIC = hashlib.sha256(b"keyss/v1/robust-places").digest()
+_PAD = np.uint64(0x9FB21C651E98DF25)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How headers are written."""
+
+    places: int  # Gaussians for each salt
+    lattice: Lattice  # that gives as many bits to all
+
+    @staticmethod
+    def of(depth: int) -> Kind:
+        """Of a payload that hardly shows, or of one that shows anyway and may cost more."""
+        return KINDS[min(len(KINDS), depth) - 1]
+
+    @property
+    def bits(self) -> int:
+        """Of one Gaussian."""
+        return COLUMNS * self.lattice.depth
+
+    def seeds(self, secret: bytes, names: Names) -> Words:
+        """[bits C] of the numbers of Gaussians with these names."""
+        words = rank(secret, "header-seeds", names)
+        order = np.arange(1, self.bits + 1, dtype=np.uint64)
+        return mixed((words[:, None] ^ mixed(order)).ravel())
+
+    def share(self, carriers: int) -> float:
+        """Of so many carriers, those that the headers of one secret take."""
+        return 1 - math.exp(-SALTS * self.places / max(1, carriers))
+
+
+KINDS = tuple(
+    Kind(places, Lattice(LEVELS - 1, SPACINGS[0], depth)) for depth, places in enumerate((64, 96), start=1)
+)
+_USUAL, _MERGED = (0.65,), (0.4, 0.2)
+# How a header is looked at: of which kind, and how likely its places, and the ones after them, hold what was
+# written. Where two models were put together, half of the places are the other's.
+VIEWS = ((KINDS[0], _USUAL), (KINDS[1], _USUAL), (KINDS[1], _MERGED))
 
 
 @dataclass(frozen=True)
 class Header:
     """How a payload is read."""
 
-    data_key: bytes
+    file_key: bytes
+    partition: bytes  # by which carriers are shared out; the same for all secrets of a file
     level: int  # of the lattice
     spacing: int  # index into SPACINGS
-    classes: int  # a bit for each of CLASSES
+    depth: int  # of the lattice
+    first: int  # of SHARES that the payload has,
+    last: int  # this one included
     bucket: int  # see `bucket_bytes`
+    idle: int  # share of its carriers that hold nothing, in units of IDLE
 
     @property
     def lattice(self) -> Lattice:
-        return Lattice(self.level, SPACINGS[self.spacing])
+        return Lattice(self.level, SPACINGS[self.spacing], self.depth)
 
-    def pack(self, secret: bytes) -> Bits:
-        """The bits of a header, encrypted under `secret`, which no other header has."""
-        plain = self.data_key + bytes([self.level << 2 | self.spacing, self.classes, self.bucket])
-        data = np.frombuffer(plain + _check(secret, plain), np.uint8) ^ _stream(secret)
-        return np.unpackbits(data)
+    @property
+    def kind(self) -> Kind:
+        return Kind.of(self.depth)
+
+    def own(self, carriers: Carriers) -> npt.NDArray[np.bool_]:
+        """[C] which carriers the payload has, by a hash of their names that holders of keys know."""
+        part = rank(self.partition, "partition", carriers.names) % np.uint64(SHARES)
+        found: npt.NDArray[np.bool_] = (part >= self.first) & (part <= self.last)
+        return found
+
+    def pack(self, check: bytes) -> Bits:
+        """The bits of a header; `check`: a secret that recognises it."""
+        packed = 0
+        for name, bits in _FIELDS:
+            packed = packed << bits | getattr(self, name)
+        plain = self.file_key + self.partition + packed.to_bytes(_FIELD_BYTES, "big")
+        return np.unpackbits(np.frombuffer(plain + _check(check, plain), np.uint8))
 
     @staticmethod
-    def unpack(bits: Bits, secret: bytes) -> Header | None:
+    def unpack(bits: Bits, check: bytes) -> Header | None:
         """None where it is not one: by chance one of 2^16 is, and opens nothing."""
-        data = (np.packbits(bits) ^ _stream(secret)).tobytes()
-        plain, check = data[:-_CHECK_BYTES], data[-_CHECK_BYTES:]
-        lattice, classes, bucket = plain[DATA_KEY_BYTES:]
-        if not hmac.compare_digest(check, _check(secret, plain)):
+        data = np.packbits(bits).tobytes()
+        plain, tag = data[:-_CHECK_BYTES], data[-_CHECK_BYTES:]
+        if not hmac.compare_digest(tag, _check(check, plain)):
             return None
-        if not classes:
+        packed, found = int.from_bytes(plain[-_FIELD_BYTES:], "big"), {}
+        for name, size in reversed(_FIELDS):
+            found[name], packed = packed & ((1 << size) - 1), packed >> size
+        if found["depth"] == 0 or found["last"] < found["first"]:
             return None
-        return Header(plain[:DATA_KEY_BYTES], lattice >> 2, lattice & 3, classes, bucket)
+        return Header(plain[:FILE_KEY_BYTES], plain[FILE_KEY_BYTES:-_FIELD_BYTES], **found)
 
 
-def write_header(header: Header, secret: bytes, carriers: Carriers) -> Doubles:
-    """[P, 2] new values of the carriers that `places` names."""
-    seeds = LATTICE.seeds(secret, carriers)
-    return LATTICE.write(secret, carriers, _fountain().encode(header.pack(secret), seeds))
+class Index:
+    """C carriers by the public hash of their names: in which order places are looked for."""
+
+    def __init__(self, carriers: Carriers) -> None:
+        fine = KINDS[-1].lattice.bits(carriers) == KINDS[-1].lattice.depth  # all but impossible sizes
+        self._original, carriers = np.flatnonzero(fine), carriers[fine]
+        hashes = rank(_PUBLIC, "places", carriers.names)
+        order = np.argsort(hashes)
+        hashes = hashes[order]
+        first = np.flatnonzero(np.concatenate([[True], hashes[1:] != hashes[:-1]])) if len(order) else order
+        self._carriers, self._rows, self._hashes = carriers, order[first], hashes[first]
+        self._namesakes = np.diff(np.append(first, len(order)))
+
+    def __len__(self) -> int:
+        """How many names there are."""
+        return len(self._rows)
+
+    def places(self, secret: bytes, count: int, behind: int = 0) -> npt.NDArray[np.int64]:
+        """[count] names that this secret's header is in, or those so many behind."""
+        points = np.frombuffer(stream(secret, "robust/places", 8 * count), "<u8")
+        found: npt.NDArray[np.int64] = (np.searchsorted(self._hashes, points) + behind) % len(self)
+        return found
+
+    def rows(self, places: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """[...] a carrier with each name."""
+        found: npt.NDArray[np.int64] = self._original[self._rows[places]]
+        return found
+
+    def parts(self, secrets: Sequence[bytes], kind: Kind, view: Sequence[float], most: int) -> Parts:
+        """What the first `most` Gaussians of each salt hold, if it is one."""
+        seeds, hints = [], []
+        for behind, sure in enumerate(view):
+            places = np.stack([self.places(secret, most, behind) for secret in secrets])
+            own = self._carriers[self._rows[places.ravel()]]
+            names = own.names.reshape(*places.shape, -1)
+            dither = np.concatenate([dithers(*each) for each in zip(secrets, names, strict=True)])
+            words = np.stack([kind.seeds(*each) for each in zip(secrets, names, strict=True)])
+            read = kind.lattice.read_dithered(dither, own, np.zeros(len(own))).reshape(words.shape)
+            certain = sure * (1 - own.doubt) / self._namesakes[places.ravel()]
+            hint = np.tanh(read / 2) * np.repeat(certain, kind.bits).reshape(words.shape)
+            seeds.append(words)
+            hints.append(hint * (1 - 2.0 * _pads(words)))
+        words, every = np.stack(seeds), np.stack(hints)
+        return Parts(words[:, :, _PILOTS:], every[:, :, _PILOTS:], every[:, :, :_PILOTS])
+
+    def promise(self, secrets: Sequence[bytes]) -> float:
+        """How much likelier what is known beforehand is with a header than without: a logarithm."""
+        if not len(self) or not secrets:
+            return -math.inf
+        odds = [self.parts(secrets, kind, _USUAL, _PILOTS // kind.bits).odds for kind in KINDS]
+        return max(float(np.logaddexp(0, each.clip(-50, 50)).sum()) for each in odds)
 
 
-def read_header(secret: bytes, carriers: Carriers, thorough: bool = True) -> Header | None:
-    """The header of this secret, if there is one. `thorough`: even where half is lost or foreign."""
-    for window, safe, trust, rest in _VIEWS if thorough else _VIEWS[:1]:
-        rows, namesakes, before = places(secret, carriers, window * BITS)
-        if not len(rows):
-            return None
-        own = carriers[rows]
-        sure = np.where(before < safe * BITS, trust, rest)
-        doubt = 1 - sure * (1 - own.doubt) / namesakes
-        ratios, seeds = LATTICE.read(secret, own, doubt), LATTICE.seeds(secret, own)
-        bits, _ = _fountain().decode(seeds, ratios, _ROUNDS)
-        header = Header.unpack(bits, secret)
+@dataclass(frozen=True)
+class Parts:
+    """Code bits of a header under S salts, as V Gaussians of each place say; hints are P(0) - P(1)."""
+
+    seeds: Words  # [V, S, B]
+    hints: Doubles  # [V, S, B] if it is a salt
+    pilots: Doubles  # [V, S, ...] the same of bits that are 0
+
+    @property
+    def odds(self) -> Doubles:
+        """[S] logarithms of the odds that each is a salt."""
+        found: Doubles = _PRIOR + np.log1p(self.pilots.clip(-0.99)).sum(axis=(0, 2))
+        return found
+
+
+def written_header(
+    header: Header, check: bytes, secret: bytes, index: Index, carriers: Carriers, free: npt.NDArray[np.bool_]
+) -> tuple[npt.NDArray[np.int64], Doubles]:
+    """[P] the carriers of those that are free [C] which hold a header, and [P, 2] their new values."""
+    kind = header.kind
+    own = index.rows(index.places(secret, kind.places))
+    words = kind.seeds(secret, carriers.names[own])
+    bits = _fountain().encode(header.pack(check), words)
+    bits[:_PILOTS] = 0
+    values = kind.lattice.write(secret, carriers[own], bits ^ _pads(words))
+    rows, first = np.unique(own, return_index=True)
+    fine = free[rows]
+    return rows[fine], values[first[fine]]
+
+
+def read_header(
+    secrets: Sequence[bytes], check: bytes, index: Index, kind: Kind, view: Sequence[float]
+) -> Header | None:
+    """The header of this kind whose parts lie under these secrets, if there is one."""
+    if not len(index) or not secrets:
+        return None
+    parts, fountain = index.parts(secrets, kind, view, kind.places), _fountain()
+    seeds, odds = parts.seeds.ravel(), parts.odds
+    trusts = _trusts(odds)
+    for _ in range(_TRIES):
+        sure = (parts.hints * trusts[:, None]).clip(-0.9999, 0.9999)
+        ratios = (2 * np.arctanh(sure)).astype(np.float32).ravel()
+        every, _ = fountain.likeliest(seeds, ratios, _ROUNDS)
+        header = Header.unpack(every[: fountain.size], check)
         if header is not None:
             return header
+        agree = parts.hints * (1 - 2.0 * fountain.sums(every, seeds).reshape(parts.hints.shape))
+        trusts = _trusts(odds + _DECODED * np.log1p(agree.clip(-0.99)).sum(axis=(0, 2)))
     return None
 
 
-def places(
-    secret: bytes, carriers: Carriers, bits: float = BITS
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Doubles]:
-    """[P] which carriers hold the header of `secret`, [P] how many share a name, [P] bits that come before.
-
-    Those whose names have the least keyed hashes, as many as hold `bits` bits. Of carriers with one name one
-    counts.
-    """
-    some = np.flatnonzero(LATTICE.bits(carriers) >= _LEAST_BITS)
-    ranks = rank(secret, "places", carriers.names[some])
-    most = int(2 * bits)  # of them are enough, unless most names are equal
-    if len(ranks) > most:
-        least = np.argpartition(ranks, most)[:most]
-        some, ranks = some[least], ranks[least]
-    some = some[np.argsort(ranks, kind="stable")]
-    _, first, order, namesakes = np.unique(
-        np.sort(ranks), return_index=True, return_inverse=True, return_counts=True
-    )
-    each = COLUMNS * LATTICE.bits(carriers[some[first]])
-    before = np.cumsum(each) - each
-    own = before[order] < bits
-    return some[own], namesakes[order][own], before[order][own].astype(np.float64)
+def header_agreement(header: Header, check: bytes, secrets: Sequence[bytes], index: Index) -> float:
+    """How far what lies under these secrets agrees with the header: 0 by chance."""
+    parts = index.parts(secrets, header.kind, _USUAL, header.kind.places)
+    bits = _fountain().encode(header.pack(check), parts.seeds.ravel()).reshape(parts.seeds.shape)
+    return float((parts.hints * (1 - 2.0 * bits)).sum() + parts.pilots.sum())
 
 
-def header_share(carriers: Carriers) -> float:
-    """Of carriers, those that the headers of one secret take."""
-    bits = LATTICE.bits(carriers)
-    return min(1.0, SALTS * BITS / max(1.0, COLUMNS * float(bits.sum())))
-
-
-def class_of(carriers: Carriers) -> npt.NDArray[np.int64]:
-    """[C] the class of each carrier, below CLASSES: a public hash of its name."""
-    return (rank(_PUBLIC, "class", carriers.names) % np.uint64(CLASSES)).astype(np.int64)
+def _trusts(odds: Doubles) -> Doubles:
+    trusts: Doubles = (1 / (1 + np.exp(-odds.clip(-50, 50)))).clip(_LEAST_TRUST, _MOST_TRUST)
+    return trusts
 
 
 def bucket_bytes(bucket: int) -> int:
@@ -129,13 +256,19 @@ def bucket_bytes(bucket: int) -> int:
 
 
 def _check(secret: bytes, plain: bytes) -> bytes:
-    return hmac.digest(expand(secret, "robust/check", 32), plain, "sha256")[:_CHECK_BYTES]
+    return hmac.digest(secret, plain, "sha256")[:_CHECK_BYTES]
 
 
-def _stream(secret: bytes) -> Bits:
-    return np.frombuffer(expand(secret, "robust/header", _BYTES), np.uint8)
+def check_secret(static: bytes) -> bytes:
+    """What recognises headers, of what the key is without a salt."""
+    return expand(static, "robust/check", 32)
+
+
+def _pads(seeds: Words) -> Bits:
+    """[B] bits by which the code is encrypted."""
+    return (mixed(seeds ^ _PAD) >> np.uint64(63)).astype(np.uint8)
 
 
 @cache
 def _fountain() -> Fountain:
-    return Fountain.of(8 * _BYTES)
+    return Fountain.of(8 * _BYTES, NOISY)

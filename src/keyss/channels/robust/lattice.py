@@ -41,11 +41,12 @@ class Lattice:
 
     level: int
     spacing: float
+    depth: int = MOST_BITS  # bits of a number, at most: noise stays below half of 2^depth spacings
 
     def bits(self, carriers: Carriers) -> Counts:
-        """[C] bits of each of a carrier's numbers, at most MOST_BITS."""
+        """[C] bits of each of a carrier's numbers, at most `depth`."""
         water = (self.level - _MIDDLE) * _LEVEL_STEP + MOST_BITS * math.log(4)
-        return np.floor((water - carriers.impact) / math.log(4)).clip(0, MOST_BITS).astype(np.int64)
+        return np.floor((water - carriers.impact) / math.log(4)).clip(0, self.depth).astype(np.int64)
 
     def noise(self, carriers: Carriers, random: np.random.Generator) -> Doubles:
         """[C, 2] something that is distributed as what writing adds."""
@@ -57,7 +58,7 @@ class Lattice:
     def seeds(self, secret: bytes, carriers: Carriers) -> Words:
         """[B] what each bit of all carriers is, as `Fountain` understands it."""
         bits = self.bits(carriers)
-        words = _random(secret, "seeds", carriers)[:, 0]
+        words = _random(secret, "seeds", carriers.names)[:, 0]
         counts = COLUMNS * bits
         first = np.repeat(np.cumsum(counts) - counts, counts)
         order = (np.arange(counts.sum()) - first).astype(np.uint64)
@@ -65,7 +66,7 @@ class Lattice:
 
     def write(self, secret: bytes, carriers: Carriers, code: Bits) -> Doubles:
         """[C, 2] new values that carry the bits `code` [B]."""
-        bits, dither = self.bits(carriers), self._dither(secret, carriers)
+        bits, dither = self.bits(carriers), dithers(secret, carriers.names)
         ends = COLUMNS * np.cumsum(bits)
         written = carriers.values.copy()
         for each in range(1, MOST_BITS + 1):
@@ -83,7 +84,11 @@ class Lattice:
 
     def read(self, secret: bytes, carriers: Carriers, doubt: Doubles) -> Ratios:
         """[B] logarithms of P(0) / P(1); `doubt` [C]: chance that a carrier holds something else."""
-        bits, dither = self.bits(carriers), self._dither(secret, carriers)
+        return self.read_dithered(dithers(secret, carriers.names), carriers, doubt)
+
+    def read_dithered(self, dither: Doubles, carriers: Carriers, doubt: Doubles) -> Ratios:
+        """The same with dithers [C, 2] that may come from several secrets."""
+        bits = self.bits(carriers)
         ends = COLUMNS * np.cumsum(bits)
         ratios = np.zeros(COLUMNS * int(bits.sum()), np.float32)
         for each in range(1, MOST_BITS + 1):
@@ -103,16 +108,11 @@ class Lattice:
                     ratios[first + bit] = np.log((1 - ones) / ones)
         return ratios
 
-    def fit(self, secret: bytes, carriers: Carriers) -> float:
-        """How well the values lie on the lattice: 0 by chance, 1 on its points."""
-        bits = self.bits(carriers)
-        place = carriers.values / self.spacing - self._dither(secret, carriers) * 2.0 ** bits[:, None]
-        return float(np.cos(2 * np.pi * place[bits > 0]).sum() / max(1, COLUMNS * (bits > 0).sum()))
 
-    def _dither(self, secret: bytes, carriers: Carriers) -> Doubles:
-        """[C, 2] numbers in [0, 1)."""
-        dither: Doubles = (_random(secret, "dither", carriers) >> np.uint64(11)) / 2.0**53
-        return dither
+def dithers(secret: bytes, names: Names) -> Doubles:
+    """[C, 2] numbers in [0, 1)."""
+    dither: Doubles = (_random(secret, "dither", names) >> np.uint64(11)) / 2.0**53
+    return dither
 
 
 def rank(secret: bytes, label: str, names: Names) -> Words:
@@ -120,9 +120,9 @@ def rank(secret: bytes, label: str, names: Names) -> Words:
     return _encrypted(expand(secret, f"robust/{label}", 32), names)[:, 0]
 
 
-def _random(secret: bytes, label: str, carriers: Carriers) -> Words:
+def _random(secret: bytes, label: str, names: Names) -> Words:
     """[C, 2] 64 bits each that nobody can tell from random ones without the secret."""
-    return _encrypted(expand(secret, f"robust/{label}", 32), carriers.names)
+    return _encrypted(expand(secret, f"robust/{label}", 32), names)
 
 
 def _encrypted(key: bytes, names: Names) -> Words:

@@ -2,9 +2,10 @@
 
 *Listed* are the Gaussians with the least public hashes of the cells in which their red coefficient, their
 opacity and the ratios of their scales lie, of those where these are in the inner part of their cells, from
-where no format moves them out. Writing changes none of these numbers. A salt is a hash of the cells of one
-listed Gaussian, green and blue included; the best salts are those with all numbers far inside. To have new
-salts, a writer moves green and blue of the listed ones by whole cells, at random and by at most 0.4. Where
+where no format moves them out: half of them faint ones, on which a new colour is hardly seen, and half
+others, which are still there when the faintest were removed. Writing changes none of these numbers. A salt
+is a hash of the cells of one listed Gaussian, green and blue included. To have new salts, a writer moves
+green and blue of the listed ones by whole cells, at random and by at most 0.4 (faint ones) or 0.13. Where
 they lie inside of their cells stays as it is, so that nothing tells that this has happened.
 """
 
@@ -28,22 +29,21 @@ from keyss.channels.robust.carriers import (
 from keyss.channels.robust.lattice import rank
 from keyss.keys.derivation import SALT_BYTES
 
-SALTS = 10  # that are written for and tried: random pruning of a quarter removes all with p = 1e-6
-_LISTED = 12  # Gaussians; rounding brings in a few others
-_OPACITIES = 0.08, 0.4  # of listed ones: a new colour is hardly seen, and hardly any pruning removes them
+SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
+_BANDS = (0.08, 0.4, 1.01)  # of opacity, from each of which half of them are
+_MOST_MOVED = (3, 1)  # cells, by band
 _COLOUR_STEPS, _OPACITY_STEPS, _RATIO_STEPS = 5, 16, 8  # that make a cell
 # Rounding a number leaves it in its cell, whose borders are borders of rounding too; a ratio moves by a step.
 _NOISE = np.array([OPACITY_NOISE / OPACITY_STEP] + [1.0] * 2 + [COLOUR_NOISE / COLOUR_STEP] * 3)
 _STEPS = np.array([_OPACITY_STEPS] + [_RATIO_STEPS] * 2 + [_COLOUR_STEPS] * 3)
 _UNCHANGED = 4  # of these numbers: opacity, ratios and red
-_MOST_MOVED = 3  # cells
 _LABEL = b"keyss/v1/robust-salt"
 _PUBLIC = hashlib.sha256(_LABEL).digest()
 
 
 @dataclass(frozen=True)
 class Salts:
-    """The listed Gaussians, the best first."""
+    """The listed Gaussians."""
 
     rows: npt.NDArray[np.int64]  # [S] of `Numbers`
     salts: list[bytes]
@@ -51,20 +51,23 @@ class Salts:
     @staticmethod
     def of(numbers: Numbers) -> Salts:
         cells, outward = _cells(numbers)
-        faint = (numbers.opacities > _OPACITIES[0]) & (numbers.opacities < _OPACITIES[1])
-        stable = np.flatnonzero((outward[:, :_UNCHANGED].max(axis=1) < 1) & faint)
-        hashes = rank(_PUBLIC, "salt", cells[stable, :_UNCHANGED])
-        _, first = np.unique(hashes, return_index=True)  # in ascending order; equal ones once
-        listed = stable[first[:_LISTED]]
-        listed = listed[np.argsort(outward[listed].max(axis=1), kind="stable")]
-        return Salts(listed, [_salt(cells[row]) for row in listed])
+        stable = np.flatnonzero(outward[:, :_UNCHANGED].max(axis=1) < 1)
+        band = np.searchsorted(_BANDS, numbers.opacities[stable]) - 1
+        listed = []
+        for index in range(len(_BANDS) - 1):
+            own = stable[band == index]
+            _, first = np.unique(rank(_PUBLIC, "salt", cells[own, :_UNCHANGED]), return_index=True)
+            listed.append(own[first[: SALTS // (len(_BANDS) - 1)]])  # in ascending order; equal ones once
+        rows = np.concatenate(listed)
+        return Salts(rows, list(dict.fromkeys(_salt(cells[row]) for row in rows)))
 
 
 def renewed(numbers: Numbers, random: np.random.Generator) -> Numbers:
     """The numbers with another green and blue of listed Gaussians, so that all salts are new."""
     rows = Salts.of(numbers).rows
     colours = numbers.colours.copy()
-    moves = random.integers(-_MOST_MOVED, _MOST_MOVED, (len(rows), 2), endpoint=True)
+    most = np.array(_MOST_MOVED)[np.searchsorted(_BANDS, numbers.opacities[rows]) - 1]
+    moves = random.integers(-most[:, None], most[:, None] + 1, (len(rows), 2))
     colours[rows, 1:] += moves * _COLOUR_STEPS * COLOUR_STEP
     return replace(numbers, colours=colours)
 

@@ -7,13 +7,14 @@ import math
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.agreement import agreement
 from keyss.measure.stealth.bits import bits
+from keyss.measure.stealth.colours import colours
 from keyss.measure.stealth.invariants import invariants
 from keyss.measure.stealth.opacities import opacities
 from keyss.measure.stealth.order import order
 from keyss.measure.stealth.statistic import Statistic
 from keyss.measure.stealth.words import Words
 
-KINDS = ("bits", "agreement", "invariants", "opacities", "order")
+KINDS = ("bits", "agreement", "invariants", "opacities", "order", "colours")
 
 
 def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
@@ -28,6 +29,7 @@ def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
         "invariants": invariants(model, words),
         "opacities": opacities(model),
         "order": order(model),
+        "colours": colours(model),
     }
     return {
         f"{kind}: {name}": each

@@ -1,0 +1,188 @@
+"""How much a model holds, and how a payload is laid into it so that it shows and costs as little as may be.
+
+What gives a payload away is the variance that writing adds, and that is least for each byte with one bit in
+each number (`depth` 1). So a payload gets a share of the carriers at that depth, as large as it needs; one
+that needs more gets all carriers, and the least depth and level that hold it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from keyss.channels.robust.carriers import CELL, Carriers, Doubles, Numbers
+from keyss.channels.robust.header import SHARES, UNNOTICED, Kind, bucket_bytes
+from keyss.channels.robust.lattice import COLUMNS, LEVELS, MOST_BITS, SPACINGS, Lattice
+from keyss.channels.robust.payload import OVERHEAD
+from keyss.channels.robust.quiet import Quiet
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.rendering.difference import cost
+
+_RATE = 0.42  # data bits for each bit of information that is expected to be read
+_GARBAGE = 0.02  # share of carriers whose name has changed although it seemed safe
+_COMFORTABLE = 0.8  # of what a share holds: the less, the more may be lost
+_ROBUST = 0.5  # the same of a payload that shows anyway
+SPREAD = 0.5  # dB by which what is written may cost more than what was measured
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where payloads go: each gets so many SHARES of the carriers."""
+
+    lattice: Lattice
+    shares: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Room:
+    """A model whose room is known."""
+
+    model: Gaussians
+    numbers: Numbers
+    spacing: int  # index into SPACINGS
+    measured: dict[Lattice, float] = field(default_factory=dict, compare=False)  # dB
+
+    def capacity(self, strength: float) -> int:
+        """Bytes that one payload may have at most at this cost in dB."""
+        if not len(self.own):
+            return 0
+        return max(0, self._bytes(self._deepest(strength)) - OVERHEAD)
+
+    def quiet_capacity(self, strength: float) -> int:
+        """The same with one bit in each number."""
+        if not len(self.own):
+            return 0
+        return max(0, self._bytes(self._within(1, strength)) - OVERHEAD)
+
+    def layout(self, sizes: Sequence[int], strength: float) -> Layout | None:
+        """For payloads of these sizes in bytes with all that belongs to them; None where they do not fit."""
+        quiet = self._within(1, strength)
+        for comfort in (_COMFORTABLE, 1.0):
+            shares = self._shares(sizes, quiet, comfort)
+            if sum(shares) <= SHARES:
+                return Layout(quiet, shares)
+        for comfort in (_ROBUST, 1.0):
+            for depth in range(2, MOST_BITS + 1):
+                lattice, shares = self._least(sizes, depth, comfort)
+                if sum(shares) <= SHARES and self.costs(lattice) >= strength + SPREAD:
+                    return Layout(lattice, _stretched(shares))
+        lattice = self._deepest(strength)
+        shares = self._shares(sizes, lattice, 1.0)
+        return Layout(lattice, _stretched(shares)) if sum(shares) <= SHARES else None
+
+    def _least(self, sizes: Sequence[int], depth: int, comfort: float) -> tuple[Lattice, tuple[int, ...]]:
+        """The lowest level of this depth that holds them, or the highest of all."""
+        for level in range(LEVELS):
+            lattice = Lattice(level, SPACINGS[self.spacing], depth)
+            shares = self._shares(sizes, lattice, comfort)
+            if sum(shares) <= SHARES:
+                break
+        return lattice, shares
+
+    def costs(self, lattice: Lattice) -> float:
+        """PSNR in dB that a payload in all carriers leaves with its headers."""
+        if lattice not in self.measured:
+            random = np.random.default_rng(0)
+            noise = lattice.noise(self.own, random)
+            headers = random.random(len(self.own)) < self._headers(lattice.depth)
+            noise[headers] = Kind.of(lattice.depth).lattice.noise(self.own[headers], random)
+            noise[self.alone[self.own_rows]] = 0
+            sh = self.model.sh.detach().clone()
+            rows = self.numbers.rows[self.own_rows]
+            sh[rows, 0, 1:] += sh.new_tensor(noise)
+            self.measured[lattice] = cost(self.model, replace(self.model.detach(), sh=sh))
+        return self.measured[lattice]
+
+    def _shares(self, sizes: Sequence[int], lattice: Lattice, comfort: float) -> tuple[int, ...]:
+        room = comfort * self._room(lattice)
+        buckets = [bucket_bytes(bucket_of(size)) for size in sizes]
+        return tuple(max(1, math.ceil(SHARES * min(1e6, size / max(room, 1e-3)))) for size in buckets)
+
+    def _deepest(self, strength: float) -> Lattice:
+        """The lattice that holds the most of those that cost no more than `strength` allows."""
+        return self._within(MOST_BITS, strength)
+
+    def _within(self, depth: int, strength: float) -> Lattice:
+        """The highest level of this depth that costs no more than `strength` allows, or the least of all."""
+        if not (math.isfinite(strength) and strength > 0):
+            raise UsageError(f"expected a `strength` above 0 dB, got {strength}")
+        every = [Lattice(level, SPACINGS[self.spacing], depth) for level in range(LEVELS)]
+        if self.costs(every[-1]) >= strength + SPREAD:
+            return every[-1]
+        least, beyond = 0, LEVELS - 1
+        while beyond - least > 1:
+            middle = (least + beyond) // 2
+            fits = self.costs(every[middle]) >= strength + SPREAD
+            least, beyond = (middle, beyond) if fits else (least, middle)
+        return every[least]
+
+    def _bytes(self, lattice: Lattice) -> int:
+        """Of the largest bucket that fits."""
+        room = self._room(lattice)
+        return max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
+
+    def _room(self, lattice: Lattice) -> float:
+        """Bytes that all carriers hold."""
+        bits = COLUMNS * float((lattice.bits(self.own) * self._information).sum())
+        return _RATE * (1 - self._headers(lattice.depth)) * bits / 8
+
+    @cached_property
+    def carriers(self) -> Carriers:
+        return self.numbers.carriers(float(np.round(self.numbers.size / CELL) * CELL))
+
+    @cached_property
+    def own_rows(self) -> npt.NDArray[np.int64]:
+        """[D] of the carriers those that are written, or left alone."""
+        return self.carriers.one_of_each()
+
+    @cached_property
+    def own(self) -> Carriers:
+        return self.carriers[self.own_rows]
+
+    @cached_property
+    def quiet(self) -> Quiet:
+        return Quiet(self.model)
+
+    @cached_property
+    def alone(self) -> npt.NDArray[np.bool_]:
+        """[C] carriers that are left alone."""
+        return self.quiet.left_alone()[self.numbers.rows]
+
+    def _headers(self, depth: int) -> float:
+        """Of carriers, those that headers take."""
+        return 1 - (1 - Kind.of(depth).share(len(self.own))) ** (UNNOTICED if depth == 1 else 1)
+
+    @cached_property
+    def _information(self) -> Doubles:
+        """[D] bits that a reader is expected to have of each bit that one of them carries."""
+        namesakes = self.carriers.namesakes()[self.own_rows]
+        garbage = 1 - (1 - _GARBAGE) * (1 - self.own.doubt) / namesakes
+        result: Doubles = ~self.alone[self.own_rows] * (1 - _entropy(garbage / 2))
+        return result
+
+
+def bucket_of(size: int) -> int:
+    """The least bucket that holds `size` bytes, or the largest of all."""
+    return next((each for each in range(255) if bucket_bytes(each) >= size), 255)
+
+
+def _stretched(shares: tuple[int, ...]) -> tuple[int, ...]:
+    """In the same proportion, all that there is."""
+    left, result = SHARES, []
+    for index, share in enumerate(shares):
+        result.append(left * share // sum(shares[index:]))
+        left -= result[-1]
+    return tuple(result)
+
+
+def _entropy(chance: Doubles) -> Doubles:
+    """[...] of bits that are wrong by this chance, at most a half."""
+    p = chance.clip(1e-12, 0.5)
+    result: Doubles = -p * np.log2(p) - (1 - p) * np.log2(1 - p)
+    return result
