@@ -83,6 +83,15 @@ def test_it_costs_no_more_than_was_asked_for(prepared: RobustCover, stego: Gauss
     assert sizes[0] > 1.3 * sizes[2]
 
 
+def test_a_small_payload_changes_far_less_than_a_large_one(prepared: RobustCover, stego: Gaussians) -> None:
+    small = prepared.embed([(key("a"), bytes(20))], strength=STRENGTH, entropy=ENTROPY)
+    full, little = ((each.sh[:, 0] - prepared.model.sh[:, 0]).square().sum() for each in (stego, small))
+    assert little < full / 30
+    assert float((small.sh != prepared.model.sh).any(dim=2).any(dim=1).float().mean()) < 0.6
+    assert float((small.sh - prepared.model.sh).abs().quantile(0.99)) < 0.0277
+    assert cost(prepared.model, small) > cost(prepared.model, stego) + 6
+
+
 def _spz(model: Gaussians) -> Gaussians:
     return next(each for each in converters() if (each.format, each.tool) == (".spz", "gsply"))(
         model
@@ -148,7 +157,7 @@ def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes)
 
 
 def test_two_keys_open_their_own_and_a_third_nothing(prepared: RobustCover) -> None:
-    data = {name: os.urandom(prepared.capacity(STRENGTH) // 10) for name in "ab"}
+    data = {name: os.urandom(prepared.quiet_capacity(STRENGTH) // 3) for name in "ab"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         stego = prepared.embed([(key(name), data[name]) for name in "ab"], strength=STRENGTH, entropy=ENTROPY)
@@ -176,8 +185,10 @@ def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: Ro
     first, second = (prepared.embed([(key("a"), b"same")], strength=STRENGTH) for _ in range(2))
     written = [(each.sh[:, 0] - prepared.model.sh[:, 0])[:, 1:].flatten() for each in (first, second)]
     both = (written[0] != 0) & (written[1] != 0)
-    assert abs(np.corrcoef(written[0][both], written[1][both])[0, 1]) < 0.1
-    assert float((written[0] == written[1])[both].float().mean()) < 0.01
+    small = [each[both].clip(-0.03, 0.03) for each in written]  # salts move by more
+    assert abs(np.corrcoef(small[0], small[1])[0, 1]) < 0.1
+    # Ten bits of each number stay, so that a noise of 0.055 has few hundred values.
+    assert float((written[0] == written[1])[both].float().mean()) < 0.03
 
 
 def test_entropy_decides_everything(prepared: RobustCover) -> None:
@@ -246,3 +257,45 @@ def test_a_model_of_one_gaussian_many_times_is_refused() -> None:
     model = replace(cover(1)[torch.zeros(3000, dtype=torch.int64)])
     with pytest.raises((UsageError, InputError)):
         embed(model, [(key("a"), b"x")], strength=STRENGTH)
+
+
+def test_repeated_and_equal_colours_are_left_alone() -> None:
+    model = cover(6000)
+    sh = model.sh.clone()
+    sh[:100, 0, 1] = sh[200:300, 0, 1]  # as of clones that were never optimised again
+    sh[400:500, 0, 2] = sh[400:500, 0, 1]  # grey
+    sh[600:700, 0, 1] = 0.25
+    model = replace(model, sh=sh)
+    stego = embed(model, [(key("a"), bytes(100))], entropy=ENTROPY)
+    kept = (stego.sh[:, 0] == sh[:, 0]).all(dim=1)
+    for rows in (slice(0, 100), slice(200, 300), slice(400, 500), slice(600, 700)):
+        assert float(kept[rows].float().mean()) > 0.98  # salts may lie there
+    low = [each.sh[:, 0].numpy().view(np.uint32) & 1023 for each in (model, stego)]
+    assert (low[0] == low[1]).mean() > 0.99
+    assert extract(stego, key("a")) == bytes(100)
+
+
+def test_a_rounded_model_gets_values_that_it_has() -> None:
+    model = cover(6000)
+    model = replace(model, sh=(model.sh * 60).round() / 60)
+    stego = embed(model, [(key("a"), bytes(100))], entropy=ENTROPY)
+    assert np.isin(stego.sh[:, 0].numpy(), model.sh[:, 0].numpy()).mean() > 0.99
+    assert extract(stego, key("a")) == bytes(100)
+
+
+def test_a_wrong_key_does_the_work_of_a_right_one(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted in looks at parts of headers, which take no less with one key than with another."""
+    from keyss.channels.robust.header import Index
+
+    looks, parts = [0], Index.parts
+
+    def counted(self: Index, *arguments: object) -> object:
+        looks[0] += 1
+        return parts(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Index, "parts", counted)
+    extract(stego, key("a"))
+    right, looks[0] = looks[0], 0
+    with pytest.raises(WrongKeyError):
+        extract(stego, key("b"))
+    assert looks[0] == right

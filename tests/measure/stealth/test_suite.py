@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
+import torch
 
 from keyss.core import Gaussians
+from keyss.measure.stealth.colours import colours
 from keyss.measure.stealth.opacities import modes
 from keyss.measure.stealth.suite import KINDS, stealth_statistics
 from measure.stealth.careless import (
@@ -135,3 +138,22 @@ def test_small_models_have_fewer_statistics(count: int) -> None:
 
 def test_models_without_harmonics() -> None:
     assert stealth_statistics(plain(1).with_sh_degree(0))
+
+
+def test_noise_in_green_and_blue_is_seen_beside_red() -> None:
+    """Neighbours that were alike are no more, in the channels with noise alone."""
+    generator = torch.Generator().manual_seed(0)
+    count = 4000
+    means = torch.rand(count, 3, generator=generator)
+    base = torch.stack([(9 * means[:, axis]).sin() for axis in range(3)], dim=1)
+    sh = (base + 0.01 * torch.randn(count, 3, generator=generator))[:, None]
+    clean = Gaussians(
+        means, torch.randn(count, 4), torch.full((count, 3), -4.0), torch.zeros(count), sh.contiguous()
+    )
+    noisy = sh.clone()
+    noisy[:, 0, 1:] += 0.2 * torch.rand(count, 2, generator=generator)
+    found = [colours(each) for each in (clean, dataclasses.replace(clean, sh=noisy))]
+    name = "green of neighbours, 0.05"
+    assert abs(found[0][name].value) < 0.4 < found[1][name].value - found[0][name].value
+    swapped = colours(dataclasses.replace(clean, sh=noisy.roll(-1, 2)))  # noise in red as well: no yardstick
+    assert swapped[name].value < found[1][name].value

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from keyss.core.gaussians import Gaussians
 
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
 _LOW = np.uint32(1023)  # bits of a float that stay
 _SHORT = np.uint32((1 << 20) - 1)  # a number whose last bits are all zero was typed, not trained
-_EQUAL = 2.0**-10  # of two numbers: what training leaves of two equal ones
-_NEIGHBOURS = 3
 
 Floats = npt.NDArray[np.float32]
 
@@ -30,22 +27,18 @@ class Quiet:
         self._values = [values for values, _, _ in every]
         self._rounded = bool(len(repeated)) and float(repeated.mean()) > _ROUNDED
         self._repeated = repeated.any(axis=1)
-        self._positions = np.nan_to_num(model.means.detach().cpu().double().numpy())
 
     def left_alone(self) -> npt.NDArray[np.bool_]:
-        """[N] Gaussians of which a colour is repeated, typed, or equal in channels or to a neighbour's.
+        """[N] Gaussians of which a colour is repeated, typed, or equal in two channels.
 
-        None of a rounded model, where all are repeated.
+        None of a rounded model, where all are repeated. Colours that are nearly equal are not left alone:
+        there would be too many of them beside those that the others were moved away from.
         """
         if self._rounded or not len(self._colours):
             return np.zeros(len(self._colours), bool)
-        alone = self._repeated | ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
-        alone |= _nearly(self._colours, np.roll(self._colours, 1, axis=1)).any(axis=1)
-        _, near = cKDTree(self._positions).query(self._positions, k=min(1 + _NEIGHBOURS, len(alone)))
-        for other in near.reshape(len(alone), -1)[:, 1:].T:
-            same = _nearly(self._colours, self._colours[other]).any(axis=1)
-            alone[same] = True
-            alone[other[same]] = True
+        typed = ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
+        alone: npt.NDArray[np.bool_] = self._repeated | typed
+        alone |= (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
         return alone
 
     def fitted(
@@ -64,9 +57,5 @@ class Quiet:
             close: Floats = np.where(np.abs(nearest - new) <= most, nearest, new).astype(np.float32)
             return close
         bits = new.astype(np.float32).view(np.uint32) & ~_LOW | old.view(np.uint32) & _LOW
-        return bits.view(np.float32)
-
-
-def _nearly(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
-    found: npt.NDArray[np.bool_] = np.abs(one - other) <= _EQUAL * np.maximum(np.abs(one), np.abs(other))
-    return found
+        same: Floats = bits.view(np.float32)
+        return same

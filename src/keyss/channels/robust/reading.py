@@ -69,9 +69,9 @@ class Reader:
             for kind, view in VIEWS:
                 header = read_header(secrets, check, index, kind, view)
                 found = found or ((header, offset) if header is not None else None)
-        if found is None:  # the same work as where there is something
-            header = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 0, 1, 0, SHARES - 1, 0, 0)
-            _payload(header, static, self._numbers.carriers(0.0), _CHANGED)
+        if found is None:  # about the work that there is where there is something
+            header = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 0, 1, 0, SHARES // 4 - 1, 64, 0)
+            _payload(header, static, self._numbers.carriers(0.0), _CHANGED, _ROUNDS // 4)
             raise WrongKeyError(_OPENS_NOTHING)
         header, offset = found
         carriers = self._refined(header, check, secrets, offset)
@@ -107,7 +107,9 @@ class Reader:
         return self._numbers.carriers(offset)
 
 
-def _payload(header: Header, static: bytes, carriers: Carriers, changed: float) -> bytes | None:
+def _payload(
+    header: Header, static: bytes, carriers: Carriers, changed: float, rounds: int = _ROUNDS
+) -> bytes | None:
     """What the header's data key decrypts, or None."""
     own = carriers[header.own(carriers)]
     size, key = bucket_bytes(header.bucket), data_key(static, header)
@@ -116,5 +118,5 @@ def _payload(header: Header, static: bytes, carriers: Carriers, changed: float) 
     garbage = min(0.9, header.idle * IDLE + changed)
     doubt = 1 - (1 - garbage) * (1 - own.doubt) / own.namesakes()
     ratios = header.lattice.read(key, own, doubt)
-    bits, _ = Fountain.of(8 * size).decode(header.lattice.seeds(key, own), ratios, _ROUNDS)
+    bits, _ = Fountain.of(8 * size).decode(header.lattice.seeds(key, own), ratios, rounds)
     return decrypt_payload(key, np.packbits(bits).tobytes())
