@@ -200,7 +200,7 @@ def test_what_was_destroyed_is_told_from_what_was_never_there(
     stego: Gaussians, prepared: RobustCover
 ) -> None:
     with pytest.raises(InputError, match="the key is right, but too much"):
-        extract(random_pruning(0.45, 1)(stego), key("a"))
+        extract(noise("log scale", 0.03)(random_pruning(0.4, 1)(stego)), key("a"))
     with pytest.raises(WrongKeyError):
         extract(prepared.model, key("a"))
 

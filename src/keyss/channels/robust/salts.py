@@ -5,7 +5,7 @@ opacity and the ratios of their scales lie, of those where these are in the inne
 where no format moves them out: half of them faint ones, on which a new colour is hardly seen, and half
 others, which are still there when the faintest were removed. Writing changes none of these numbers. A salt
 is a hash of the cells of one listed Gaussian, green and blue included. To have new salts, a writer moves
-green and blue of the listed ones by whole cells, at random and by at most 0.4 (faint ones) or 0.13. Where
+green and blue of the listed ones by whole cells, at random and by at most 0.4. Where
 they lie inside of their cells stays as it is, so that nothing tells that this has happened.
 """
 
@@ -31,7 +31,7 @@ from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
 _BANDS = (0.08, 0.4, 1.01)  # of opacity, from each of which half of them are
-_MOST_MOVED = (3, 1)  # cells, by band
+_MOST_MOVED = (3, 3)  # cells, by band: with fewer, two files of one model would often share a salt
 _COLOUR_STEPS, _OPACITY_STEPS, _RATIO_STEPS = 5, 16, 8  # that make a cell
 # Rounding a number leaves it in its cell, whose borders are borders of rounding too; a ratio moves by a step.
 _NOISE = np.array([OPACITY_NOISE / OPACITY_STEP] + [1.0] * 2 + [COLOUR_NOISE / COLOUR_STEP] * 3)
