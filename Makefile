@@ -1,6 +1,6 @@
 # Every target sets up what it needs in .venv, with the versions in requirements/constraints.txt.
 #   make demo          hide one made-up scene in another and open it again (results in out/demo)
-#   make test          lint, types, import rules and the fast tests
+#   make test          lint, types, import rules and the fast tests, in two processes (JOBS=4: in four)
 #   make lint          ruff (rules and format), mypy, import-linter; `make format` formats
 #   make test-real     one small real scene end to end, from ../shared/data or $KEYSS_TEST_DATA
 #   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
@@ -17,6 +17,7 @@
 PYTHON ?= python3
 PIP_EXTRA ?=
 ARGS ?=
+JOBS ?= 2
 
 BIN := .venv/bin
 PACKAGE := .venv/.package
@@ -33,6 +34,8 @@ OLDEST_PIP := $(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-
 OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
 
 FAST := -m "not slow and not cuda and not real"
+# Files go to processes whole, since their tests share what is expensive; what measures time runs alone.
+PARALLEL := -n $(JOBS) --dist loadfile
 
 .PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
@@ -41,7 +44,7 @@ demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest $(FAST) $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
 
 test-real: $(DEV)
 	$(BIN)/python -m pytest -m real $(ARGS)
@@ -59,7 +62,7 @@ test-oldest-quick: $(OLDEST_DEV)
 	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
 
 coverage: $(DEV)
-	$(BIN)/python -m pytest $(FAST) --cov --cov-report=term $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(PARALLEL) --cov --cov-report=term $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check $(PYTHON_CODE)
