@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
+from keyss.cli.doctor import doctor
 from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
@@ -94,5 +95,5 @@ def version() -> None:
 
 ALL = (
     *(keygen, fit, hide, reveal, verify, render, convert),
-    *(evaluate, audit, report, steganalyze, info, demo, version),
+    *(evaluate, audit, report, steganalyze, info, demo, doctor, version),
 )
