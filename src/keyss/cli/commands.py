@@ -6,9 +6,9 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
@@ -85,6 +85,22 @@ def demo(
     )
 
 
+def completion(
+    shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="{bash,zsh}", help="Which.")],
+) -> None:
+    """Print what makes a shell complete commands and options.
+
+    bash loads it at its start; zsh looks for a file _keyss in the folders of its fpath.
+
+    example: keyss completion bash >> ~/.bash_completion
+
+    example: keyss completion zsh > ~/.zfunc/_keyss
+    """
+    from keyss.cli.entry import application
+
+    application(["completion"], whole=True).run(["--tyro-print-completion", shell])
+
+
 def version() -> None:
     """Print the version, as `keyss --version` does.
 
@@ -95,5 +111,5 @@ def version() -> None:
 
 ALL = (
     *(keygen, fit, hide, reveal, verify, render, convert),
-    *(evaluate, audit, report, steganalyze, info, demo, doctor, version),
+    *(evaluate, audit, report, steganalyze, info, demo, doctor, completion, version),
 )

@@ -25,6 +25,7 @@ from keyss.cli.arguments import (
     Resume,
     Seed,
     SkipMissing,
+    TensorBoard,
     Width,
     optional,
     preset_sizes,
@@ -82,6 +83,7 @@ def hide(
     ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    tensorboard: TensorBoard = False,
     device: Device = "auto",
     seed: Seed = None,
     **own: Any,
@@ -99,9 +101,9 @@ def hide(
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.cli.tensorboard import reporter
     from keyss.core.errors import UsageError
     from keyss.methods import registry
-    from keyss.progress import reporter
     from keyss.rendering.orbit import is_model
     from keyss.runs.files import STEGOS
 
@@ -112,6 +114,7 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
+        unused |= {"--tensorboard": tensorboard}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         if publish not in ("ply", "any"):
@@ -187,7 +190,7 @@ def hide(
         out=out,
         overwrite=overwrite,
         resume=resume,
-        reporter=reporter(),
+        reporter=reporter(out, tensorboard=tensorboard),
     )
     print_hiding(result.metrics)
     print_files(
