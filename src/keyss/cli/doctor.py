@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 EXTRAS = {
     "clip": ("transformers", "the paper's key encoder"),
     "metrics": ("flip-evaluator", "FLIP in audits"),
+    "tensorboard": ("tensorboard", "losses of a training, as it runs"),
+    "video": ("av", "films by keyss render --video"),
     "steganalysis": ("sealwatch", "detectors in audits"),
 }
 _LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")

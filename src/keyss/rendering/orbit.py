@@ -89,7 +89,7 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
         position = middle + outward * reach * DISTANCES[index % len(DISTANCES)]
-        cameras.append(_looking(position, -outward, K, size, f"orbit_{index:03d}.png"))
+        cameras.append(looking(position, -outward, K, size, f"orbit_{index:03d}.png"))
     return cameras
 
 
@@ -116,7 +116,7 @@ def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
     return values[int(torch.searchsorted(total, share * total[-1]).clamp_max(len(values) - 1))]
 
 
-def _looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str) -> Camera:
+def looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str) -> Camera:
     """A camera at `position` that looks along the unit vector `forward`, with -y up."""
     right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
     right = right / right.norm()
