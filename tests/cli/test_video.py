@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +19,8 @@ from keyss import api, load_scene, write_model
 from keyss._verbs.filming import shown, wiped
 from keyss.core import Camera, Gaussians, UsageError
 from keyss.rendering import render
-from keyss.rendering.orbit import middle_and_radius
-from keyss.rendering.paths import along, circle
+from keyss.rendering.orbit import look_at, middle_and_radius
+from keyss.rendering.paths import around, circle, through
 from tiny_scenes import random_gaussians
 
 Run = Callable[..., Said]
@@ -81,8 +82,9 @@ def test_a_wipe_from_one_model_to_the_other_and_back(keyss: Run, files: Path, tm
         assert frames[index][:, 47:49].mean() > 200
 
 
-def test_along_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path) -> None:
-    scene = ("--cameras", files / "scene")
+@pytest.mark.parametrize("path", ["around", "through"])
+def test_with_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path, path: str) -> None:
+    scene = ("--cameras", files / "scene", "--path", path)
     said = keyss("render", files / "a.ply", *scene, "--video", tmp_path / "s.mp4", "--seconds", 0.2)
     assert said.status == 0, said.err
     cameras = sorted((view.camera for view in load_scene(files / "scene").views), key=lambda each: each.name)
@@ -93,7 +95,7 @@ def test_along_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path) -
 
 def test_a_path_goes_through_its_cameras() -> None:
     cameras = circle(random_gaussians(50), 32, 5)
-    path = along(cameras[::-1], 9)  # by their names, whatever the order
+    path = through(cameras[::-1], 9)  # by their names, whatever the order
     for index, camera in enumerate(cameras):
         torch.testing.assert_close(path[2 * index].viewmat, camera.viewmat, atol=1e-5, rtol=0)
     for camera in path:
@@ -101,9 +103,9 @@ def test_a_path_goes_through_its_cameras() -> None:
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
     middle = (path[2].position + path[4].position) / 2
     torch.testing.assert_close(path[3].position, middle, atol=1e-5, rtol=0)
-    assert along(cameras[:1], 3) == [cameras[0]] * 3
+    assert through(cameras[:1], 3) == [cameras[0]] * 3
     with pytest.raises(UsageError):
-        along([], 3)
+        through([], 3)
 
 
 def test_a_circle_looks_at_the_middle_from_above() -> None:
@@ -114,6 +116,44 @@ def test_a_circle_looks_at_the_middle_from_above() -> None:
         torch.testing.assert_close(at[:2], torch.zeros(2), atol=1e-5, rtol=0)
         assert at[2] > 0
         assert camera.position[1] < middle[1]  # up is -y
+
+
+def ring(degrees: range, up: str) -> list[Camera]:
+    """Cameras on a ring of radius 3 around (1, 2, 3), at a height of 1, that look at its middle."""
+    found = []
+    for index, angle in enumerate(degrees):
+        flat = 3 * math.cos(math.radians(angle)), 3 * math.sin(math.radians(angle))
+        outward = torch.tensor([flat[0], -1.0, flat[1]] if up == "-y" else [*flat, 1.0])
+        axis = torch.tensor([0.0, -1.0, 0.0] if up == "-y" else [0.0, 0.0, 1.0])
+        viewmat = look_at(MIDDLE + outward, -outward / outward.norm(), axis)
+        found.append(Camera(viewmat, torch.eye(3), 8, 8, f"{index:03}"))
+    return found
+
+
+MIDDLE = torch.tensor([1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("up", ["-y", "z"])
+def test_around_what_cameras_look_at(up: str) -> None:
+    """The same ring again, from wherever it begins."""
+    cameras = ring(range(0, 360, 30), up)
+    path = around(cameras, 12)
+    places = torch.stack([camera.position for camera in cameras])
+    found = torch.stack([camera.position for camera in path])
+    assert float(torch.cdist(found, places).min(dim=1).values.max()) < 1e-2
+    assert float(torch.cdist(places, found).min(dim=1).values.max()) < 1e-2
+    for camera in path:
+        nearest = cameras[int((places - camera.position).norm(dim=1).argmin())]
+        torch.testing.assert_close(camera.viewmat, nearest.viewmat, atol=1e-2, rtol=0)
+
+
+def test_around_stays_where_cameras_were() -> None:
+    """Those of a half ring: the path sways between its ends."""
+    path = around(ring(range(0, 181, 20), "-y"), 24)
+    offsets = torch.stack([camera.position for camera in path]) - MIDDLE
+    assert float(offsets[:, 2].min()) > -0.1
+    assert float(offsets[:, 0].min()) == pytest.approx(-3, abs=0.1)
+    assert float(offsets[:, 0].max()) == pytest.approx(3, abs=0.1)
 
 
 def test_wipes() -> None:
@@ -136,6 +176,7 @@ def test_wipes() -> None:
         (("--video", "film.mp4", "--wipe", "none.ply"), 4, "none.ply"),
         (("--video", "there.mp4"), 5, "--overwrite"),
         (("--wipe", "b.ply", "--cameras", "scene", "-o", "x"), 2, "give --video"),
+        (("--path", "through", "--cameras", "scene", "-o", "x"), 2, "give --video"),
         (("-o", "x"), 2, "--cameras SCENE"),
         ((), 2, "--video FILE"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +22,7 @@ from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.rendering import Backend, render, resolve_device
 from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.orbit import IMAGE_SIZE
-from keyss.rendering.paths import along, circle
+from keyss.rendering.paths import around, circle, through
 from keyss.runs.config import Background, PathLike
 from keyss.runs.opening import as_model, as_scene
 
@@ -36,6 +37,7 @@ def render_video(
     *,
     wipe: PathLike | Gaussians | None = None,
     cameras: PathLike | Scene | None = None,
+    path: Literal["around", "through"] = "around",
     seconds: float = 8.0,
     width: int | None = None,
     background: Background = None,
@@ -46,12 +48,15 @@ def render_video(
 ) -> int:
     """Film a model into the file `out` (.mp4, 25 frames a second); returns the number of frames.
 
-    The camera goes once around the model, or through the `cameras` of a scene in the order of their names.
+    The camera goes once around the model; with `cameras`, around what those of a scene look at, at their
+    height, or with the path "through" from one to the next in the order of their names.
     `wipe`: a second model, uncovered from the left and covered again, such as the secret over the cover;
     without `cameras` each is seen from its own circle, so that it need not lie in the same place. `width` in
     pixels, 400 without a scene; sizes are made even. Raises KeyssError and its children.
     """
     check_video(out)
+    if path not in ("around", "through"):
+        raise UsageError(f"`path`: expected 'around' or 'through', got {path!r}")
     inputs = [Path(each) for each in (model, wipe) if isinstance(each, str | Path)]
     check_not_an_input(out, inputs)
     check_output_file(out, overwrite)
@@ -68,8 +73,8 @@ def render_video(
         paths = [circle(each, size - size % 2, count) for each in models]
     else:
         scene = as_scene(cameras, width, background, skip_missing=skip_missing)
-        color = scene.background
-        paths = [[_even(camera) for camera in along([view.camera for view in scene.views], count)]]
+        color, way = scene.background, around if path == "around" else through
+        paths = [[_even(camera) for camera in way([view.camera for view in scene.views], count)]]
         paths *= len(models)
     reporter = reporter or SilentReporter()
     reporter.start(f"film {Path(out).name}", count, 0)

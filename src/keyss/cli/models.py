@@ -102,17 +102,19 @@ def render(
     *,
     cameras: Annotated[
         Path | None,
-        optional("SCENE", "Scene folder whose cameras are used.", "a film goes once around the model"),
+        optional("SCENE", "Scene folder whose cameras are used.", "a film goes around the model"),
     ] = None,
     out: Annotated[
         Path | None, optional("FOLDER", "Folder for the images.", "only a film is made", aliases=["-o"])
     ] = None,
     video: Annotated[
         Path | None,
-        optional(
-            "FILE", "Make a film, an .mp4; its camera goes through those of SCENE.", "pictures are made"
-        ),
+        optional("FILE", "Make a film, an .mp4, on a path that SCENE gives, if any.", "pictures are made"),
     ] = None,
+    path: Annotated[
+        Literal["around", "through"],
+        arg(help="Of a film with cameras: around what they look at, or through them by their names."),
+    ] = "around",
     wipe: Annotated[
         Path | None, optional("FILE", "In a film, a second model that a wipe uncovers.", "none")
     ] = None,
@@ -128,7 +130,7 @@ def render(
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
 
-    example: keyss render stego.ply --wipe secret.ply --video film.mp4
+    example: keyss render stego.ply --wipe secret.ply --cameras SCENE_A --video film.mp4
     """
     from keyss import api
     from keyss.core.errors import UsageError
@@ -143,6 +145,7 @@ def render(
             video,
             wipe=wipe,
             cameras=cameras,
+            path=path,
             seconds=seconds,
             width=width,
             background=background,
@@ -155,8 +158,8 @@ def render(
         return
     if cameras is None or out is None:
         raise UsageError("pictures need --cameras SCENE and -o FOLDER; a film needs --video FILE")
-    if wipe is not None or seconds != 8.0:
-        raise UsageError("--wipe and --seconds are for films: give --video FILE")
+    if wipe is not None or seconds != 8.0 or path != "around":
+        raise UsageError("--path, --wipe and --seconds are for films: give --video FILE")
     images = api.render(
         model,
         cameras,

@@ -118,10 +118,15 @@ def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
 
 def looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str) -> Camera:
     """A camera at `position` that looks along the unit vector `forward`, with -y up."""
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    return Camera(look_at(position, forward, torch.tensor([0.0, -1.0, 0.0])), K, size, size, name)
+
+
+def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
+    """[4, 4] world to camera, from `position` along the unit vector `forward`, which is not that of `up`."""
+    right = torch.linalg.cross(-up, forward)
     right = right / right.norm()
     down = torch.linalg.cross(forward, right)
-    viewmat = torch.eye(4)
+    viewmat = torch.eye(4, dtype=position.dtype)
     viewmat[:3, :3] = torch.stack([right, down, forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    return Camera(viewmat, K, size, size, name)
+    return viewmat
