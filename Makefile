@@ -7,6 +7,7 @@
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
 #   make coverage      the fast tests, and which lines they reach
 #   make docs          the documentation as a site, in site/
+#   make pictures      the pictures of the documents, from the demo
 #   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
 #   make benchmark-baseline     store what the quick benchmark measures as the next baseline
 #   make benchmark-fidelity     what hiding costs (ARGS="--data FOLDER --hide COVER,SECRET ... --write FILE")
@@ -37,7 +38,7 @@ FAST := -m "not slow and not cuda and not real"
 # Files go to processes whole, since their tests share what is expensive; what measures time runs alone.
 PARALLEL := -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs venv clean \
+.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs pictures venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
 
 demo: $(PACKAGE)
@@ -76,6 +77,9 @@ format: $(DEV)
 
 docs: $(DEV)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet  # no advertisement of its successor
+
+pictures: $(DEV) demo
+	$(BIN)/python docs/pictures.py out/demo
 
 benchmark-check: $(DEV)
 	$(BIN)/python benchmarks/quick.py --check $(ARGS)
