@@ -3,7 +3,8 @@
 At its cost a key takes 0.1 s of two cores, sixteen times as long in low bits, and most of the time of the
 tests would be spent there. What a key becomes is as sensitive to all that goes in, costs included, so that
 nothing opens here what would not open what it does at full cost; what is expected of the real costs (vectors,
-files of before, other implementations) is marked.
+files of before, other implementations) is marked. A fixture that several tests share is made at the cost of
+the first of them: a marked test makes what it opens itself.
 """
 
 from __future__ import annotations
