@@ -5,8 +5,8 @@
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
     python benchmarks/stealth.py --quick --pairs $(cat FOLDER/pairs)
 
-The second gives the cost of each attribute alone; the third writes of each model an untouched file and one nine
-tenths full, and lists them for the fourth, which tells how well they are told apart.
+The second gives the cost of each attribute alone; the third writes of each model an untouched file and one
+nine tenths full, and lists them for the fourth, which tells how well they are told apart.
 
 Each `--pair` names a folder of photos in `--data` and a model of it for the cover, then for the secret (a
 folder that is not there: pictures of the model itself are taken). The secret is as large as fits, and at most
@@ -137,9 +137,7 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )
         payload = Payload("carry", os.urandom(cover.capacity * 9 // 10))
-        # Written anew, for bits are counted in another order than that of the file.
-        model = in_morton_order(read_model(path)) if format_name != "spz" else read_model(path)
-        write_model(plain, coded(FORMATS[format_name].quantise(model)))
+        write_model(plain, read_model(path))
         write_model(stego, coded(cover.embed([(KEY, payload)])))
         found.append(f"{scene}={plain}:{stego}")
     (folder / "pairs").write_text("\n".join(found))
