@@ -151,13 +151,13 @@ def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
     cover = CodesCover.of(codes_of(suffix))
     file = written(cover, np.random.default_rng(0).bytes(cover.capacity * 9 // 10))
     found = []
-    for row in range(0, 6000, 750):
+    for row in range(0, 6000, 400):
         rotations = file.rotations.copy()
-        rotations[row] ^= 1
+        rotations[row, 0] ^= 1
         with pytest.raises((InputError, WrongKeyError)) as error:
             CodesReader.of(replace(file, rotations=rotations)).extract(key(0))
         found.append("damaged" in str(error.value))
-    assert sum(found) >= 5
+    assert sum(found) > 10
 
 
 def test_equal_keys_no_secrets_and_too_many() -> None:

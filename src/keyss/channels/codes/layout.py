@@ -27,7 +27,7 @@ from keyss.keys.derivation import SALT_BYTES, DerivedKey, stream
 VERSION = 1
 LEAST_SLOTS, MOST_SLOTS = 4, 256
 ZONE_RATE = 384  # bits that a block of salt and slots holds: more than half of its bits may have to stay
-_LEAST_SHARE, _SHARE = 1 / 4, 1 / 16  # of all bits that the least slots, and more of them, may take
+_LEAST_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits that the least slots, and more of them, may take
 _HEADER = struct.Struct("<BHIIx")  # version, bits that a block holds, first bit, bytes of data
 SLOT_BYTES = _HEADER.size + 16
 _ASSOCIATED = b"keyss/v1/codes"
@@ -112,7 +112,9 @@ def find_header(zone: bytes, key: DerivedKey, room: Room) -> Header | None:
 def order(salt: bytes, count: int) -> Order:
     """[count] the bits of data, in the order in which blocks take them."""
     numbers = np.frombuffer(stream(salt + bytes(16), "codes/order", 8 * count), "<u8")
-    return np.argsort(numbers, kind="stable")
+    # Sorted with their numbers in the lower half: this is the same everywhere, and faster than `argsort`.
+    lower = np.uint64(2**32 - 1)
+    return (np.sort(numbers & ~lower | np.arange(count, dtype=np.uint64)) & lower).astype(np.int64)
 
 
 def to_bits(data: bytes) -> Bits:
