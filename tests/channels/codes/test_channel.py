@@ -147,17 +147,21 @@ def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str)
 
 @EVERY
 def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
-    """But for the few bits that hold salt and slots."""
+    """But for the few bits that hold salt and slots, or nothing."""
     cover = CodesCover.of(codes_of(suffix))
-    file = written(cover, np.random.default_rng(0).bytes(cover.capacity * 9 // 10))
-    found = []
+    data = np.random.default_rng(0).bytes(cover.capacity * 9 // 10)
+    file = written(cover, data)
+    damaged = 0
     for row in range(0, 6000, 400):
         rotations = file.rotations.copy()
         rotations[row, 0] ^= 1
-        with pytest.raises((InputError, WrongKeyError)) as error:
-            CodesReader.of(replace(file, rotations=rotations)).extract(key(0))
-        found.append("damaged" in str(error.value))
-    assert sum(found) > 10
+        try:
+            assert CodesReader.of(replace(file, rotations=rotations)).extract(key(0)).data == data
+        except WrongKeyError:
+            continue
+        except InputError as error:
+            damaged += "damaged" in str(error)
+    assert damaged > 10
 
 
 def test_equal_keys_no_secrets_and_too_many() -> None:
