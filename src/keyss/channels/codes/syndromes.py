@@ -7,20 +7,17 @@ bits as it has dry ones, less the few that random matrices lack in rank.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from keyss.keys.derivation import stream
+from keyss.rendering.cpu.jit import kernel
 
 BLOCK = 1024
 _WORDS = BLOCK // 64
 _DEVIATIONS = 4.5  # of the number of dry bits of a block below its mean: one block in 300,000 has fewer
 _SPARE = 10  # dry bits beyond the rate: one matrix in 1000 lacks as much in rank
 _AT_ONCE = 1024  # blocks
-_numba: Any = numba  # typed in some versions only
 
 Bits = npt.NDArray[np.uint8]  # each 0 or 1
 Words = npt.NDArray[np.uint64]
@@ -78,7 +75,7 @@ def _unpacked(rows: Words) -> Bits:
     return np.unpackbits(rows.view(np.uint8).reshape(len(rows), -1), axis=1, bitorder="little")
 
 
-@_numba.njit(cache=True)
+@kernel
 def _eliminated(rows):  # type: ignore[no-untyped-def]
     """`rows` reduced, so that in column pivots[i] only row i is 1; what made them so; the pivots, or -1."""
     rate, words = rows.shape
@@ -104,7 +101,7 @@ def _eliminated(rows):  # type: ignore[no-untyped-def]
     return own, made, pivots
 
 
-@_numba.njit(cache=True)
+@kernel
 def _solve(free, columns, may, rest_may, changed, rest):  # type: ignore[no-untyped-def]
     """Find `rest` [B, F], 0 except where `rest_may`: `changed` [B, R] + free rest is 0 except where `may`.
 
