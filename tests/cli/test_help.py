@@ -37,7 +37,7 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert"]
+        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert", "view", "export-html"]
         judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "version"]
         assert making + judging == COMMANDS
 

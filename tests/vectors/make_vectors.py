@@ -2,8 +2,8 @@
 
     python tests/vectors/make_vectors.py
 
-`carried.json` is not written here: what old files revealed, new ones must reveal too. `revealed.json` says what keys
-open in the models of this folder, and is what the reader in `web/` is tested against.
+`carried.json` is not written here: what old files revealed, new ones must reveal too. `revealed.json` says
+what keys open in the models of this folder, and is what the reader in `web/` is tested against.
 """
 
 from __future__ import annotations
@@ -104,7 +104,10 @@ def pruned() -> Gaussians:
     """
     cover = trained_like(1000, 3, sh_degree=2)
     cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
-    secrets = [(TWO_KEYS[0], trained_like(250, 4, sh_degree=1)), (TWO_KEYS[1], trained_like(30, 5, sh_degree=2))]
+    secrets = [
+        (TWO_KEYS[0], trained_like(250, 4, sh_degree=1)),
+        (TWO_KEYS[1], trained_like(30, 5, sh_degree=2)),
+    ]
     stego = embed(cover, secrets, entropy=bytes(32))
     rows = torch.randperm(len(stego), generator=torch.Generator().manual_seed(6))[:900]
     return stego[torch.cat([rows, rows[:5]])]

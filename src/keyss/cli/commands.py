@@ -16,6 +16,7 @@ from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
 from keyss.cli.revealing import reveal, verify
+from keyss.cli.viewing import export_html, view
 
 
 def keygen(
@@ -93,6 +94,6 @@ def version() -> None:
 
 
 ALL = (
-    *(keygen, fit, hide, reveal, verify, render, convert),
+    *(keygen, fit, hide, reveal, verify, render, convert, view, export_html),
     *(evaluate, audit, report, steganalyze, info, demo, version),
 )

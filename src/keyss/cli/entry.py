@@ -72,7 +72,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
         elif command is fit and arguments[0] == "fit":
             asked = fit_with_presets()
         app.command(asked)
-        if command.__name__ == arguments[0]:
+        if command.__name__.replace("_", "-") == arguments[0]:
             options |= {
                 name
                 for name, parameter in inspect.signature(asked).parameters.items()

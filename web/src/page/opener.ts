@@ -1,0 +1,40 @@
+/** The worker that reads files and tries keys, as functions. */
+import WORKER from 'source:../worker.ts';
+import type { Answer, Question } from '../protocol.ts';
+
+export class Opener {
+  private readonly worker: Worker;
+  private readonly waiting = new Map<number, (answer: Answer) => void>();
+  private next = 0;
+
+  constructor() {
+    // From a blob, so that a page that is one file and opens from disk has a worker, too.
+    const url = URL.createObjectURL(new Blob([WORKER], { type: 'text/javascript' }));
+    this.worker = new Worker(url);
+    this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
+      this.waiting.get(data.id)?.(data);
+      this.waiting.delete(data.id);
+    };
+    this.worker.onerror = () => {
+      for (const [id, resolve] of this.waiting) resolve({ id, error: 'This file cannot be read.' });
+      this.waiting.clear();
+    };
+  }
+
+  /** The model in a file; keys are tried on it from now on. */
+  load(bytes: Uint8Array): Promise<Answer> {
+    return this.ask({ id: this.next++, bytes }, [bytes.buffer as ArrayBuffer]);
+  }
+
+  /** What a key opens. */
+  unlock(key: string): Promise<Answer> {
+    return this.ask({ id: this.next++, key });
+  }
+
+  private ask(question: Question, moved: Transferable[] = []): Promise<Answer> {
+    return new Promise((resolve) => {
+      this.waiting.set(question.id, resolve);
+      this.worker.postMessage(question, moved);
+    });
+  }
+}
