@@ -171,6 +171,7 @@ class Page {
     page.wipe.value = '0';
     page.revealed.hidden = false;
     this.controls.setPose(this.firstPose());
+    this.writeAddress();
   }
 
   private firstPose(): Pose {
@@ -185,10 +186,12 @@ class Page {
       this.viewer.setPose(this.alike(pose, this.secret, this.published));
     } else this.viewer.setPose(pose);
     clearTimeout(this.addressTimer);
-    this.addressTimer = window.setTimeout(() => {
-      const hash = poseToHash(this.pose);
-      if (this.published && location.hash !== hash) history.replaceState(null, '', hash);
-    }, ADDRESS_AFTER);
+    this.addressTimer = window.setTimeout(() => this.writeAddress(), ADDRESS_AFTER);
+  }
+
+  private writeAddress(): void {
+    const hash = poseToHash(this.pose);
+    if (this.published && location.hash !== hash) history.replaceState(null, '', hash);
   }
 
   /** The pose that shows the second model as `pose` shows the first, which has coordinates of its own. */

@@ -129,6 +129,8 @@ export class Viewer {
       clearColor: new Color(0, 0, 0, 1), fov: FIELD_OF_VIEW, layers: [layer.id], priority: order,
       gammaCorrection: GAMMA_SRGB, toneMapping: TONEMAP_NONE,
     });
+    // Without this internal switch the engine leaves the scissor rectangle aside.
+    (camera.camera as unknown as { camera: { _scissorRectClear: boolean } }).camera._scissorRectClear = true;
     this.app.root.addChild(camera);
     return { layer, camera, splats: null };
   }
