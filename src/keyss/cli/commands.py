@@ -76,6 +76,7 @@ def demo(
         out,
         {
             "comparison.png": "all of it in one picture: look here first",
+            "index.html": "what would be published, in a browser: type the key there",
             "publish/stego.ply": "what would be published: opens in any 3DGS viewer",
             "secret.ply": "what the key brought back from it",
             "key.txt": "the key of this demo, known to everybody",
