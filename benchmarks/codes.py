@@ -30,7 +30,6 @@ from keyss.files.scenes import load_scene
 from keyss.measure.images import psnr
 from keyss.methods.dither import cost
 from keyss.methods.records import whole
-from keyss.methods.records.embedding import ENCRYPTION_BYTES
 from keyss.methods.records.encoding import most_visible
 from keyss.methods.records.table import Table
 from keyss.rendering import render
@@ -75,7 +74,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         untouched = format_.dequantise(format_.quantise(model))
         start = time.monotonic()
         room: CodesCover = prepare(cover[1], name)
-        kept, encoded = whole.fitted(own, room.capacity * 1023 // 1024 - ENCRYPTION_BYTES, prune=True)
+        kept, encoded = whole.fitted(own, room.capacity * 1023 // 1024 - 128, prune=True)
         stego = coded(room.embed([(KEY, Payload("carry", encoded))]))
         file = format_.serialise(stego.codes)
         hiding = time.monotonic() - start
@@ -83,7 +82,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data).gaussians
         revealing = time.monotonic() - start
         bits = 8 * room.capacity / len(model)
-        floor = Table.floor(0).total
+        floor = Table.floor(0)
         most = room.capacity * 8 / (8 * len(whole.encode(kept, floor)) / len(kept)) / len(model)
         in_format = format_.dequantise(format_.quantise(in_morton_order(kept)))
         numbers = [

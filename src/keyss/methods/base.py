@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from keyss.channels.base import Content
-from keyss.core.errors import KeyssError
+from keyss.channels.rooms import AnyChannel, Publish
+from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -154,6 +155,17 @@ class MethodOptions:
     """What every method can be told; each has a class of its own that adds to it."""
 
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
+    publish: Publish = "ply"  # format that the published model is passed on in; any: it may be converted
+    # Of models that may be converted: appended Gaussians hold everything, and everybody can see that they are
+    # there; colours hold little and show less.
+    channel: AnyChannel = "appended"
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for what does not go together."""
+        if self.channel != "appended" and self.publish != "any":
+            raise UsageError(
+                f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
+            )
 
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`."""

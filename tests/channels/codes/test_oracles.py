@@ -14,10 +14,11 @@ from channels.codes.published import FORMATS, model_of
 from files.formats.conftest import splat_transform  # noqa: F401
 from keyss.channels.base import Payload
 from keyss.channels.codes.published import SUFFIXES, coded, prepare
+from keyss.channels.rooms import room_in
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.methods import registry
-from keyss.methods.records.embedding import embed_in_codes
+from keyss.methods.records.embedding import embed_whole
 
 EVERY = pytest.mark.parametrize("name", SUFFIXES)
 # World units of positions, log scales, f_dc and opacities that two files may differ by: a few codes.
@@ -85,9 +86,9 @@ def test_splat_transform_reads_it(
 
 @EVERY
 def test_it_opens_from_the_very_file_and_from_no_other(name: str, tmp_path: Path) -> None:
-    cover, secret = prepare(model_of(), name), model_of(200, seed=3)
+    room, secret = room_in(model_of(), name, "appended"), model_of(200, seed=3)  # type: ignore[arg-type]
     _, stego = files(name, tmp_path)
-    made = embed_in_codes(cover, ["key"], [secret], "carry", prune=False)
+    made = embed_whole(room, ["key"], [secret], prune=False)
     write_model(stego, made.stego)
     again = read_model(stego)
     found = registry.open_model(again, "key").reveal(again)
@@ -98,4 +99,4 @@ def test_it_opens_from_the_very_file_and_from_no_other(name: str, tmp_path: Path
     assert (tmp_path / f"copy{SUFFIXES[name]}").read_bytes() == stego.read_bytes()
     with pytest.raises(WrongKeyError):
         registry.open_model(again[:-1], "key")
-    assert FORMATS[SUFFIXES[name]].parse(stego.read_bytes()) == made.stego.codes
+    assert FORMATS[SUFFIXES[name]].parse(stego.read_bytes()) == made.stego.codes  # type: ignore[attr-defined]

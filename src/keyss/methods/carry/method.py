@@ -8,16 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from keyss.channels.base import Content, RecordRequest
-from keyss.channels.codes import published
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.layout import plan_records, record_capacity
+from keyss.channels.rooms import room_in
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import cost, dither, sampled
 from keyss.methods.records import whole
-from keyss.methods.records.embedding import embed_in_codes, embed_models, rooms_in_codes, unpack_records
+from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
 from keyss.methods.records.encoding import (
     CarriedSecret,
     check_degrees,
@@ -25,6 +25,7 @@ from keyss.methods.records.encoding import (
     record_requests,
     subsampled_counts,
 )
+from keyss.methods.records.prospect import outlook_whole
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned", sidecar=True` has room'
 _LEARNED = '`method="learned"` needs no low bits of the cover'
@@ -34,8 +35,6 @@ _DITHER_AND_PRUNE = (
     f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
 )
 _PRUNE_OR_PLY = '`prune_to_fit=True` leaves out what is seen least, `publish="ply"` has more room'
-_BITS_IN_CODES = 18  # of a Gaussian of the cover, where it is not known yet, and of the secret's
-_BITS_OF_SECRETS = 110  # of a Gaussian of a secret, of which nothing else is known
 
 NAME = "carry"
 
@@ -57,7 +56,7 @@ class CarryMethod:
         refused after their training.
         """
         if options.publish != "ply":
-            return _prepared_for_codes(inputs, options)
+            return _prepared_for_room(inputs, options)
         cover, *others = (each.model for each in inputs)
         degree, *degrees = _degrees(inputs, options)
         check_degrees(LOW_BITS, degree, degrees)
@@ -82,7 +81,7 @@ class CarryMethod:
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
         """The cover as it is, and in it what its carriers have room for."""
         if options.publish != "ply":
-            return _outlook_in_codes(inputs, options)
+            return outlook_whole(inputs, options)
         sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
         degrees = _degrees(inputs, options)
         cover, notes = inputs[0].model, []
@@ -108,9 +107,9 @@ class CarryMethod:
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
         if options.publish != "ply":
-            room = published.prepare(cover.model, options.publish)
+            room = room_in(cover.model, options.publish, options.channel)
             with advising(UsageError, _PRUNE_OR_PLY):
-                written = embed_in_codes(room, keys, models, NAME, prune=options.prune_to_fit)
+                written = embed_whole(room, keys, models, prune=options.prune_to_fit)
             seconds = time.monotonic() - start
             return Stego(written.stego, None, written.opened, seconds, details=written.details)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
@@ -130,31 +129,18 @@ class CarryMethod:
         return {}
 
 
-def _prepared_for_codes(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
+def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
     """Refuses given models that will not fit; those that are fitted first are made to fit."""
     cover, *others = (each.model for each in inputs)
     secrets = [model for model in others if model is not None]
     if cover is None or len(secrets) < len(others):
         return replace(options, prune_to_fit=True)
-    room = published.prepare(cover, options.publish)
+    room = room_in(cover, options.publish, options.channel)
     with advising(UsageError, _PRUNE_OR_PLY):
         if not options.prune_to_fit:
-            for model, size in zip(secrets, rooms_in_codes(room, secrets), strict=True):
-                whole.fitted(model, size, prune=False)
+            for model, share in zip(secrets, shares_of(room, secrets), strict=True):
+                whole.fitted(model, share, prune=False, short=room.grows)
     return options
-
-
-def _outlook_in_codes(inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
-    """The room of the cover; how many Gaussians of the secrets fit is a guess until they are encoded."""
-    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
-    cover, asked = inputs[0].model, sum(sizes[1:])
-    degree = _degrees(inputs, options)[0]
-    if cover is None:
-        room, note = sizes[0] * _BITS_IN_CODES // 8, "about"
-    else:
-        room, note = published.prepare(cover, options.publish).capacity, "exactly"
-    notes = (f"the codes of the {options.publish} file have room for {note} {room:,} bytes",)
-    return Outlook(sizes[0], degree, asked, min(asked, 8 * room // _BITS_OF_SECRETS), notes=notes)
 
 
 def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:

@@ -17,6 +17,7 @@ from typing import Any
 from torch import Tensor
 
 from keyss.channels.base import Content, Records
+from keyss.channels.rooms import room_in
 from keyss.core.alignment import align
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -43,6 +44,7 @@ from keyss.methods.learned.room import (
 )
 from keyss.methods.learned.targets import PlacedScene
 from keyss.methods.records.embedding import unpack_records
+from keyss.methods.records.prospect import outlook_whole
 
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
@@ -61,7 +63,10 @@ class LearnedMethod:
         """Sized for models where they are all there is; refuses models too small for their low bits."""
         options = sized(options, inputs)
         encoder_of(options)  # says what is missing
-        if not options.sidecar:
+        if options.publish != "ply":
+            if (cover := inputs[0].model) is not None:
+                room_in(cover, options.publish, options.channel)  # says what is missing
+        elif not options.sidecar:
             check_room(options, [each.model for each in inputs])
         return options
 
@@ -78,6 +83,11 @@ class LearnedMethod:
                     f"{role} of SH degree {each.model.sh_degree} gets degree {degree}: {psnr:.1f} dB PSNR "
                     "against itself"
                 )
+        if options.publish != "ply":
+            found = outlook_whole(inputs, options)
+            share = found.capacity / max(1, found.asked)
+            drawn = [0, *(int(share * each) for each in sizes[1:])]
+            return replace(found, steps=fit.iterations, drawn=tuple(drawn), notes=(*notes, *found.notes))
         if options.in_records:
             gaussians = fit.max_gaussians if cover is None else len(cover)
             carriers = carriers_of(cover, gaussians, fit.sh_degree)
@@ -184,6 +194,8 @@ def _roles(inputs: Sequence[SceneInput]) -> list[str]:
 def _degrees(options: LearnedOptions, scenes: int) -> list[int]:
     """SH degrees with which the cover and the secrets come out."""
     degree = options.fit.sh_degree
+    if options.publish != "ply":
+        return [degree, *[3] * (scenes - 1)]  # as they are
     of_secrets = record_degree(degree) if options.in_records else degree
     return [degree, *[degree if of_secrets is None else of_secrets] * (scenes - 1)]
 

@@ -89,6 +89,12 @@ class LearnedOptions(MethodOptions):
     prune_by: Literal["all", "cover"] = "all"  # whose opacities spare a Gaussian; cover: the authors' code
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.publish != "ply" and not self.in_records:
+            raise UsageError(
+                f'`publish="{self.publish}"` is for secrets that lie in the published file: leave out '
+                '`sidecar=True` and `start="points"`'
+            )
         if self.clip_model is not None and self.key_encoder != "clip":
             raise UsageError(
                 '`clip_model` is for the key encoder clip: leave it out or set `key_encoder="clip"`'

@@ -21,20 +21,18 @@ from keyss.methods.dither import cost
 from keyss.methods.records.encoding import CarriedSecret, most_visible
 from keyss.methods.records.packing import Bytes, Codes, codes_of_records, records_of_codes
 from keyss.methods.records.quantise import Codec
-from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
+from keyss.methods.records.table import BANDS, Table, chroma_bits
 
 MOST_GAUSSIANS = 1 << 22
 _COUNT = struct.Struct("<I")
+_GOOD_ENOUGH = 44.0  # dB of pictures against those of the model: of photos at 30 dB it takes 0.2
 _MORE_BITS = 20  # of a record beyond the least, after which nobody sees a difference: 3 dB for each four
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
 _POSITIONS = range(3, 6)  # among the columns of a layout
 
 
-def encode(model: Gaussians, bits: int) -> bytes:
-    """`model`, each record of at most `bits`. Raises ValueError where they are too few."""
-    table = Table.of_size(bits, model.sh_degree)
-    if table is None:
-        raise ValueError(f"{bits} bits are too few for a record of SH degree {model.sh_degree}")
+def encode(model: Gaussians, table: Table) -> bytes:
+    """`model` in records of a table of its SH degree."""
     model = in_morton_order(model)
     codec = Codec.fit(model, table)
     columns = codes_of_records(codec.encode(model), _layout(table))
@@ -65,7 +63,7 @@ def decode(data: bytes) -> CarriedSecret:
     for index, (columns, bits) in enumerate(layout):
         width = columns * -(-bits // 8) * count
         part = np.frombuffer(planes, np.uint8, width, at)
-        found.append(_from_planes(part.reshape(columns, -1, count), bits, index))
+        found.append(_from_planes(part.reshape(columns, -(-bits // 8), count), bits, index))
         at += width
     gaussians = codec.decode(records_of_codes(found, layout))
     return CarriedSecret(gaussians, count, codec.table.total)
@@ -73,18 +71,18 @@ def decode(data: bytes) -> CarriedSecret:
 
 def least_bytes(model: Gaussians) -> int:
     """Of the shortest encoding."""
-    return len(encode(model, Table.floor(model.sh_degree).total))
+    return len(encode(model, Table.floor(model.sh_degree)))
 
 
-def fitted(model: Gaussians, room: int, *, prune: bool) -> tuple[Gaussians, bytes]:
-    """What of `model` is encoded, and it in at most `room` bytes, as precise as it fits.
+def fitted(model: Gaussians, room: int, *, prune: bool, short: bool = False) -> tuple[Gaussians, bytes]:
+    """What of `model` is encoded, and it in at most `room` bytes, as precise as it fits, or `short`.
 
     If all of it does not fit, `prune` takes the most visible Gaussians, of the SH degree that renders most
     like the model. Raises UsageError without `prune`, or where nothing fits.
     """
-    least = encode(model, Table.floor(model.sh_degree).total)
+    least = _short(model) if short else encode(model, Table.floor(model.sh_degree))
     if len(least) <= room:
-        return model, _most_precise(model, least, room)
+        return model, least if short else _most_precise(model, least, room)
     if not prune:
         raise UsageError(
             f"the secret of {len(model):,} Gaussians takes {len(least):,} bytes, and there is room for "
@@ -101,12 +99,21 @@ def fitted(model: Gaussians, room: int, *, prune: bool) -> tuple[Gaussians, byte
     return kept, _most_precise(kept, data, room)
 
 
+def _short(model: Gaussians) -> bytes:
+    """The shortest encoding of which pictures are good enough, or the best of the short ones."""
+    for table in Table.short(model.sh_degree):
+        data = encode(model, table)
+        if cost(model, decode(data).gaussians) >= _GOOD_ENOUGH:
+            break
+    return data
+
+
 def _pruned(model: Gaussians, room: int) -> tuple[Gaussians, bytes] | None:
     """The most visible Gaussians that fit into `room` bytes; None if not even one does."""
-    bits, count = Table.floor(model.sh_degree).total, len(model)
+    table, count = Table.short(model.sh_degree)[1], len(model)
     while count > 0:
         kept = most_visible(model, count)
-        data = encode(kept, bits)
+        data = encode(kept, table)
         if len(data) <= room:
             return kept, data
         count = min(count - 1, int(0.995 * count * room / len(data)))
@@ -118,7 +125,8 @@ def _most_precise(model: Gaussians, least: bytes, room: int) -> bytes:
     floor = Table.floor(model.sh_degree).total
     more = min(_MORE_BITS, 8 * (room - len(least)) // len(model))
     while more > 0:
-        data = encode(model, floor + more)
+        table = Table.of_size(floor + more, model.sh_degree)
+        data = least if table is None else encode(model, table)
         if len(data) <= room:
             return data
         more -= 2
@@ -130,7 +138,7 @@ def _layout(table: Table) -> list[tuple[int, int]]:
     means, log_scales, quats, opacity, *colours = table.bits
     layout = [(1, 1), (1, 2), (3, quats), (1, means), (1, means), (1, means), (3, log_scales), (1, opacity)]
     for count, bits in zip(BANDS, colours, strict=False):
-        layout += [(count, bits), (2 * count, bits - CHROMA_FEWER)]
+        layout += [(count, bits), (2 * count, chroma_bits(bits))]
     return layout
 
 
