@@ -14,7 +14,7 @@ import pytest
 
 from cli.said import PROGRAM as KEYSS
 from keyss.core.gaussians import Gaussians
-from keyss.files.models import read_model
+from keyss.files.models import read_model, write_model
 from keyss.files.ply import write_ply
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
@@ -105,6 +105,18 @@ def test_served_it_is_the_same(tab: Visit, served: str, secrets: list[Gaussians]
     tab.settle()
     assert tab.page.locator("#revealed").is_hidden()
     assert all(url.startswith((served, f"blob:{served}")) for url in tab.requests), tab.requests
+
+
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply"])
+def test_published_formats_are_shown(tab: Visit, page_file: Path, tmp_path: Path, suffix: str) -> None:
+    converted = tmp_path / f"model.{suffix}"
+    model = made(600, 5)
+    write_model(converted, model)
+    tab.goto(page_file.as_uri() + POSE)
+    tab.page.set_input_files("#file", converted)
+    tab.page.wait_for_function("() => document.getElementById('facts').textContent.includes('600')")
+    tab.settle()
+    assert psnr(tab.picture(), drawn(read_model(converted), POSE)) > CLOSE
 
 
 def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, page_file: Path) -> None:
