@@ -1,9 +1,10 @@
 /** What the page and its worker tell each other. */
 import type { Gaussians } from './core/gaussians.ts';
 
-/** Bytes of a file that is to be read, or a key to be tried on the one before. */
+/** The port of the worker that derives keys; bytes of a file to be read; or a key to be tried on the one before. */
 export interface Question {
   readonly id: number;
+  readonly port?: MessagePort;
   readonly bytes?: Uint8Array;
   readonly key?: string;
 }

@@ -1,4 +1,4 @@
-/** Everything that takes time: files into models, and keys. Nothing of it outlives the page. */
+/** What takes time: files into models, and what keys open in them. Nothing of it outlives the page. */
 import { type Content, LowBitsReader } from './channels/reader.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf } from './core/gaussians.ts';
@@ -6,6 +6,7 @@ import { readModel } from './files/models.ts';
 import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
+let port: MessagePort | null = null;
 let prepared: Promise<LowBitsReader | null> = Promise.resolve(null);
 
 function answer(message: Answer, moved: Transferable[] = []): void {
@@ -19,9 +20,18 @@ async function load(id: number, bytes: Uint8Array): Promise<void> {
   prepared = new Promise((resolve) => setTimeout(() => resolve(LowBitsReader.of(model)), 0));
 }
 
+/** What a key becomes with a salt, by the worker at the other end of the port that the page gave. */
+const derive = (key: string, salt: Uint8Array): Promise<Uint8Array> =>
+  new Promise((resolve, reject) => {
+    if (port === null) throw new Error('no port');
+    port.onmessage = ({ data }: MessageEvent<Uint8Array | null>) =>
+      data === null ? reject(new Error('no memory')) : resolve(data);
+    port.postMessage({ key, salt });
+  });
+
 async function unlock(id: number, key: string): Promise<void> {
   const reader = await prepared;
-  const content = reader === null ? null : await reader.open(key);
+  const content = reader === null ? null : await reader.open(key, derive);
   if (content === null) answer({ id });
   else if (content.service === 'records') {
     const model = secretOf(content).gaussians;
@@ -38,6 +48,10 @@ function fileOf(content: Content): { name: string; data: Uint8Array } | undefine
 }
 
 self.onmessage = async ({ data }: MessageEvent<Question>) => {
+  if (data.port) {
+    port = data.port;
+    return;
+  }
   try {
     if (data.bytes) await load(data.id, data.bytes);
     else await unlock(data.id, data.key ?? '');

@@ -62,13 +62,15 @@ export class LowBitsReader {
 
   /** What `key` opens, null for nothing. Raises InputError for damage. */
   async open(key: string, derive: Derive = master): Promise<Content | null> {
-    const secrets: Uint8Array[] = [];
-    for (const salt of this.salts.slice(0, SALTS_TRIED)) {
-      secrets.push(expand(await derive(key, salt), 'low-bits/key', 32));
-    }
-    if (this.width < TAG_BYTES + DATA_KEY_BYTES) return null;
+    const room = this.width >= TAG_BYTES + DATA_KEY_BYTES;
+    const tried = this.salts.slice(0, SALTS_TRIED);
     const dataKeys: Uint8Array[] = [];
-    for (const secret of secrets) {
+    let [secret, next] = [new Uint8Array(32), derive(key, tried[0])];
+    for (let index = 0; index < tried.length; index++) {
+      secret = new Uint8Array(expand(await next, 'low-bits/key', 32));
+      // The next one is derived by another worker while this one looks through the cells.
+      if (index + 1 < tried.length) next = derive(key, tried[index + 1]);
+      if (!room) continue;
       const found = mostFrequent(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
       if (found !== null) dataKeys.push(found);
     }
@@ -76,7 +78,7 @@ export class LowBitsReader {
       const parts = this.decrypted(this.parameterCipher(dataKey));
       if (parts.length) return this.content(dataKey, unpackParameters(parts, this.chunkBytes));
     }
-    if (dataKeys.length === 0) this.passesForNothing(secrets[0]);
+    if (room && dataKeys.length === 0) this.passesForNothing(secret);
     return null;
   }
 

@@ -49,3 +49,15 @@ export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussia
 export function opacity(logit: number): number {
   return 1 / (1 + Math.exp(-logit));
 }
+
+/** About the `count` Gaussians that are seen most, by opacity and cross-section, in their order. */
+export function mostVisible(gaussians: Gaussians, count: number): Gaussians {
+  const visibility = Float32Array.from({ length: gaussians.count }, (_, row) => {
+    const [a, b, c] = gaussians.logScales.subarray(3 * row, 3 * row + 3);
+    return opacity(gaussians.opacityLogits[row]) * Math.exp(a + b + c - Math.min(a, b, c));
+  });
+  const least = Float32Array.from(visibility).sort()[Math.max(0, gaussians.count - count)];
+  const rows: number[] = [];
+  for (let row = 0; row < gaussians.count && rows.length < count; row++) if (visibility[row] >= least) rows.push(row);
+  return selected(gaussians, rows);
+}

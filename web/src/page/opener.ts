@@ -1,4 +1,5 @@
-/** The worker that reads files and tries keys, as functions. */
+/** The workers that read files and try keys, as functions. */
+import DERIVE from 'source:../derive.ts';
 import WORKER from 'source:../worker.ts';
 import type { Answer, Question } from '../protocol.ts';
 
@@ -8,9 +9,10 @@ export class Opener {
   private next = 0;
 
   constructor() {
-    // From a blob, so that a page that is one file and opens from disk has a worker, too.
-    const url = URL.createObjectURL(new Blob([WORKER], { type: 'text/javascript' }));
-    this.worker = new Worker(url);
+    this.worker = started(WORKER);
+    const { port1, port2 } = new MessageChannel();
+    started(DERIVE).postMessage(null, [port1]);
+    this.worker.postMessage({ id: this.next++, port: port2 }, [port2]);
     this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
       this.waiting.get(data.id)?.(data);
       this.waiting.delete(data.id);
@@ -37,4 +39,9 @@ export class Opener {
       this.worker.postMessage(question, moved);
     });
   }
+}
+
+/** A worker from a blob, so that a page that is one file and opens from disk has one, too. */
+function started(source: string): Worker {
+  return new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
 }

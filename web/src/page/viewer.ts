@@ -3,20 +3,24 @@ import {
   AppBase, AppOptions, CameraComponentSystem, Color, createGraphicsDevice, Entity, GAMMA_SRGB, GSplatComponentSystem,
   GSplatData, GSplatResource, Layer, Mat4, Quat, RESOLUTION_FIXED, TONEMAP_NONE, Vec4,
 } from 'playcanvas';
-import { coefficients, type Gaussians } from '../core/gaussians.ts';
+import { coefficients, type Gaussians, mostVisible } from '../core/gaussians.ts';
 import { axes, FIELD_OF_VIEW, type Pose } from './pose.ts';
 
 const NEAREST = 1e-3; // of the distance of what the camera looks at
 const FURTHEST = 1e4;
 const SLOW = 120; // milliseconds of a frame beyond which pictures in motion are coarser
 const COARSE = 0.5; // of the resolution, then
+const COARSE_COUNT = 30_000; // and so many Gaussians at most, those that are seen most
+const POLL = 4; // milliseconds
 const AT_REST = 250; // milliseconds without a change after which pictures are fine
 export type Side = 'left' | 'right';
 
 interface Half {
   readonly layer: Layer;
   readonly camera: Entity;
+  model: Gaussians | null;
   splats: Entity | null;
+  coarse: Entity | null; // few of its Gaussians, made when they are needed
 }
 
 export class Viewer {
@@ -24,7 +28,10 @@ export class Viewer {
   private scale = 1;
   private moving = false;
   private lastChange = 0;
-  private frameTimes: number[] = [];
+  private inFlight = false; // a frame that is being drawn
+  private wanted = false; // another one after it
+  private started = 0;
+  private slowFrames = 0;
   private split = 1; // share of the width that the left model has
   private whenReady: (() => void)[] = [];
   private ready = false;
@@ -61,23 +68,28 @@ export class Viewer {
   /** Shows a model, or nothing, on one side; the right side is hidden while it has none. */
   show(model: Gaussians | null, side: Side = 'left'): void {
     const half = this.halves[side];
-    const before = half.splats;
-    half.splats = null;
-    if (model !== null) {
-      half.splats = new Entity(side);
-      half.splats.addComponent('gsplat', { layers: [half.layer.id] });
-      (half.splats.gsplat as unknown as { resource: unknown }).resource = new GSplatResource(
-        this.app.graphicsDevice, elements(model),
-      );
-      this.app.root.addChild(half.splats);
-    }
-    if (before) {
-      const old = (before.gsplat as unknown as { resource: GSplatResource }).resource;
-      before.destroy();
+    const before = [half.splats, half.coarse];
+    half.model = model;
+    half.coarse = null;
+    half.splats = model && this.splats(model, half.layer);
+    for (const entity of before) {
+      if (!entity) continue;
+      const old = (entity.gsplat as unknown as { resource: GSplatResource }).resource;
+      entity.destroy();
       old.destroy();
     }
     this.layOut();
     this.touch();
+  }
+
+  private splats(model: Gaussians, layer: Layer): Entity {
+    const entity = new Entity();
+    entity.addComponent('gsplat', { layers: [layer.id] });
+    (entity.gsplat as unknown as { resource: unknown }).resource = new GSplatResource(
+      this.app.graphicsDevice, elements(model),
+    );
+    this.app.root.addChild(entity);
+    return entity;
   }
 
   /** Where the border between the two models lies, 0 to 1 of the width from the left. */
@@ -117,7 +129,7 @@ export class Viewer {
       this.app.once('frameend', () =>
         this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('no picture'))), 'image/png'),
       );
-      this.draw();
+      this.draw(); // into the buffer, which is empty between frames
     });
   }
 
@@ -132,7 +144,7 @@ export class Viewer {
     // Without this internal switch the engine leaves the scissor rectangle aside.
     (camera.camera as unknown as { camera: { _scissorRectClear: boolean } }).camera._scissorRectClear = true;
     this.app.root.addChild(camera);
-    return { layer, camera, splats: null };
+    return { layer, camera, model: null, splats: null, coarse: null };
   }
 
   private layOut(): void {
@@ -152,6 +164,10 @@ export class Viewer {
   }
 
   private draw(): void {
+    this.wanted = this.inFlight;
+    if (this.inFlight) return;
+    this.inFlight = true;
+    this.started = performance.now();
     this.app.renderNextFrame = true;
   }
 
@@ -166,25 +182,48 @@ export class Viewer {
   private setScale(scale: number): void {
     if (scale === this.scale) return;
     this.scale = scale;
+    for (const half of Object.values(this.halves)) {
+      if (half.model === null || half.model.count <= COARSE_COUNT) continue;
+      half.coarse ??= this.splats(mostVisible(half.model, COARSE_COUNT), half.layer);
+      half.coarse.enabled = scale < 1;
+      half.splats!.enabled = scale === 1;
+    }
     this.resize();
   }
 
+  /** The next frame is drawn when this one is: else a slow GPU would have a queue of them, and lag behind. */
   private afterFrame(): void {
+    const gl = (this.app.graphicsDevice as unknown as { gl: WebGL2RenderingContext }).gl;
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const poll = (): void => {
+      if (fence !== null && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
+        setTimeout(poll, POLL);
+        return;
+      }
+      gl.deleteSync(fence);
+      this.drawn();
+    };
+    setTimeout(poll, 0);
+  }
+
+  private drawn(): void {
     const now = performance.now();
+    this.inFlight = false;
+    this.canvas.dataset.frames = String(Number(this.canvas.dataset.frames ?? 0) + 1);
     if (this.moving) {
-      this.frameTimes = [...this.frameTimes.slice(-4), now];
-      const mean = (now - this.frameTimes[0]) / Math.max(1, this.frameTimes.length - 1);
-      if (this.frameTimes.length > 3 && mean > SLOW && mean < 5 * AT_REST) this.setScale(COARSE);
+      this.slowFrames = now - this.started > SLOW ? this.slowFrames + 1 : 0;
+      if (this.slowFrames > 1 && now - this.lastChange < AT_REST) this.setScale(COARSE);
       if (now - this.lastChange > AT_REST) {
         this.moving = false;
-        this.frameTimes = [];
+        this.slowFrames = 0;
         this.setScale(1);
       }
       this.draw();
     } else if (this.whenReady.length) {
       if (this.ready) for (const resolve of this.whenReady.splice(0)) resolve();
       else this.draw();
-    }
+    } else if (this.wanted) this.draw();
   }
 }
 
