@@ -6,11 +6,15 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from keyss.cli.arguments import Overwrite, optional
+
+Up = Annotated[
+    Literal["-y", "z", "y"], arg(help="Which way is up at first: -y as in COLMAP, z as in Blender.")
+]
 
 
 def view(
@@ -20,6 +24,7 @@ def view(
     host: Annotated[
         str, arg(metavar="ADDRESS", help="Address to serve on; any other than this one lets others look too.")
     ] = "127.0.0.1",
+    up: Up = "-y",
 ) -> None:
     """Look at a published model in a browser, where its key can be typed.
 
@@ -32,7 +37,7 @@ def view(
 
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    server = ModelServer(model, host, port)
+    server = ModelServer(model, host, port, up)
     who = "only this machine" if host in ("127.0.0.1", "localhost", "::1") else f"whoever reaches {host}"
     print(f"{server.address} shows {model}, to {who}; Ctrl-C ends it", flush=True)
     server.run()
@@ -49,6 +54,7 @@ def export_html(
             help="A name that ends in .html: one file that opens from disk; any other: a folder.",
         ),
     ],
+    up: Up = "-y",
     overwrite: Overwrite = False,
 ) -> None:
     """Write a page that shows a published model and has a field for its key; no secret is in it.
@@ -57,7 +63,7 @@ def export_html(
     """
     from keyss.viewer import export_html
 
-    written = export_html(model, out, overwrite=overwrite)
+    written = export_html(model, out, up=up, overwrite=overwrite)
     size = sum(path.stat().st_size for path in written) / 1e6
     what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
     print(f"{out}: {size:.1f} MB; {what}")

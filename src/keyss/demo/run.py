@@ -91,7 +91,7 @@ def run_demo(
             picture = io.BytesIO()
             comparison = _comparison(out / STEGO, revealed, cover, secret, metrics, device)
             comparison.save(picture, "PNG", optimize=True)
-            viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name)
+            viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, up="z")
             files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
             results.write(writers(files | {VIEWER: viewer}))
         return DemoResult(metrics, refused)

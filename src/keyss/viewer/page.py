@@ -34,18 +34,19 @@ def served_policy() -> str:
     return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
 
 
-def page_beside(model: str) -> bytes:
+def page_beside(model: str, up: str = "-y") -> bytes:
     """The page for `model`, the address of a file beside it; style and script lie beside it too."""
     return _page(
         policy=served_policy(),
         style=f'<link rel="stylesheet" href="{STYLE}">',
         model=f'<meta name="keyss-model" content="{html.escape(model)}">',
         script=f'<script src="{SCRIPT}"></script>',
+        up=up,
     )
 
 
-def page_with(model: bytes, name: str) -> bytes:
-    """The page with the `model` and everything else in it; `name` is shown."""
+def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
+    """The page with the `model` and everything else in it; `name` is shown, `up` is "-y", "z" or "y"."""
     style, script = asset(STYLE).decode(), asset(SCRIPT).decode()
     data = f'<script id="model" type="application/octet-stream" data-name="{html.escape(name)}">'
     scripts = f"script-src {_hash(script)} {_WASM}; worker-src blob:"
@@ -55,13 +56,17 @@ def page_with(model: bytes, name: str) -> bytes:
         style=f"<style>{style}</style>",
         model=data + b64encode(model).decode() + "</script>",
         script=f"<!-- {_comment(asset(LICENCES).decode())} -->\n<script>{script}</script>",
+        up=up,
     )
 
 
-def export_html(model: Path | str, out: Path | str, *, overwrite: bool = False) -> tuple[Path, ...]:
+def export_html(
+    model: Path | str, out: Path | str, *, up: str = "-y", overwrite: bool = False
+) -> tuple[Path, ...]:
     """Write the viewer with the published `model`: one file, or a folder where `out` does not end in .html.
 
-    One file opens from disk; a folder, for larger models, has to be served. Returns what was written.
+    One file opens from disk; a folder, for larger models, has to be served. `up`: "-y", as captures made with
+    COLMAP have it, "z" or "y". Returns what was written.
     Raises UsageError for a model that the page cannot read or that is too large, InputError, OutputError.
     """
     model, out = Path(model), Path(out)
@@ -74,9 +79,9 @@ def export_html(model: Path | str, out: Path | str, *, overwrite: bool = False) 
                 "for the output, which a web server can serve"
             )
         check_not_an_input(out, [model])
-        write_bytes(check_output_file(out, overwrite), page_with(data, model.name))
+        write_bytes(check_output_file(out, overwrite), page_with(data, model.name, up))
         return (out,)
-    contents = {INDEX: page_beside(quote(model.name)), model.name: data}
+    contents = {INDEX: page_beside(quote(model.name), up), model.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
     if len(contents) < 5:
         raise UsageError(f"{model} has the name of a file of the viewer: give it another one")
@@ -103,8 +108,8 @@ def asset(name: str) -> bytes:
     return files("keyss.viewer").joinpath("assets", name).read_bytes()
 
 
-def _page(**parts: str) -> bytes:
-    page = asset("page.html").decode()
+def _page(*, up: str = "-y", **parts: str) -> bytes:
+    page = asset("page.html").decode().replace('data-up="-y"', f'data-up="{html.escape(up)}"')
     policy = f'<meta http-equiv="Content-Security-Policy" content="{html.escape(parts.pop("policy"))}">'
     for name, part in {"policy": policy, **parts}.items():
         before, found, after = page.partition(f"<!--{name}-->")

@@ -23,12 +23,12 @@ _START_BYTES = 16
 class ModelServer:
     """A server of the viewer and one model. Nothing else is given out, whatever is asked."""
 
-    def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0) -> None:
+    def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0, up: str = "-y") -> None:
         """`port` 0: any that is free. Raises InputError, UsageError, and OutputError where it is in use."""
         self.model = Path(model)
         read_file_start(self.model)
         try:
-            self._server = ThreadingHTTPServer((host, port), _handler(self.model, host in _LOCAL_NAMES))
+            self._server = ThreadingHTTPServer((host, port), _handler(self.model, up, host in _LOCAL_NAMES))
         except (OSError, OverflowError) as error:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
@@ -61,10 +61,10 @@ def read_file_start(model: Path) -> None:
         raise InputError(f"{model}: cannot be read: {error.strerror}") from error
 
 
-def _handler(model: Path, local: bool) -> type[BaseHTTPRequestHandler]:
+def _handler(model: Path, up: str, local: bool) -> type[BaseHTTPRequestHandler]:
     own = f"/model/{model.name}"
     contents: dict[str, tuple[str, Callable[[], BinaryIO]]] = {
-        "/": ("text/html; charset=utf-8", lambda: BytesIO(page_beside(f"model/{quote(model.name)}"))),
+        "/": ("text/html; charset=utf-8", lambda: BytesIO(page_beside(f"model/{quote(model.name)}", up))),
         f"/{SCRIPT}": ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
         f"/{STYLE}": ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
         own: ("application/octet-stream", lambda: model.open("rb")),

@@ -1,5 +1,5 @@
 /** Moving the camera by mouse, touch and keyboard: around what it looks at, or flying. */
-import { add, axes, difference, length, type Pose, STEEPEST, type Vector } from './pose.ts';
+import { add, axes, difference, length, type Pose, turned, type Vector } from './pose.ts';
 
 const TURN = 0.005; // radians for each pixel
 const KEY_TURN = 0.08; // radians for each press of an arrow key
@@ -90,13 +90,13 @@ export class Controls {
   }
 
   private orbit(azimuth: number, elevation: number): void {
-    const { eye, target } = this.pose;
-    this.setPose({ eye: add(target, turned(difference(eye, target), azimuth, elevation)), target });
+    const { eye, target, up } = this.pose;
+    this.setPose({ eye: add(target, turned(difference(eye, target), up, azimuth, elevation)), target, up });
   }
 
   private look(azimuth: number, elevation: number): void {
-    const { eye, target } = this.pose;
-    this.setPose({ eye, target: add(eye, turned(difference(target, eye), -azimuth, elevation)) });
+    const { eye, target, up } = this.pose;
+    this.setPose({ eye, target: add(eye, turned(difference(target, eye), up, -azimuth, elevation)), up });
   }
 
   private zoom(factor: number): void {
@@ -105,7 +105,7 @@ export class Controls {
     const distance = length(offset);
     const bounded = Math.min(Math.max(distance * factor, NEAREST), FURTHEST);
     if (this.flying) this.fly(0, 0, 1 - factor);
-    else this.setPose({ eye: add(target, offset, bounded / distance), target });
+    else this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
   }
 
   private slide(right: number, down: number): void {
@@ -119,16 +119,6 @@ export class Controls {
     const distance = length(difference(target, eye));
     let step: Vector = add([0, 0, 0], directions.right, right * distance);
     step = add(add(step, directions.down, down * distance), directions.forward, forward * distance);
-    this.setPose({ eye: add(eye, step), target: add(target, step) });
+    this.setPose({ ...this.pose, eye: add(eye, step), target: add(target, step) });
   }
-}
-
-/** An offset turned about the vertical axis, and towards it as far as it may. */
-function turned(offset: Vector, azimuth: number, elevation: number): Vector {
-  const distance = length(offset);
-  const around = Math.atan2(offset[2], offset[0]) + azimuth;
-  const up = Math.asin(Math.max(-1, Math.min(1, -offset[1] / distance))) + elevation;
-  const bounded = Math.max(-STEEPEST, Math.min(STEEPEST, up));
-  const flat = Math.cos(bounded) * distance;
-  return [flat * Math.cos(around), -Math.sin(bounded) * distance, flat * Math.sin(around)];
 }

@@ -4,7 +4,9 @@ import { writePly } from '../files/ply.ts';
 import { COLOURINGS, type Look, lookedAt } from './attacker.ts';
 import { Controls } from './controls.ts';
 import { Opener } from './opener.ts';
-import { add, difference, firstPose, middleAndRadius, type Pose, poseOfHash, poseToHash } from './pose.ts';
+import {
+  add, difference, firstPose, middleAndRadius, type Pose, poseOfHash, poseToHash, UPS, upOf,
+} from './pose.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
@@ -24,6 +26,7 @@ const page = {
   status: element('status'),
   problem: element('problem'),
   facts: element('facts'),
+  up: element<HTMLSelectElement>('up'),
   fly: element<HTMLButtonElement>('fly'),
   home: element<HTMLButtonElement>('home'),
   snapshot: element<HTMLButtonElement>('snapshot'),
@@ -44,7 +47,7 @@ class Page {
   private secret: Gaussians | null = null;
   private readonly opener = new Opener();
   private readonly controls: Controls;
-  private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0] };
+  private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
   private addressTimer = 0;
   private lookTimer = 0;
   private loads = 0;
@@ -70,6 +73,10 @@ class Page {
     page.fly.addEventListener('click', () => {
       this.controls.flying = !this.controls.flying;
       page.fly.setAttribute('aria-pressed', String(this.controls.flying));
+    });
+    page.up.addEventListener('input', () => {
+      this.pose = { ...this.pose, up: upOf(page.up.value) };
+      this.controls.setPose(this.firstPose());
     });
     page.home.addEventListener('click', () => this.controls.setPose(this.firstPose()));
     page.snapshot.addEventListener('click', () => void this.viewer.snapshot().then((png) => save('view.png', png)));
@@ -176,11 +183,12 @@ class Page {
 
   private firstPose(): Pose {
     const model = this.secret ?? this.published;
-    return model ? firstPose(model) : this.pose;
+    return model ? firstPose(model, this.pose.up) : this.pose;
   }
 
   private moved(pose: Pose): void {
     this.pose = pose;
+    page.up.value = pose.up;
     if (this.secret && this.published) {
       this.viewer.setPose(pose, 'right');
       this.viewer.setPose(this.alike(pose, this.secret, this.published));
@@ -199,7 +207,7 @@ class Page {
     const [a, b] = [framing(from), framing(to)];
     const scale = b.radius / a.radius;
     const place = (point: Pose['eye']): Pose['eye'] => add(b.middle, difference(point, a.middle), scale);
-    return { eye: place(pose.eye), target: place(pose.target) };
+    return { eye: place(pose.eye), target: place(pose.target), up: pose.up };
   }
 
   private look(): void {
@@ -268,6 +276,7 @@ function save(name: string, data: Blob): void {
 
 async function main(): Promise<void> {
   for (const colouring of COLOURINGS) page.colouring.add(new Option(colouring));
+  for (const up of UPS) page.up.add(new Option(up));
   let viewer: Viewer;
   try {
     viewer = await Viewer.on(page.canvas);

@@ -1,16 +1,28 @@
-/** Where the camera is and what it looks at; up is -y, as captures made with COLMAP have it. */
+/** Where the camera is, what it looks at, and which way is up. */
 import { type Gaussians, opacity } from '../core/gaussians.ts';
 
 export type Vector = readonly [number, number, number];
 
+/** -y as captures made with COLMAP have it, z as those of Blender. */
+export const UPS = ['-y', 'z', 'y'] as const;
+export type Up = (typeof UPS)[number];
+
 export interface Pose {
   readonly eye: Vector;
   readonly target: Vector;
+  readonly up: Up;
 }
+
+// For each: two horizontal directions of which the cross product is up, the way up, and the side of the first pose.
+const FRAMES: Record<Up, { a: Vector; b: Vector; up: Vector; front: Vector }> = {
+  '-y': { a: [1, 0, 0], b: [0, 0, 1], up: [0, -1, 0], front: [0, 0, -1] },
+  z: { a: [1, 0, 0], b: [0, 1, 0], up: [0, 0, 1], front: [0, -1, 0] },
+  y: { a: [0, 0, 1], b: [1, 0, 0], up: [0, 1, 0], front: [0, 0, 1] },
+};
 
 export const FIELD_OF_VIEW = 50; // degrees, vertical
 const SAMPLE = 20_000; // Gaussians that the first pose is found by
-const [LARGE, MOST] = [0.95, 10]; // a weight's quantile, and what the largest may be of it
+const AWAY = 3; // times the radius of the nearer half
 const HEIGHT = 0.35; // of the first pose, as the sine of its elevation
 export const STEEPEST = (85 * Math.PI) / 180;
 
@@ -22,40 +34,34 @@ export const length = (a: Vector): number => Math.hypot(...a);
 export const cross = (a: Vector, b: Vector): Vector => [
   a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
 ];
+export const dot = (a: Vector, b: Vector): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const unit = (a: Vector): Vector => add([0, 0, 0], a, 1 / Math.max(length(a), 1e-12));
 
 /** Unit vectors of the camera: right, down (OpenCV's y) and forward. */
-export function axes({ eye, target }: Pose): { right: Vector; down: Vector; forward: Vector } {
+export function axes({ eye, target, up }: Pose): { right: Vector; down: Vector; forward: Vector } {
   const forward = unit(difference(target, eye));
-  const right = unit(cross([0, 1, 0], forward));
+  const right = unit(cross(forward, FRAMES[up].up));
   return { right, down: cross(forward, right), forward };
 }
 
-/** From where most of what can be seen of a model is in view. */
-export function firstPose(model: Gaussians): Pose {
+/** From where the detail of a model is in view: inside of the background that captures have around them. */
+export function firstPose(model: Gaussians, up: Up): Pose {
   const { middle, radius } = middleAndRadius(model);
-  const reach = (0.8 * radius) / Math.sin((FIELD_OF_VIEW / 2) * (Math.PI / 180));
   const flat = Math.sqrt(1 - HEIGHT * HEIGHT);
-  return { eye: add(middle, [0, -HEIGHT, -flat], reach), target: middle };
+  const away = add(add([0, 0, 0], FRAMES[up].up, HEIGHT), FRAMES[up].front, flat);
+  return { eye: add(middle, away, AWAY * radius), target: middle, up };
 }
 
-/** As `keyss.rendering.orbit` finds them, of a sample: huge and faint Gaussians count little. */
+/** Where half of the Gaussians lie, of a sample; each counts by its opacity, since large ones are background. */
 export function middleAndRadius(model: Gaussians): { middle: Vector; radius: number } {
   const step = Math.max(1, Math.ceil(model.count / SAMPLE));
   const rows: number[] = [];
   for (let row = 0; row < model.count; row += step) rows.push(row);
-  const weights = rows.map((row) => {
-    const scales = Array.from(model.logScales.subarray(3 * row, 3 * row + 3)).sort((a, b) => a - b);
-    const weight = opacity(model.opacityLogits[row]) * Math.exp(scales[1] + scales[2]);
-    return Number.isFinite(weight) ? weight : 0;
-  });
-  const most = MOST * quantile(weights, weights.map(() => 1), LARGE);
-  const bounded = weights.map((weight) => Math.min(weight, most));
+  const weights = rows.map((row) => opacity(model.opacityLogits[row]));
   const means = rows.map((row): Vector => [model.means[3 * row], model.means[3 * row + 1], model.means[3 * row + 2]]);
-  const middle = [0, 1, 2].map((axis) => quantile(means.map((each) => each[axis]), bounded, 0.5)) as unknown as Vector;
-  const distances = means.map((each) => length(difference(each, middle)));
-  const [half, nearly] = [0.5, 0.9].map((share) => quantile(distances, bounded, share));
-  return { middle, radius: Math.max(Math.min(nearly, 3 * half), 1e-6) };
+  const middle = [0, 1, 2].map((axis) => quantile(means.map((each) => each[axis]), weights, 0.5)) as unknown as Vector;
+  const radius = quantile(means.map((each) => length(difference(each, middle))), weights, 0.5);
+  return { middle, radius: Math.max(radius, 1e-6) };
 }
 
 function quantile(values: number[], weights: number[], share: number): number {
@@ -69,10 +75,21 @@ function quantile(values: number[], weights: number[], share: number): number {
   return values[order.at(-1) ?? 0] ?? 0;
 }
 
-/** `#eye=x,y,z&target=x,y,z`, and back; null for anything else. */
+/** An offset turned about the vertical axis, and towards it as far as it may; angles in radians. */
+export function turned(offset: Vector, up: Up, azimuth: number, elevation: number): Vector {
+  const distance = length(offset);
+  const frame = FRAMES[up];
+  const around = Math.atan2(dot(offset, frame.b), dot(offset, frame.a)) + azimuth;
+  const height = Math.asin(Math.max(-1, Math.min(1, dot(offset, frame.up) / distance))) + elevation;
+  const bounded = Math.max(-STEEPEST, Math.min(STEEPEST, height));
+  const flat = add(add([0, 0, 0], frame.a, Math.cos(around)), frame.b, Math.sin(around));
+  return add(add([0, 0, 0], flat, Math.cos(bounded) * distance), frame.up, Math.sin(bounded) * distance);
+}
+
+/** `#eye=x,y,z&target=x,y,z`, with `&up=z` where up is not -y, and back; null for anything else. */
 export function poseToHash(pose: Pose): string {
   const text = (values: Vector): string => values.map((each) => Number(each.toPrecision(6))).join(',');
-  return `#eye=${text(pose.eye)}&target=${text(pose.target)}`;
+  return `#eye=${text(pose.eye)}&target=${text(pose.target)}${pose.up === '-y' ? '' : `&up=${pose.up}`}`;
 }
 
 export function poseOfHash(hash: string): Pose | null {
@@ -82,5 +99,11 @@ export function poseOfHash(hash: string): Pose | null {
     return numbers.length === 3 && numbers.every((each) => Math.abs(each) < 1e6) ? (numbers as unknown as Vector) : null;
   };
   const [eye, target] = [vector('eye'), vector('target')];
-  return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target } : null;
+  const up = upOf(found.get('up'));
+  return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target, up } : null;
+}
+
+/** -y for whatever is no way up. */
+export function upOf(text: string | null | undefined): Up {
+  return UPS.find((each) => each === text) ?? '-y';
 }
