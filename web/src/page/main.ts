@@ -87,8 +87,8 @@ class Page {
     for (const input of [page.threshold, page.faint, page.opaque, page.colouring]) {
       input.addEventListener('input', () => this.look());
     }
-    window.addEventListener('hashchange', () => {
-      const pose = poseOfHash(location.hash);
+    window.addEventListener('hashchange', ({ newURL }) => {
+      const pose = poseOfHash(new URL(newURL).hash); // that of now may be one that was written meanwhile
       if (pose) this.controls.setPose(pose);
     });
   }
@@ -198,6 +198,7 @@ class Page {
   }
 
   private writeAddress(): void {
+    clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
     if (this.published && location.hash !== hash) history.replaceState(null, '', hash);
   }
