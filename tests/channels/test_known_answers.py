@@ -16,6 +16,8 @@ from keyss.channels.sidecar import decrypt_sidecar
 from keyss.core import Gaussians, InputError, KeyssError, WrongKeyError
 from keyss.files.ply import read_ply
 
+pytestmark = pytest.mark.argon2
+
 FOLDER = Path(__file__).parents[1] / "vectors"
 SIDECAR = json.loads((FOLDER / "sidecar.json").read_text())
 CARRIED = json.loads((FOLDER / "carried.json").read_text())

@@ -21,7 +21,7 @@ from methods.carry.carried import embed, extract
 from viewer.browser import PATIENCE, POSE, PROGRAM, SWITCHES, WEB, Visit, drawn, made, psnr, visit
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")
+pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
 
 KEYS = ("the first key", "ein zweiter Schlüssel")
 CLOSE = 25.0  # dB on the canvas
@@ -119,6 +119,7 @@ def test_published_formats_are_shown(tab: Visit, page_file: Path, tmp_path: Path
     assert psnr(tab.picture(), drawn(read_model(converted), POSE)) > CLOSE
 
 
+@pytest.mark.alone
 def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, page_file: Path) -> None:
     tab.goto(page_file.as_uri())
     # Each as long as those before it or longer; other work on the machine makes single ones longer.

@@ -16,6 +16,7 @@ REVEALED = json.loads((FOLDER / "revealed.json").read_text())
 PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
 
+@pytest.mark.argon2
 @pytest.mark.parametrize("expected", REVEALED, ids=lambda each: f"{each['file']} {each['key']}")
 def test_what_keys_open(expected: dict[str, Any]) -> None:
     with warnings.catch_warnings():
