@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, demo.DemoResult
 def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResult]) -> None:
     out, result = run
     assert {path.name for path in out.iterdir()} == {
-        *("publish", "private", "scenes", "secret.ply", "comparison.png", "key.txt", "index.html"),
+        *("publish", "private", "scenes", "secret.ply", "web.spz", "comparison.png", "key.txt", "index.html"),
     }
     assert result.refused == len(demo.WRONG_KEYS)
     assert result.metrics == read_record(out / "private" / "metrics.json", HideMetrics)
@@ -51,6 +51,11 @@ def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path
     out, _ = run
     verbs.reveal(out / "publish" / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
     assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
+
+
+def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
+    found = verbs.reveal(run[0] / "web.spz", "demo-key-3")
+    assert len(found) == len(verbs.reveal(run[0] / "publish" / "stego.ply", "demo-key-3"))
 
 
 def test_one_seed_gives_the_same_bytes_in_another_place(
