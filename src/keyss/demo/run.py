@@ -88,8 +88,8 @@ def run_demo(
         with results.work():
             revealed = verbs.reveal(out / STEGO, key, device=device)
             refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
-            results.write(writers({WEB: _for_the_web(out, cover, secret, key, device)}))
-            converted = verbs.reveal(out / WEB, key, device=device)
+            there = results.write(writers({WEB: _for_the_web(out, cover, secret, key, device)}))
+            converted = verbs.reveal(there / WEB, key, device=device)
             picture = io.BytesIO()
             comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
             comparison.save(picture, "PNG", optimize=True)
