@@ -28,6 +28,7 @@ from tiny_scenes import random_gaussians, tiny_scene
 CONFIG = LearnedOptions(
     fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
 )
+POINTS = replace(CONFIG, start="points", mask=("op", "sh"), hidden=(16, 16), branch=8, decoder_rate=5e-3)
 # What the paper has, small.
 PAPER = replace(
     PRESETS["paper"], fit=replace(CONFIG.fit, iterations=60), design="standardised", decoder_rate=3e-3
@@ -168,8 +169,7 @@ class _InterruptAt(SilentReporter):
     ("base", "sidecar"),
     [
         (CONFIG, False),
-        (CONFIG, True),
-        (replace(CONFIG, decoder="network", sidecar=True), True),
+        (POINTS, True),
         (PAPER, True),
     ],
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -86,19 +86,6 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
             lambda model: _clusters(model, seed),
         ),
     ]
-
-
-def source_attack(show: Callable[[Gaussians], Mapping[str, Gaussians]]) -> Attack:
-    """The attack of somebody who read the source of the methods: `keyss.methods.base.Method.attacks`.
-
-    `show` gives the same names for every model.
-    """
-    return Attack(
-        "by the source",
-        "What this program's source tells somebody to try.",
-        {},
-        lambda model: iter(show(model).items()),
-    )
 
 
 def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed: int = 0) -> Attack:
