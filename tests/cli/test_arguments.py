@@ -100,9 +100,9 @@ class TestArguments:
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
-        assert keyss(*scenes, "--sidecar", "--key-encoder", "clip", "--clip-model", "C").status == 0
+        assert keyss(*scenes, "--start", "points", "--key-encoder", "clip", "--clip-model", "C").status == 0
         learned = hidden[0][1]["method"]
-        assert (learned.sidecar, learned.key_encoder, learned.clip_model) == (True, "clip", "C")
+        assert (learned.start, learned.key_encoder, learned.clip_model) == ("points", "clip", "C")
         assert keyss(*scenes, "--method", "carry", "--thin", "--dither", "--seed", 5).status == 0
         carry = hidden[1][1]["method"]
         assert (carry.prune_to_fit, carry.dither, carry.fit.seed) == (True, True, 5)

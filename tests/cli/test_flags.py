@@ -25,7 +25,7 @@ QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
     [
         ("`overwrite=True` replaces it", "--overwrite replaces it"),
         ('`method="learned"` can', "--method learned can"),
-        ('`method="learned", sidecar=True` needs none', "--method learned --sidecar needs none"),
+        ('`method="carry", dither=True` has one', "--method carry --dither has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
         ("`decoy=False`", "no --decoy"),

@@ -25,7 +25,6 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
 from keyss.channels.base import Payload  # noqa: E402
 from keyss.channels.low_bits import LOW_BITS  # noqa: E402
-from keyss.channels.sidecar import encrypt_sidecar  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
 from keyss.methods.learned.payload import pack_secret  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
@@ -65,7 +64,7 @@ def derivation() -> dict[str, object]:
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
         costs = (vector["time_cost"], vector["memory_kib"], vector["parallelism"])
         master = hash_secret_raw(key, salt, *costs, 32, Type.ID)
-        for label in ("seal", "low-bits/key"):
+        for label in ("writer", "low-bits/key"):
             expand = HKDFExpand(SHA256(), 32, f"keyss/v1/{label}".encode())
             vector[label] = expand.derive(master).hex()
     return vectors
@@ -77,10 +76,6 @@ def main() -> None:
     sealing["cell"] = cell()
     (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    payload = Payload("learned", b"a payload")
-    sealed = {"key": key, "method": payload.method, "payload": payload.data.hex()}
-    (FOLDER / "sidecar.json").write_text(json.dumps(sealed, indent=1) + "\n")
-    (FOLDER / "sidecar.sealed").write_bytes(encrypt_sidecar([(key, payload)], entropy=bytes(32)))
     secret = trained_like(8, 1, 1)
     secret.means[0, 0] = 1e6  # an outlier
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from keyss.channels.appended import is_appended
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
 from keyss.fitting.image_metrics import subsample_views
@@ -131,11 +132,12 @@ def search_embeddings(
     their mean: what makes some visible and as much of others invisible is a scene in place of a scene, while
     what only adds or only removes is not. With 0 all change counts, which finds a secret that needs more
     Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded: a decoder that
-    divides opacities by their norm over the model sees larger ones then, which are small all the same. Where
-    the decoded opacities have no gradient in the embedding, the random starts come back.
+    divides opacities by their norm over the model sees larger ones then, which are small all the same. What
+    was appended to the model, no decoder changes: it is left out. Where the decoded opacities have no gradient
+    in the embedding, the random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
-    part = stego.detach()
+    part = stego.detach()[~is_appended(stego)]
     if len(part) > most:
         part = part[torch.randperm(len(part), generator=generator)[:most].to(stego.device)]
 
