@@ -31,7 +31,6 @@ from keyss.measure.images import psnr
 from keyss.methods.dither import cost
 from keyss.methods.records import whole
 from keyss.methods.records.encoding import most_visible
-from keyss.methods.records.table import Table
 from keyss.rendering import render
 from keyss.rendering.orbit import scene_of_model
 
@@ -82,8 +81,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data).gaussians
         revealing = time.monotonic() - start
         bits = 8 * room.capacity / len(model)
-        floor = Table.floor(0)
-        most = room.capacity * 8 / (8 * len(whole.encode(kept, floor)) / len(kept)) / len(model)
+        most = room.capacity * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
         in_format = format_.dequantise(format_.quantise(in_morton_order(kept)))
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),

@@ -70,6 +70,17 @@ def test_a_model_without_anything_opens_nothing(cover: Gaussians) -> None:
     assert AppendedReader.of(cover) is None
 
 
+@pytest.mark.parametrize("scale", [1.0, 1.37])
+def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
+    """Few appended ones, whose lattices have to be found among as many others."""
+    cover = lifelike(6000, 3)
+    faint = torch.arange(len(cover)) % 4 == 0
+    cover = replace(cover, opacity_logits=torch.where(faint, -5.5, cover.opacity_logits))
+    for seed in range(4):
+        stego = embed(cover, [(KEY, Payload("file", b"a note"))], entropy=bytes([seed] * 32))
+        assert opened(_turned(scale)(stego)) == b"a note"
+
+
 def test_a_wrong_key_opens_nothing_in_about_the_same_time(stego: Gaussians) -> None:
     reader = AppendedReader.of(stego)
     assert reader is not None

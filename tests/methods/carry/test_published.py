@@ -66,21 +66,21 @@ def test_too_large_secrets_are_refused_or_pruned(publish: str) -> None:
 def test_a_whole_model_comes_back_as_its_records_would() -> None:
     model = model_of(3000, sh_degree=2)
     sizes, costs = [], []
-    for table in (*Table.short(2), Table.floor(2), Table((16, 9, 9, 8, 9, 5, 5))):
-        data = whole.encode(model, table)
+    for bits in (97, whole.USUAL_BITS, 123, whole.MOST_BITS):
+        data = whole.encode(model, whole.Precision.of_size(bits))
         opened = whole.decode(data)
         assert opened.count == len(opened.gaussians) == 3000
         sizes.append(len(data))
         costs.append(cost(model, opened.gaussians))
     assert sizes == sorted(sizes)
     assert costs == sorted(costs)
-    assert costs[0] > 30
-    assert costs[3] > 40
-    assert len(whole.encode(model, Table.floor(2))) * 8 < 3000 * Table.floor(2).total
+    assert costs[0] > 34
+    assert costs[1] > 40
+    assert sizes[1] * 8 < 3000 * Table.floor(2).total
 
 
 def test_damaged_encodings_end_in_an_input_error() -> None:
-    data = whole.encode(model_of(500), Table.floor(1))
+    data = whole.encode(model_of(500))
     generator = torch.Generator().manual_seed(0)
     for cut in (0, 3, 50, 200, len(data) - 1):
         with pytest.raises(InputError):

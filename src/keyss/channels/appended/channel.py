@@ -11,7 +11,7 @@ import hashlib
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -21,16 +21,20 @@ import torch
 from keyss.channels import reed_solomon
 from keyss.channels.appended import packets, pilots
 from keyss.channels.appended.lattice import (
-    INVARIANT_BITS,
     Bits,
     Cube,
+    Doubles,
+    Points,
     Words,
+    all_shifts,
     colours_of,
     in_own_frame,
+    invariants_of,
     is_candidate,
     joined,
-    number,
-    scales_of,
+    likely_shifts,
+    scale_steps,
+    scales_at,
     to_gaussians,
 )
 from keyss.channels.appended.packets import NUMBER_BITS, PACKET_BYTES, Bytes
@@ -47,6 +51,9 @@ _MOST_BLOCKS = min(1 << NUMBER_BITS - _LENGTH_BITS, (1 << NUMBER_BITS) // reed_s
 _LEFT, _DEVIATIONS = 0.72, 4.5
 MOST_BYTES = _MOST_BLOCKS * _MOST_DATA * PACKET_BYTES - OVERHEAD - METHOD_BYTES
 
+# Gaussians in which pilots are counted; places of the lattice that are tried then, which have so many deviations
+# more of them than there are by chance.
+_SAMPLE, _TRIED, _NOT_BY_CHANCE = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
 _OPENS_NOTHING = "this key opens nothing here"
 _NOTICED = (
@@ -102,19 +109,19 @@ class AppendedReader:
         if candidates.sum() < pilots.LEAST // 4:
             return None
         faint = model.detach().to("cpu")[torch.from_numpy(candidates)]
-        means, colours = faint.means.double().numpy(), colours_of(faint)
-        best, own = None, colours
-        for scales in scales_of(faint):
-            invariants = np.concatenate([colours, scales], axis=1)
-            told = number(joined(invariants, np.zeros_like(invariants))[:, :INVARIANT_BITS])
-            found = pilots.read(told, means, np.random.default_rng(0))
-            if found and (best is None or found.agreeing > best.agreeing):
-                best, own = found, invariants
-                if found.agreeing > pilots.SHARE * len(faint) / 2:
-                    break
-        if best is None:
-            return None
-        return AppendedReader(best.salt, joined(own, in_own_frame(faint, best.to_own)))
+        colours, steps = colours_of(faint), scale_steps(faint)
+        few = np.random.default_rng(0).permutation(len(faint))[:_SAMPLE]
+        for shifts in (likely_shifts(steps), _shifts_with_pilots(steps[few], colours[few])):
+            best: tuple[pilots.Found, Points] | None = None
+            for shift in shifts:
+                scales = scales_at(steps, shift)
+                found = pilots.read(invariants_of(colours, scales), faint.means.double().numpy())
+                if found and (best is None or found.agreeing > best[0].agreeing):
+                    best = found, scales
+            if best is not None:
+                found, scales = best
+                return AppendedReader(found.salt, joined(colours, scales, in_own_frame(faint, found.to_own)))
+        return None
 
     def open(self, key: str) -> Payload:
         """What `key` opens. Raises WrongKeyError, and InputError where too much was lost or changed."""
@@ -202,6 +209,16 @@ class _Blocks:
                 )
             decoded[:, block] = data
         return decoded.tobytes()
+
+
+def _shifts_with_pilots(steps: Doubles, colours: Points) -> Iterator[float]:
+    """Of all places where the lattice of log scales may begin those with most pilots among the Gaussians."""
+    shifts = all_shifts(steps)
+    counts = np.array([pilots.count(invariants_of(colours, scales_at(steps, each))) for each in shifts])
+    by_chance = len(steps) / pilots.ONE_IN
+    for index in np.argsort(counts)[::-1][:_TRIED]:
+        if counts[index] > by_chance + _NOT_BY_CHANCE * math.sqrt(by_chance):
+            yield float(shifts[index])
 
 
 def _words(key: DerivedKey, payload: Payload, random: np.random.Generator) -> Bits:

@@ -26,6 +26,7 @@ from keyss.core.similarity import Similarity
 Bits = npt.NDArray[np.uint8]
 Doubles = npt.NDArray[np.float64]
 Words = npt.NDArray[np.uint64]
+Points = npt.NDArray[np.int64]  # of lattices
 
 COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS = 7, 6, 10, 5
 INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
@@ -39,7 +40,7 @@ _SCALE_STEP = 0.08  # the same for log scales
 _LEAST_LOG_SCALE = -9.9  # of `.spz`, whose least is -10
 _SMALL = -9.0  # log scales of the smallest, beside that of the cube
 _TURNS_REACH = 0.5  # x, y and z are below it, so that w is never smaller
-_FURTHER = 2  # shifts of log scales tried beside the likeliest
+_FARTHEST, _MOST_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
 
 
 def is_candidate(model: Gaussians) -> npt.NDArray[np.bool_]:
@@ -104,32 +105,43 @@ def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
     return cube.to_world().apply_gaussians(own)
 
 
-def colours_of(model: Gaussians) -> npt.NDArray[np.int64]:
+def colours_of(model: Gaussians) -> Points:
     """[N, 3] the nearest lattice points of colours."""
     colours = model.sh[:, 0].detach().cpu().double().numpy()
     return _nearest(colours / _COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS)
 
 
-def scales_of(model: Gaussians) -> list[npt.NDArray[np.int64]]:
-    """[N, 3] the nearest lattice points of log scales, by every shift that may be right, the likeliest first.
+def scale_steps(model: Gaussians) -> Doubles:
+    """[N, 3] log scales in steps of their lattice, which lies anywhere: see `likely_shifts`."""
+    return model.log_scales.detach().cpu().double().numpy() / _SCALE_STEP
+
+
+def scales_at(steps: Doubles, shift: float) -> Points:
+    """[N, 3] the nearest lattice points of log scales, of a lattice that begins at `shift`."""
+    return _nearest(steps - shift, SCALE_BITS)
+
+
+def likely_shifts(steps: Doubles) -> list[float]:
+    """Where the lattice may begin if most of the log scales lie on it, the likeliest first.
 
     A model that was scaled has all log scales shifted by one number: the lattice is where they lie.
     """
-    steps = model.log_scales.detach().cpu().double().numpy() / _SCALE_STEP
-    turn = np.exp(2j * np.pi * steps).mean()
-    whole = np.rint(steps - np.angle(turn) / (2 * np.pi)).clip(-1e6, 1e6).astype(np.int64)
-    least, count = int(whole.min()), 2**SCALE_BITS
-    if int(whole.max()) - least >= 1 << 20:
-        centre = int(np.median(whole))
-        least = centre - (1 << 19)
-    found = np.bincount((whole - least).clip(0, 1 << 20).ravel(), minlength=count)
-    inside = np.convolve(found, np.ones(count, np.int64))  # at i: those in the `count` levels up to i
-    best = int(inside.argmax()) - count + 1 + least
-    shifts = sorted(range(best - _FURTHER, best + _FURTHER + 1), key=lambda each: abs(each - best))
-    return [(whole - each).clip(0, count - 1) for each in shifts]
+    phase = float(np.angle(np.exp(2j * np.pi * steps).mean())) / (2 * np.pi)
+    whole = np.rint(steps - phase).clip(-_FARTHEST, _FARTHEST).astype(np.int64)
+    found = np.bincount((whole + _FARTHEST).ravel(), minlength=2 * _FARTHEST)
+    inside = np.convolve(found, np.ones(2**SCALE_BITS, np.int64))  # at i: those in the levels up to i
+    best = int(inside.argmax()) - 2**SCALE_BITS + 1 - _FARTHEST
+    return [best + phase + each for each in (0, 1, -1, 2, -2)]
 
 
-def in_own_frame(model: Gaussians, to_own: Similarity) -> npt.NDArray[np.int64]:
+def all_shifts(steps: Doubles) -> Doubles:
+    """[S] where the lattice may begin if only some of the log scales lie on it."""
+    low, high = np.quantile(steps.clip(-_FARTHEST, _FARTHEST), [0.01, 0.99])
+    most = min(high - 2 ** (SCALE_BITS - 2), low + _MOST_SHIFTS)
+    return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
+
+
+def in_own_frame(model: Gaussians, to_own: Similarity) -> Points:
     """[N, 6] the nearest lattice points of positions and turns; `to_own`: from the world."""
     own = to_own.apply_gaussians(model.with_sh_degree(0))
     positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
@@ -138,11 +150,24 @@ def in_own_frame(model: Gaussians, to_own: Similarity) -> npt.NDArray[np.int64]:
     return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(turns, TURN_BITS)], axis=1)
 
 
-def joined(invariants: npt.NDArray[np.int64], others: npt.NDArray[np.int64]) -> Bits:
-    """[N, WORD_BITS] words of lattice points: colours and scales [N, 6], positions and turns [N, 6]."""
-    widths = [COLOUR_BITS] * 3 + [SCALE_BITS] * 3 + [POSITION_BITS] * 3 + [TURN_BITS] * 3
-    points = np.concatenate([invariants, others], axis=1)
-    return np.concatenate([_bits(points[:, i], width) for i, width in enumerate(widths)], axis=1)
+def joined(colours: Points, scales: Points, others: Points) -> Bits:
+    """[N, WORD_BITS] words of colours and scales [N, 3] and of positions and turns [N, 6]."""
+    parts = [
+        (colours, COLOUR_BITS),
+        (scales, SCALE_BITS),
+        (others[:, :3], POSITION_BITS),
+        (others[:, 3:], TURN_BITS),
+    ]
+    bits = [bits_of(each[:, axis].astype(np.uint64), width) for each, width in parts for axis in range(3)]
+    return np.concatenate(bits, axis=1)
+
+
+def invariants_of(colours: Points, scales: Points) -> Words:
+    """[N] the first INVARIANT_BITS of words of colours and scales [N, 3]."""
+    of_colours = colours @ (1 << COLOUR_BITS * np.arange(3)[::-1])
+    of_scales = scales @ (1 << SCALE_BITS * np.arange(3)[::-1])
+    found: Words = (of_colours << 3 * SCALE_BITS | of_scales).astype(np.uint64)
+    return found
 
 
 def number(bits: Bits) -> Words:
@@ -172,10 +197,6 @@ def _with_largest_w(quats: Doubles) -> Doubles:
     return found
 
 
-def _bits(points: npt.NDArray[np.int64], count: int) -> Bits:
-    return bits_of(points.astype(np.uint64), count)
-
-
 def _split(words: Bits) -> list[Doubles]:
     """Colours, scales, positions and turns [N, 3] each."""
     fields, at = [], 0
@@ -186,5 +207,5 @@ def _split(words: Bits) -> list[Doubles]:
     return fields
 
 
-def _nearest(steps: Doubles, bits: int) -> npt.NDArray[np.int64]:
+def _nearest(steps: Doubles, bits: int) -> Points:
     return np.rint(steps).clip(0, 2**bits - 1).astype(np.int64)

@@ -30,10 +30,10 @@ from keyss.channels.robust.fountain import mixed
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 
-LEAST = 64  # pilots of a model
+LEAST = 128  # pilots of a model
 SHARE = 1 / 16  # of the other appended Gaussians
 _PUBLIC = np.uint64(0x6B65797373_617070)  # what tells this hash from others
-_ONE_IN = np.uint64(63)
+ONE_IN = 64  # words is a pilot by chance
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2
 _RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # beside the part of the salt and its number
 _TRIES, _AGREE = 300, 12  # of three pilots; that have to agree
@@ -75,11 +75,17 @@ def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
     return np.concatenate([bits_of(found, INVARIANT_BITS), others], axis=1)
 
 
-def read(invariants: Words, means: Doubles, random: np.random.Generator) -> Found | None:
+def count(invariants: Words) -> int:
+    """How many of `invariants` [N] are those of pilots."""
+    return int(_is_pilot(invariants).sum())
+
+
+def read(invariants: Words, means: Doubles) -> Found | None:
     """What the pilots among candidates tell: `invariants` [N] as they were read, `means` [N, 3] in the world.
 
     None where too few agree.
     """
+    random = np.random.default_rng(0)
     own = np.flatnonzero(_is_pilot(invariants))
     if len(own) < _AGREE:
         return None
@@ -150,7 +156,7 @@ def _salt(invariants: Words) -> bytes | None:
 
 
 def _is_pilot(invariants: Words) -> npt.NDArray[np.bool_]:
-    pilot: npt.NDArray[np.bool_] = mixed(invariants ^ _PUBLIC) & _ONE_IN == 0
+    pilot: npt.NDArray[np.bool_] = mixed(invariants ^ _PUBLIC) & np.uint64(ONE_IN - 1) == 0
     return pilot
 
 

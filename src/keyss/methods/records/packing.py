@@ -18,8 +18,7 @@ def packed(columns: Iterator[tuple[Codes, int]]) -> Bytes:
     parts = []
     for codes, bits in columns:
         shifts = np.arange(bits - 1, -1, -1, dtype=np.uint32)
-        own = (codes[:, :, None] >> shifts & 1).astype(np.uint8)
-        parts.append(own.reshape(len(codes), bits * codes.shape[1]))
+        parts.append((codes[:, :, None] >> shifts & 1).astype(np.uint8).reshape(len(codes), -1))
     return np.packbits(np.concatenate(parts, axis=1), axis=1)
 
 
@@ -36,5 +35,5 @@ def codes_of_records(records: Bytes, layout: Sequence[tuple[int, int]]) -> list[
         part = np.split(np.unpackbits(records[start : start + CHUNK], axis=1), ends, axis=1)
         for codes, unread, (columns, bits) in zip(found, part, layout, strict=False):
             powers = np.uint32(1) << np.arange(bits, dtype=np.uint32)[::-1]
-            codes[start : start + CHUNK] = unread.reshape(len(unread), columns, bits) @ powers
+            codes[start : start + CHUNK] = unread.reshape(-1, columns, bits) @ powers
     return found

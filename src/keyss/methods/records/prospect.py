@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from keyss.channels.appended import appended_for
 from keyss.channels.rooms import room_in
 from keyss.methods.base import MethodOptions, Outlook, SceneInput
-from keyss.methods.records.table import Table
+from keyss.methods.records.whole import least_bytes
 
-_BITS_OF_COVERS = {"any": 1}  # that a Gaussian has room for in codes or colours, where it is not known yet
-_BITS_IN_CODES = 18
-_PACKED = 0.82  # bits of a record that are left when it is packed
+# Of a Gaussian that is not there yet: room in codes or colours, and what one of a secret takes.
+_BITS_IN_COLOURS, _BITS_IN_CODES, _BITS_OF_SECRETS = 1, 18, 130
 
 
 def outlook_whole(inputs: Sequence[SceneInput], options: MethodOptions) -> Outlook:
@@ -19,19 +18,20 @@ def outlook_whole(inputs: Sequence[SceneInput], options: MethodOptions) -> Outlo
     fit, (cover, *secrets) = options.fit, inputs
     count, *sizes = (fit.max_gaussians if each.model is None else len(each.model) for each in inputs)
     degree = fit.sh_degree if cover.model is None else cover.model.sh_degree
-    bits = [
-        size * _PACKED * Table.short(fit.sh_degree if each.model is None else each.model.sh_degree)[1].total
+    needed = [
+        size * _BITS_OF_SECRETS // 8 if each.model is None else least_bytes(each.model)
         for size, each in zip(sizes, secrets, strict=True)
     ]
     asked = sum(sizes)
     if options.publish == "any" and options.channel == "appended":
-        more = sum(appended_for(int(each / 8)) for each in bits)
+        more = sum(map(appended_for, needed))
         note = f"about {more:,} Gaussians that nobody sees are appended to the cover's {count:,}"
         return Outlook(count + more, degree, asked, asked, notes=(note,))
     if cover.model is None:
-        room, how = count * _BITS_OF_COVERS.get(options.publish, _BITS_IN_CODES) // 8, "about"
+        bits = _BITS_IN_COLOURS if options.publish == "any" else _BITS_IN_CODES
+        room, how = count * bits // 8, "about"
     else:
         room, how = room_in(cover.model, options.publish, options.channel).capacity, "exactly"
     where = "colours" if options.publish == "any" else f"codes of the {options.publish} file"
     note = f"the {where} have room for {how} {room:,} bytes"
-    return Outlook(count, degree, asked, min(asked, int(8 * room * asked / sum(bits))), notes=(note,))
+    return Outlook(count, degree, asked, min(asked, room * asked // sum(needed)), notes=(note,))

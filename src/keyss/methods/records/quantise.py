@@ -31,7 +31,7 @@ from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
 from keyss.methods.records.packing import CHUNK, packed
-from keyss.methods.records.table import BANDS, Table, chroma_bits
+from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
 
 Floats = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint32]
@@ -72,8 +72,6 @@ class Line:
 
     def encode(self, values: Floats, bits: int) -> Codes:
         """Of each value the nearest code; of those beyond the ends the last one."""
-        if bits == 0:
-            return np.zeros(values.shape, np.uint32)
         offset: Floats = values - self.centre
         position: Floats = np.arcsinh(offset / self.spread) if self.spread > 0 else offset
         last = (1 << bits) - 1
@@ -82,8 +80,6 @@ class Line:
 
     def decode(self, codes: Codes, bits: int) -> Floats:
         """The values that codes stand for."""
-        if bits == 0:
-            return np.full(codes.shape, self.centre)
         position = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self.reach
         offset: Floats = np.sinh(position) * self.spread if self.spread > 0 else position
         return offset + self.centre
@@ -196,7 +192,7 @@ class Codec:
             nonlocal unread
             part, unread = np.split(unread, [columns * bits], axis=1)
             powers = np.uint32(1) << np.arange(bits, dtype=np.uint32)[::-1]
-            return part.reshape(len(part), columns, bits) @ powers
+            return part.reshape(-1, columns, bits) @ powers
 
         outlier = codes(1, 1)[:, 0] > 0
 
@@ -213,7 +209,7 @@ class Codec:
         harmonics = []
         for count, bits in zip(BANDS, colours, strict=False):
             brightness = values(count, bits)[:, :, None]
-            differences = values(2 * count, chroma_bits(bits)).reshape(-1, count, 2)
+            differences = values(2 * count, bits - CHROMA_FEWER).reshape(-1, count, 2)
             harmonics.append(np.concatenate([brightness, differences], axis=2) @ OPPONENT)
         sh = np.concatenate(harmonics, axis=1)
         return Gaussians(*(torch.from_numpy(v).float() for v in (positions, turns, sizes, logits, sh)))
@@ -343,7 +339,7 @@ def _numbers(gaussians: Gaussians, table: Table) -> Iterator[_Numbers]:
         harmonics = gaussians.sh[:, band**2 : (band + 1) ** 2].clamp(-_MAX_HARMONIC, _MAX_HARMONIC)
         rotated, kind = _doubles(harmonics) @ OPPONENT.T, _HARMONIC if band > 0 else _COLOUR
         yield _Numbers(rotated[:, :, 0], bits, kind)
-        yield _Numbers(rotated[:, :, 1:].reshape(len(rotated), -1), chroma_bits(bits), kind)
+        yield _Numbers(rotated[:, :, 1:].reshape(len(rotated), -1), bits - CHROMA_FEWER, kind)
 
 
 def _doubles(values: torch.Tensor) -> Floats:

@@ -16,18 +16,12 @@ _NUMBERS = (3, 3, 3, 1, *(3 * count for count in BANDS))
 _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
 
 
-def chroma_bits(bits: int) -> int:
-    """Bits of a difference of colours where the brightness has `bits`."""
-    return max(0, bits - CHROMA_FEWER)
-
-
 @dataclass(frozen=True)
 class Table:
     """Bits of one number of positions, log scales, quaternions and opacity, then of each band of harmonics.
 
     Of harmonics, the constant ones included, these are the bits of the brightness; the two differences of
-    colours have two fewer, or none, for they are a tenth of the energy. Raises ValueError for what no table
-    is.
+    colours have two fewer, for they are a tenth of the energy. Raises ValueError for what no table is.
     """
 
     bits: tuple[int, ...]
@@ -35,30 +29,27 @@ class Table:
     def __post_init__(self) -> None:
         if not 5 <= len(self.bits) <= 8 or not all(1 <= each <= MOST_BITS for each in self.bits):
             raise ValueError(f"bits out of range: {self}")
-        if self.bits[4] <= CHROMA_FEWER:
+        if min(self.bits[4:]) <= CHROMA_FEWER:
             raise ValueError(f"no bits are left for differences of colours: {self}")
 
     @staticmethod
     def floor(sh_degree: int) -> Table:
-        """The smallest table of records in low bits: about 50 dB against the unquantised model."""
+        """The smallest table in use: about 50 dB against the unquantised model."""
         return Table(_FLOOR[: 5 + sh_degree])
 
     @staticmethod
-    def short(sh_degree: int) -> list[Table]:
-        """Shorter ones, for places where every byte is dear, the shortest first: 35 to 50 dB."""
-        constant = len(_FLOOR) - len(BANDS) + 1
-        return [
-            Table((*(each - fewer for each in _FLOOR[:constant]), *[harmonics] * sh_degree))
-            for fewer, harmonics in ((2, 2), (1, 2), (1, 4))
-        ]
+    def short() -> Table:
+        """A still smaller one of SH degree 0, for places where every byte is dear: about 40 dB."""
+        return Table(tuple(each - 2 for each in _FLOOR[:5]))
 
     @staticmethod
-    def of_size(bits: int, sh_degree: int) -> Table | None:
+    def of_size(bits: int, sh_degree: int, least: Table | None = None) -> Table | None:
         """The table for records of at most `bits` that distorts least; None if not even the floor fits.
 
-        Bits are given one by one to the attribute for which one more takes away the most error per bit.
+        Bits are given one by one to the attribute for which one more takes away the most error per bit,
+        beginning with those of `least`, by default the floor.
         """
-        table = Table.floor(sh_degree)
+        table = least or Table.floor(sh_degree)
         while (room := bits - table.total) >= 0:
             given = table.bits
             grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= room and each < MOST_BITS]
@@ -76,8 +67,7 @@ class Table:
     def total(self) -> int:
         """Bits of a record: besides the numbers one for outliers, and two for quaternions."""
         numbers = sum(each * count for each, count in zip(self.bits, _NUMBERS, strict=False))
-        brightness = zip(BANDS, self.bits[4:], strict=False)
-        return 3 + numbers - 2 * sum(count * (bits - chroma_bits(bits)) for count, bits in brightness)
+        return 3 + numbers - 2 * CHROMA_FEWER * sum(BANDS[: self.sh_degree + 1])
 
     @property
     def record_bytes(self) -> int:
