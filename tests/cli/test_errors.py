@@ -184,7 +184,6 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         "leave out --secret-model",
         lambda f: _hide(f, secret=_plain(f, "secret-1"), secret_model=_plain(f, "cover")),
     ),
-    "a missing decoder": (4, "error: nope: expected a file", lambda f: _reveal(f, "--decoder", "nope")),
     "two keys for one secret": (
         2,
         "one --key-file, got 2",

@@ -133,8 +133,8 @@ def search_embeddings(
     what only adds or only removes is not. With 0 all change counts, which finds a secret that needs more
     Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded: a decoder that
     divides opacities by their norm over the model sees larger ones then, which are small all the same. What
-    was appended to the model, no decoder changes: it is left out. Where the decoded opacities have no gradient
-    in the embedding, the random starts come back.
+    was appended to the model, no decoder changes: it is left out. Where the decoded opacities have no
+    gradient in the embedding, the random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
     part = stego.detach()[~is_appended(stego)]
