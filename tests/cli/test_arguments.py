@@ -24,7 +24,7 @@ class TestArguments:
 
         def hide(*args: Any, **kwargs: Any) -> verbs.HideResult:
             calls.append((args, kwargs))
-            return verbs.HideResult(random_gaussians(1), None, METRICS)
+            return verbs.HideResult(random_gaussians(1), METRICS)
 
         monkeypatch.setattr(verbs, "hide", hide)
         return calls

@@ -90,7 +90,7 @@ class WholeMethod:
         rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
         payload = Payload("whole", rows.numpy().tobytes())
         stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])
-        return Stego(stego, None, (self.unpack(payload),), 0.0, details={"floats": rows.numel()})
+        return Stego(stego, (self.unpack(payload),), 0.0, details={"floats": rows.numel()})
 
     def unpack(self, content: Content) -> OpenedWhole:
         assert isinstance(content, Payload)
