@@ -12,6 +12,7 @@ import pytest
 import keyss
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, LearnedOptions, Secret
+from keyss.channels.appended import is_appended
 from keyss.core.errors import Interrupted, OutputError
 from keyss.methods.base import MethodOptions
 from keyss.runs.files import STEGO
@@ -28,8 +29,8 @@ def _hidden(options: MethodOptions) -> Gaussians:
 
 
 def _rotations(model: Gaussians) -> set[bytes]:
-    """Of all that training moved, without the low bits that hiding changes."""
-    bits = model.quats.numpy().view(np.uint32) & ~np.uint32(0xFFF)
+    """Of all that training moved, without the low bits that hiding changes and what it appends."""
+    bits = model[~is_appended(model)].quats.numpy().view(np.uint32) & ~np.uint32(0xFFF)
     start = np.array([1, 0, 0, 0], np.float32).view(np.uint32)
     return {row.tobytes() for row in bits if (row != start).any()}
 
