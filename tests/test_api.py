@@ -86,10 +86,7 @@ def test_metrics_have_their_shape(run: Path) -> None:
     assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim"}
     assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians"}
     assert metrics["photos"] == [True, True]
-    wrong = metrics["wrong_key"]
-    assert wrong["keys"] == 32
-    assert set(wrong["vs_cover"]) == set(wrong["vs_secrets"][0]) == {"mean", "min", "max"}
-    assert wrong["vs_cover"]["min"] <= wrong["vs_cover"]["mean"]
+    assert metrics["wrong_key"] is None  # there is no decoder that a wrong one could be tried on
     assert len(metrics["chance_level"]) == 1
     assert metrics["iterations"] == 60
     assert metrics["width"] == WIDTH
@@ -155,7 +152,7 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
     decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "stego.ply")
     stego = whole[whole.opacities >= 1 / 255]
-    assert len(decoy) == len(stego) < len(whole)
+    assert len(decoy) == len(stego)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
         assert (getattr(decoy, name) != getattr(stego, name)).float().mean() > 0.9, name
     for (_, shown), (_, cover) in zip(

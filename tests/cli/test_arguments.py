@@ -70,7 +70,6 @@ class TestArguments:
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
         assert config.mask == ("sc", "xyz")
         assert config.start == "points"
-        assert config.decoder == "network"
         assert (config.iterations, config.max_gaussians) == (7, 80)
         assert config.fit.evaluate_every == LEARNED_PRESETS["quick"].fit.evaluate_every
         assert options.pop("reporter") is not None
