@@ -1,12 +1,13 @@
 # Every target sets up what it needs in .venv, with the versions in requirements/constraints.txt.
 #   make demo          hide one made-up scene in another and open it again (results in out/demo)
-#   make test          lint, types, import rules and the fast tests
+#   make test          lint, types, import rules and the fast tests, in two processes (JOBS=4: in four)
 #   make lint          ruff (rules and format), mypy, import-linter; `make format` formats
 #   make test-real     one small real scene end to end, from ../shared/data or $KEYSS_TEST_DATA
 #   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
 #   make coverage      the fast tests, and which lines they reach
 #   make docs          the documentation as a site, in site/
+#   make pictures      the pictures of the documents, from the demo
 #   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
 #   make benchmark-baseline     store what the quick benchmark measures as the next baseline
 #   make benchmark-fidelity     what hiding costs (ARGS="--data FOLDER --hide COVER,SECRET ... --write FILE")
@@ -17,6 +18,7 @@
 PYTHON ?= python3
 PIP_EXTRA ?=
 ARGS ?=
+JOBS ?= 2
 
 BIN := .venv/bin
 PACKAGE := .venv/.package
@@ -33,15 +35,17 @@ OLDEST_PIP := $(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-
 OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
 
 FAST := -m "not slow and not cuda and not real"
+# Files go to processes whole, since their tests share what is expensive; what measures time runs alone.
+PARALLEL := -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs venv clean \
+.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs pictures venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
 
 demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest $(FAST) $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
 
 test-real: $(DEV)
 	$(BIN)/python -m pytest -m real $(ARGS)
@@ -59,7 +63,7 @@ test-oldest-quick: $(OLDEST_DEV)
 	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
 
 coverage: $(DEV)
-	$(BIN)/python -m pytest $(FAST) --cov --cov-report=term $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(PARALLEL) --cov --cov-report=term $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check $(PYTHON_CODE)
@@ -73,6 +77,9 @@ format: $(DEV)
 
 docs: $(DEV)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet  # no advertisement of its successor
+
+pictures: $(DEV) demo
+	$(BIN)/python docs/pictures.py out/demo
 
 benchmark-check: $(DEV)
 	$(BIN)/python benchmarks/quick.py --check $(ARGS)

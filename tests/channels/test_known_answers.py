@@ -15,6 +15,8 @@ from keyss.channels.low_bits import LOW_BITS
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files.ply import read_ply
 
+pytestmark = pytest.mark.argon2
+
 FOLDER = Path(__file__).parents[1] / "vectors"
 CARRIED = json.loads((FOLDER / "carried.json").read_text())
 

@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import cheap_keys
 from keyss.cli import commands
 from keyss.fitting.image_metrics import ImageQuality
 from keyss.measure.hiding import BaselineQuality, RenderFidelity
@@ -30,7 +31,7 @@ METRICS = HideMetrics(
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
 COMMANDS = [command.__name__ for command in commands.ALL]
-PROGRAM = [sys.executable, "-m", "keyss"]
+PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def tour(keyss: Callable[..., Said]) -> None:
     small = " ".join(SMALL)
     done("keygen -o key.txt")
     done(f"fit a -o plain {small}")
-    done(f"hide --start points --cover a --secret b --key-file key.txt --min-psnr=0 -o learned {small}")
+    done(f"hide --publish any --cover a --secret b --key-file key.txt --min-psnr=0 -o learned {small}")
     models = "--cover own/cover.ply --secret own/secret.ply --width 16 --device cpu"
     done(f"hide --method carry {models} --key-file key.txt -o carried")
     for run in ("learned", "carried"):

@@ -38,6 +38,8 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.alone
+@pytest.mark.argon2
 @pytest.mark.parametrize("given", [True, False])
 def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> None:
     """Wide bounds: others use the machine, too."""

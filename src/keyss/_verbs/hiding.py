@@ -28,7 +28,7 @@ from keyss.runs.files import CONFIG, METRICS, STEGOS, plain_names, stego_name, w
 from keyss.runs.folder import RunFolder, recorded_seed
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.opening import as_scene, open_in
-from keyss.runs.planning import check_disk
+from keyss.runs.planning import check_disk, plan_hiding, worth_planning
 from keyss.runs.records import record_bytes
 
 MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
@@ -124,6 +124,9 @@ def hide(
         as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
         for source in sources
     ]
+    if reporter and trains and not resume and worth_planning(options.fit):
+        place = folder.path if folder else None
+        reporter.note(f"hide: {plan_hiding(chosen, options, inputs, scenes, target, place)}")
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)

@@ -6,12 +6,13 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
+from keyss.cli.doctor import doctor
 from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
@@ -84,6 +85,22 @@ def demo(
     )
 
 
+def completion(
+    shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="{bash,zsh}", help="Which.")],
+) -> None:
+    """Print what makes a shell complete commands and options.
+
+    bash loads it at its start; zsh looks for a file _keyss in the folders of its fpath.
+
+    example: keyss completion bash >> ~/.bash_completion
+
+    example: keyss completion zsh > ~/.zfunc/_keyss
+    """
+    from keyss.cli.entry import application
+
+    application(["completion"], whole=True).run(["--tyro-print-completion", shell])
+
+
 def version() -> None:
     """Print the version, as `keyss --version` does.
 
@@ -94,5 +111,5 @@ def version() -> None:
 
 ALL = (
     *(keygen, fit, hide, reveal, verify, render, convert),
-    *(evaluate, audit, report, steganalyze, info, demo, version),
+    *(evaluate, audit, report, steganalyze, info, demo, doctor, completion, version),
 )

@@ -25,6 +25,7 @@ from keyss.cli.arguments import (
     Resume,
     Seed,
     SkipMissing,
+    TensorBoard,
     Width,
     optional,
     preset_sizes,
@@ -92,6 +93,7 @@ def hide(
     ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    tensorboard: TensorBoard = False,
     device: Device = "auto",
     seed: Seed = None,
     **own: Any,
@@ -109,9 +111,9 @@ def hide(
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.cli.tensorboard import reporter
     from keyss.core.errors import UsageError
     from keyss.methods import registry
-    from keyss.progress import reporter
     from keyss.rendering.orbit import is_model
     from keyss.runs.files import STEGOS
 
@@ -122,6 +124,7 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
+        unused |= {"--tensorboard": tensorboard}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         _hide_files(cover, secret_file, publish, channel or "colours", key_file, out, overwrite)
@@ -189,7 +192,7 @@ def hide(
         out=out,
         overwrite=overwrite,
         resume=resume,
-        reporter=reporter(),
+        reporter=reporter(out, tensorboard=tensorboard),
     )
     print_hiding(result.metrics)
     how = _HOW[publish == "any"]

@@ -14,6 +14,10 @@ from keyss.files.foreign import what_it_is
 from keyss.files.streams import is_standard
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
+    from numpy.typing import NDArray
     from torch import Tensor
 
     from keyss.core.scene import Scene
@@ -76,6 +80,9 @@ def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
         if path.is_dir():
             return _folder_info(path)
 
+    if path.suffix.lower() == ".ply" and (rows := _ply_rows(path)) is not None:
+        return _table_info(path, *rows)
+
     from keyss.files.models import is_model_path, known_suffixes
 
     if not (is_standard(path) or is_model_path(path)):
@@ -97,6 +104,32 @@ def _folder_info(path: Path) -> RunInfo | SceneInfo:
     if (path / MODEL).exists():
         return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
     return _scene_info(load_scene(path, skip_missing=True))
+
+
+def _ply_rows(path: Path) -> tuple[list[str], NDArray[np.float32]] | None:
+    """Of a model in plain PLY the properties' names and values; None for whatever else has its name."""
+    from keyss.files.ply_rows import is_compressed, read_rows
+
+    with path.open("rb") as file:
+        begins = file.read(3) == b"ply"
+    return read_rows(path) if begins and not is_compressed(path) else None
+
+
+def _table_info(path: Path, names: list[str], rows: NDArray[np.float32]) -> ModelInfo:
+    """Without torch, which takes longer to load than all the rest; other formats are unpacked with it."""
+    import numpy as np
+
+    logits = rows[:, names.index("opacity")]
+    low, high = rows[:, :3].min(axis=0), rows[:, :3].max(axis=0)
+    return ModelInfo(
+        kind="3DGS model",
+        path=str(path),
+        bytes=path.stat().st_size,
+        gaussians=len(rows),
+        sh_degree=round(((len(names) - 11) // 3) ** 0.5) - 1,
+        bounding_box=(_rounded(low), _rounded(high)),
+        nearly_transparent=round(float((logits < np.log(0.05 / 0.95)).mean()), 4),
+    )
 
 
 def _model_info(path: Path) -> ModelInfo:
@@ -128,5 +161,5 @@ def _scene_info(scene: Scene) -> SceneInfo:
     )
 
 
-def _rounded(values: Tensor) -> tuple[float, ...]:
+def _rounded(values: Tensor | Iterable[float]) -> tuple[float, ...]:
     return tuple(round(float(x), 4) for x in values)

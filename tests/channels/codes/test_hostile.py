@@ -41,6 +41,7 @@ def test_random_codes_open_nothing(seed: int, kind: str) -> None:
     assert CodesReader.of(file).extract(key(0)).data == b"data"
 
 
+@pytest.mark.alone
 @EVERY
 def test_mutated_files_open_or_are_refused(suffix: str) -> None:
     format_, rng = FORMATS[suffix], np.random.default_rng(0)

@@ -14,6 +14,8 @@ from keyss.core import errors
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.encryption import decrypt
 
+pytestmark = pytest.mark.argon2
+
 FOLDER = Path(__file__).parents[3] / "tests" / "vectors"
 DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
 SEALING = json.loads((FOLDER / "sealing.json").read_text())

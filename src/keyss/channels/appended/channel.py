@@ -51,8 +51,8 @@ _MOST_BLOCKS = min(1 << NUMBER_BITS - _LENGTH_BITS, (1 << NUMBER_BITS) // reed_s
 _LEFT, _DEVIATIONS = 0.72, 4.5
 MOST_BYTES = _MOST_BLOCKS * _MOST_DATA * PACKET_BYTES - OVERHEAD - METHOD_BYTES
 
-# Gaussians in which pilots are counted; places of the lattice that are tried then, which have so many deviations
-# more of them than there are by chance.
+# Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
+# more of them than by chance.
 _SAMPLE, _TRIED, _NOT_BY_CHANCE = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
 _OPENS_NOTHING = "this key opens nothing here"

@@ -106,6 +106,7 @@ class JointRun:
         for meta, _, _ in drawn:
             meta["means2d"].retain_grad()
         total.backward()
+        self.loss = total.detach()
         self._set_rates()
         for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
             optimizer.step()
