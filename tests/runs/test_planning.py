@@ -21,6 +21,7 @@ FIT = FitConfig(iterations=60, max_gaussians=400, evaluate_every=0, seed=0)
 Usage = namedtuple("Usage", "total used free")
 
 
+@pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
     options = LearnedOptions(fit=FIT, iterations=90, start="points", hidden=(8, 8), branch=8)
