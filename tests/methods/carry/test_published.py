@@ -104,3 +104,12 @@ def test_a_published_file_as_cover_is_taken_as_it_is(publish: str, tmp_path: Pat
     write_model(path, model_of(3000))
     model = read_model(path)
     assert prepare(model, publish).codes == Counted.of(model.codes).codes  # type: ignore[attr-defined]
+
+
+@EVERY
+def test_what_carries_is_the_file_that_would_be_written_without_secrets(publish: str, tmp_path: Path) -> None:
+    model = model_of(3000)[torch.randperm(3000, generator=torch.Generator().manual_seed(0))]
+    path = tmp_path / f"plain{SUFFIXES[publish]}"
+    write_model(path, model)
+    written = read_model(path).codes  # type: ignore[attr-defined]
+    assert prepare(model, publish).codes == Counted.of(written).codes
