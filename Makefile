@@ -6,6 +6,8 @@
 #   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
 #   make coverage      the fast tests, and which lines they reach
+#   make web           build the viewer of web/ into src/keyss/viewer/assets (needs node, which its users do not)
+#   make test-web      the viewer: types, its reader against the vectors, and end to end in headless Chromium
 #   make docs          the documentation as a site, in site/
 #   make pictures      the pictures of the documents, from the demo
 #   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
@@ -27,6 +29,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requi
 PINS := pyproject.toml requirements/constraints.txt
 PYTHON_CODE := src tests benchmarks docs
 
+WEB_MODULES := web/node_modules/.package-lock.json
+
 OLDEST := .venv-oldest
 OLDEST_DEV := $(OLDEST)/.dev
 OLDEST_PIP := $(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check \
@@ -38,7 +42,8 @@ FAST := -m "not slow and not cuda and not real"
 # Files go to processes whole, since their tests share what is expensive; what measures time runs alone.
 PARALLEL := -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs pictures venv clean \
+.PHONY: demo test web test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
+  lint format docs pictures venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
 
 demo: $(PACKAGE)
@@ -61,6 +66,16 @@ test-oldest: $(OLDEST_DEV)
 
 test-oldest-quick: $(OLDEST_DEV)
 	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
+
+web: $(WEB_MODULES)
+	npm --prefix web run --silent build
+
+test-web-units: $(WEB_MODULES)
+	npm --prefix web run --silent check
+	npm --prefix web test
+
+test-web: test-web-units $(DEV)
+	$(BIN)/python -m pytest tests/viewer $(ARGS)
 
 coverage: $(DEV)
 	$(BIN)/python -m pytest $(FAST) $(PARALLEL) --cov --cov-report=term $(ARGS)
@@ -96,7 +111,7 @@ benchmark-rasterizer: $(DEV)
 venv: $(DEV)
 
 clean:
-	rm -rf .venv .venv-oldest out site build dist .coverage
+	rm -rf .venv .venv-oldest web/node_modules out site build dist .coverage
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -104,6 +119,10 @@ clean:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "keyss needs Python 3.11 or newer as \`$(PYTHON)\`; name another with PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(@:/bin/python=)
+
+$(WEB_MODULES): web/package.json web/package-lock.json
+	npm ci --prefix web --no-audit --no-fund --loglevel=error
+	@touch $@
 
 # Without build isolation, so that setuptools has its pinned version too.
 $(PACKAGE): $(PINS) | $(BIN)/python

@@ -30,7 +30,7 @@ METRICS = HideMetrics(
     details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
-COMMANDS = [command.__name__ for command in commands.ALL]
+COMMANDS = [command.__name__.replace("_", "-") for command in commands.ALL]
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 

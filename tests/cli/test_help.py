@@ -40,7 +40,7 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert"]
+        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert", "view", "export-html"]
         judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "doctor"]
         assert [*making, *judging, "completion", "version"] == COMMANDS
 

@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, demo.DemoResult
 def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResult]) -> None:
     out, result = run
     assert {path.name for path in out.iterdir()} == {
-        *("publish", "private", "scenes", "secret.ply", "comparison.png", "key.txt"),
+        *("publish", "private", "scenes", "secret.ply", "comparison.png", "key.txt", "index.html"),
     }
     assert result.refused == len(demo.WRONG_KEYS)
     assert result.metrics == read_record(out / "private" / "metrics.json", HideMetrics)

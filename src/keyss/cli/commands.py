@@ -17,6 +17,7 @@ from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
 from keyss.cli.revealing import reveal, verify
+from keyss.cli.viewing import export_html, view
 
 
 def keygen(
@@ -76,6 +77,7 @@ def demo(
         out,
         {
             "comparison.png": "all of it in one picture: look here first",
+            "index.html": "what would be published, in a browser: type the key there",
             "publish/stego.ply": "what would be published: opens in any 3DGS viewer",
             "secret.ply": "what the key brought back from it",
             "key.txt": "the key of this demo, known to everybody",
@@ -110,6 +112,6 @@ def version() -> None:
 
 
 ALL = (
-    *(keygen, fit, hide, reveal, verify, render, convert),
+    *(keygen, fit, hide, reveal, verify, render, convert, view, export_html),
     *(evaluate, audit, report, steganalyze, info, demo, doctor, completion, version),
 )

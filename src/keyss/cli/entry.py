@@ -81,7 +81,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
     try:
         commands.run(arguments)
     except SystemExit as end:
-        names = [command.__name__ for command in ALL]
+        names = [name_of(command) for command in ALL]
         if end.code not in (None, 0) and (meant := suggestions.meant(arguments, names, flags)):
             print(f"keyss: did you mean {meant}?", file=sys.stderr)
         raise
@@ -112,7 +112,7 @@ def application(arguments: Sequence[str], *, whole: bool = False) -> Application
 
     found: dict[str, Callable[..., None]] = {}
     for command in commands.ALL:
-        name, asked = command.__name__, command
+        name, asked = name_of(command), command
         if command is hide and (whole or name == arguments[0]):
             asked = hide_with_options(arguments)
         elif command is fit and (whole or name == arguments[0]):
@@ -122,6 +122,11 @@ def application(arguments: Sequence[str], *, whole: bool = False) -> Application
     for asked in found.values():
         app.command(asked)
     return Application(found, app)
+
+
+def name_of(command: Callable[..., None]) -> str:
+    """What a command is called on the command line."""
+    return command.__name__.replace("_", "-")
 
 
 def explain(error: BaseException) -> tuple[int, str]:

@@ -26,12 +26,14 @@ from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import STEGO, writers
 from keyss.runs.folder import RunFolder, clear
 from keyss.runs.metrics import HideMetrics
+from keyss.viewer.page import page_with
 
 COVER, SECRET = "tea-table", "golden-knot"
 VIEWS, WIDTH, HEIGHT = 48, 160, 120
 OPTIONS = LearnedOptions(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
+VIEWER = "index.html"
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def run_demo(
     height: int = HEIGHT,
     reporter: Reporter | None = None,
 ) -> DemoResult:
-    """Everything from photos to a comparison picture, in the folder `out`.
+    """Everything from photos to a comparison picture and a page to type the key into, in the folder `out`.
 
     The key is `demo-key-SEED`, known to everybody, and so is the seed: the pictures are to be the same every
     time, and nothing has to stay hidden. On the CPU, one seed gives the same `stego.ply` and
@@ -89,8 +91,9 @@ def run_demo(
             picture = io.BytesIO()
             comparison = _comparison(out / STEGO, revealed, cover, secret, metrics, device)
             comparison.save(picture, "PNG", optimize=True)
+            viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, up="z")
             files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
-            results.write(writers(files))
+            results.write(writers(files | {VIEWER: viewer}))
         return DemoResult(metrics, refused)
     except BaseException as error:
         clear(out)
