@@ -27,7 +27,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["keyss", ""], {*COMMANDS, "-h", "--help"}),
         (["keyss", "re"], {"reveal", "render", "report"}),
         (["keyss", "hide", "--secret"], {"--secret", "--secret-file", "--secret-model"}),
-        (["keyss", "hide", "--sidec"], {"--sidecar"}),
+        (["keyss", "hide", "--start"], {"--start"}),
         (["keyss", "fit", "x", "--preset", ""], set(PRESETS)),
     ],
 )

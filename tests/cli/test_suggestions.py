@@ -31,7 +31,7 @@ def hint(said: Said) -> str:
         (("--quiet", "inof", "x"), "`keyss info`"),
         (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file instead of --keyfile"),
         (("hide", "--cover", "a", "--seckret=b"), "--secret instead of --seckret"),
-        (("hide", "--sidcar", "--cover", "a", "-o", "b"), "--sidecar instead of --sidcar"),
+        (("hide", "--strat", "--cover", "a", "-o", "b"), "--start instead of --strat"),
         (("fit", "a", "--widht", "9", "--overwite"), "--overwrite instead of --overwite, --width"),
         (("hide", "--method", "carry", "--prune-to-fitt"), "--prune-to-fit instead"),
     ],

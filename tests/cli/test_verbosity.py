@@ -70,7 +70,7 @@ class TestEstimate:
 
     def test_of_hide(self, keyss: Run, world: Path, tmp_path: Path) -> None:
         scenes = ("--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt")
-        said = keyss("hide", "--sidecar", *scenes, "-o", tmp_path / "out", *SMALL, "--min-psnr", 0)
+        said = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--min-psnr", 0)
         assert said.status == 0, said.err
         assert re.search(rf"^hide: {self.WORDS}\n", said.err, re.MULTILINE)
 

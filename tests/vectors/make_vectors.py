@@ -33,7 +33,6 @@ from channels.low_bits.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_spz  # noqa: E402
 from keyss.channels.base import Payload  # noqa: E402
 from keyss.channels.low_bits import LOW_BITS  # noqa: E402
-from keyss.channels.sidecar import encrypt_sidecar  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.files import read_model  # noqa: E402
 from keyss.files.formats import compressed_ply, sog, spz  # noqa: E402
@@ -77,7 +76,7 @@ def derivation() -> dict[str, object]:
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
         costs = (vector["time_cost"], vector["memory_kib"], vector["parallelism"])
         master = hash_secret_raw(key, salt, *costs, 32, Type.ID)
-        for label in ("seal", "low-bits/key"):
+        for label in ("writer", "low-bits/key"):
             expand = HKDFExpand(SHA256(), 32, f"keyss/v1/{label}".encode())
             vector[label] = expand.derive(master).hex()
     return vectors
@@ -121,10 +120,6 @@ def main() -> None:
     sealing["cell"] = cell()
     (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    payload = Payload("learned", b"a payload")
-    sealed = {"key": key, "method": payload.method, "payload": payload.data.hex()}
-    (FOLDER / "sidecar.json").write_text(json.dumps(sealed, indent=1) + "\n")
-    (FOLDER / "sidecar.sealed").write_bytes(encrypt_sidecar([(key, payload)], entropy=bytes(32)))
     secret = trained_like(8, 1, 1)
     secret.means[0, 0] = 1e6  # an outlier
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))

@@ -9,7 +9,7 @@ interface Vector {
   time_cost?: number;
   memory_kib?: number;
   parallelism?: number;
-  seal?: string;
+  writer?: string;
   verifier?: string;
   'low-bits/key'?: string;
 }
@@ -23,7 +23,7 @@ function derived(vector: Vector): Promise<Uint8Array> {
 
 test.each(valid)('a key becomes what it becomes in Python: $key', async (vector) => {
   const secret = await derived(vector);
-  for (const label of ['seal', 'verifier', 'low-bits/key'] as const) {
+  for (const label of ['writer', 'verifier', 'low-bits/key'] as const) {
     expect(Buffer.from(expand(secret, label, 32)).toString('hex')).toBe(vector[label]);
   }
 });

@@ -200,7 +200,6 @@ def hide(
         out,
         {
             **dict.fromkeys(STEGOS, f"publish this, {how}: the cover, with the secret in it"),
-            "publish/decoder.sealed": "the encrypted secret: publish it too, or send it to who is to open it",
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
     )

@@ -217,12 +217,12 @@ def convert(
 def info(
     path: Annotated[
         Positional[Path],
-        arg(metavar="FILE", help="A model (- for stdin), a scene folder, a sidecar or a result folder."),
+        arg(metavar="FILE", help="A model (- for stdin), a scene folder or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
 ) -> None:
-    """Tell what is in a model, a scene folder or a sidecar.
+    """Tell what is in a model or a scene folder.
 
     example: keyss info runs/hidden/publish/stego.ply
     """

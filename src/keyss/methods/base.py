@@ -118,9 +118,6 @@ class Opened(Protocol):
     def remains(self, revealed: Gaussians) -> Remains:
         """How much of the secret there is in what `reveal` gave."""
 
-    def check_belongs_to(self, stego: Gaussians) -> None:
-        """Raise InputError if the secret was hidden in another model, as one out of a sidecar may be."""
-
     def fingerprint(self) -> str:
         """16 hexadecimal digits by which a run knows its secrets; they say nothing without the secret."""
 
@@ -130,7 +127,6 @@ class Stego:
     """What hiding gives."""
 
     gaussians: Gaussians  # to be published
-    sidecar: bytes | None  # the encrypted payloads, where they are not in the model
     opened: tuple[Opened, ...]  # the secrets as they come out again with their keys
     seconds: float  # of hiding alone, without plain models
     iterations: int = 0  # of the method's own training
@@ -220,12 +216,6 @@ class Method(Protocol):
 
     def unpack(self, content: Content) -> Opened:
         """The secret that lies in what a channel gave. Raises InputError for damage."""
-
-    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
-        """What somebody without a key, who has read the source of this method, makes of a stego model.
-
-        Models to be rendered in the cover's frame, by the name of the attack; for `keyss audit`.
-        """
 
 
 @contextmanager

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from keyss.channels.base import Content
 from keyss.channels.opening import open_content, quick_attempts
-from keyss.channels.sidecar import decrypt_slots, read_header
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey
 from keyss.methods import hidden_file
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
@@ -36,20 +34,12 @@ def of_options(options: MethodOptions) -> Method:
     raise UsageError(f"expected options of a method ({known}), got {type(options).__name__}")
 
 
-def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, decoy: bool = False) -> Opened:
-    """What `key` opens in a model (see `keyss.channels.opening`), or in a `sidecar`'s bytes.
+def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
+    """What `key` opens in a model (see `keyss.channels.opening`).
 
     With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
     wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
     """
-    if sidecar is not None:
-        derived = DerivedKey(key, read_header(sidecar)[0])
-        try:
-            return _unpacked(decrypt_slots(sidecar, derived))
-        except WrongKeyError:
-            if not decoy:
-                raise
-            return Decoy.of(stego, derived)
     if not decoy:
         return _unpacked(open_content(stego, key))
     for derived, reader in quick_attempts(stego, key):

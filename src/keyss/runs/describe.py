@@ -62,29 +62,8 @@ class SceneInfo:
     background: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class KeyDerivationInfo:
-    """What Argon2id costs."""
-
-    function: str
-    memory_kib: int
-    time_cost: int
-    parallelism: int
-
-
-@dataclass(frozen=True)
-class SidecarInfo:
-    """A sidecar; it does not tell how many secrets there are."""
-
-    kind: str
-    path: str
-    bytes: int
-    key_derivation: KeyDerivationInfo
-
-
-def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    """What is in a model, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
-    InputError.
+def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
+    """What is in a model, "-" for standard input, a scene folder or a folder of results. Raises InputError.
 
     Photos that a scene names but that are not there are left out, with a KeyssWarning.
     """
@@ -94,7 +73,7 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
+def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     if not is_standard(path):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
@@ -104,9 +83,14 @@ def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
     if path.suffix.lower() == ".ply" and (rows := _ply_rows(path)) is not None:
         return _table_info(path, *rows)
 
-    from keyss.files.models import is_model_path
+    from keyss.files.models import is_model_path, known_suffixes
 
-    return _model_info(path) if is_standard(path) or is_model_path(path) else _sidecar_info(path)
+    if not (is_standard(path) or is_model_path(path)):
+        raise InputError(
+            f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
+            f"{what_it_is(path)}"
+        )
+    return _model_info(path)
 
 
 def _folder_info(path: Path) -> RunInfo | SceneInfo:
@@ -120,26 +104,6 @@ def _folder_info(path: Path) -> RunInfo | SceneInfo:
     if (path / MODEL).exists():
         return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
     return _scene_info(load_scene(path, skip_missing=True))
-
-
-def _sidecar_info(path: Path) -> SidecarInfo:
-    from keyss.channels.sidecar import MAGIC, read_header
-    from keyss.files.models import known_suffixes
-    from keyss.runs.opening import read_sidecar
-
-    with path.open("rb") as file:
-        start = file.read(len(MAGIC))
-    if start != MAGIC:
-        raise InputError(
-            f"{path}: expected a model ({known_suffixes()}), a sidecar, a scene folder or a result "
-            f"folder, found {what_it_is(path)}"
-        )
-    try:
-        costs, _, _ = read_header(read_sidecar(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    derivation = KeyDerivationInfo("Argon2id", costs.memory_kib, costs.time_cost, costs.parallelism)
-    return SidecarInfo("sidecar", str(path), path.stat().st_size, derivation)
 
 
 def _ply_rows(path: Path) -> tuple[list[str], NDArray[np.float32]] | None:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
@@ -32,6 +33,7 @@ INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
 WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + TURN_BITS)
 
 _OPACITY = 1.1 * DRAWN_OPACITY
+_LOGIT = math.log(_OPACITY / (1 - _OPACITY))
 _FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # after rounding
 _COLOUR_STEP = 0.0275  # twice what formats move constant colours by, and a little
 _SCALE_STEP = 0.08  # the same for log scales
@@ -48,6 +50,14 @@ def is_candidate(model: Gaussians) -> npt.NDArray[np.bool_]:
     for values in (model.means, model.quats, model.log_scales, model.sh):
         found &= np.isfinite(values.detach().cpu().numpy()).reshape(len(found), -1).all(axis=1)
     return found
+
+
+def is_appended(model: Gaussians) -> Tensor:
+    """[N] which Gaussians were appended to a model that no format has rounded since.
+
+    They have one opacity, which others have to the last bit by chance only: once in millions.
+    """
+    return model.opacity_logits == float(np.float32(_LOGIT))
 
 
 @dataclass(frozen=True)
@@ -89,7 +99,7 @@ def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
     w = np.sqrt(1 - np.square(parts).sum(axis=1, keepdims=True))
     sh = np.zeros((len(words), (sh_degree + 1) ** 2, 3))
     sh[:, 0] = colours
-    logits = np.full(len(words), math.log(_OPACITY / (1 - _OPACITY)))
+    logits = np.full(len(words), _LOGIT)
     numbers = (positions, np.concatenate([w, parts], axis=1), scales, logits, sh)
     own = Gaussians(*(torch.from_numpy(each).float() for each in numbers))
     return cube.to_world().apply_gaussians(own)

@@ -27,12 +27,11 @@ from keyss.methods.records.encoding import (
 )
 from keyss.methods.records.prospect import outlook_whole
 
-_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned", sidecar=True` has room'
-_LEARNED = '`method="learned"` needs no low bits of the cover'
-_SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
-_DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
+_PRUNE = '`prune_to_fit=True` leaves out the least visible, `publish="any"` has room'
+_ANY = '`publish="any"` needs no low bits of the cover'
+_DITHER = f"`dither=True` gives it new low bits, {_ANY}"
 _DITHER_AND_PRUNE = (
-    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
+    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_ANY}"
 )
 _PRUNE_OR_PLY = '`prune_to_fit=True` leaves out what is seen least, `publish="ply"` has more room'
 
@@ -111,22 +110,18 @@ class CarryMethod:
             with advising(UsageError, _PRUNE_OR_PLY):
                 written = embed_whole(room, keys, models, prune=options.prune_to_fit)
             seconds = time.monotonic() - start
-            return Stego(written.stego, None, written.opened, seconds, details=written.details)
+            return Stego(written.stego, written.opened, seconds, details=written.details)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
-        with advising(InputError, _LEARNED if options.dither else _DITHER):
+        with advising(InputError, _ANY if options.dither else _DITHER):
             prepared = _prepared(cover.model, options)
         counts = _counts(prepared, models, options)
         found = embed_models(prepared, keys, models, counts, NAME)
         seconds = time.monotonic() - start
-        return Stego(found.stego, None, found.opened, seconds, details=found.details(cover.model))
+        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model))
 
     def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""
         return unpack_records(content)
-
-    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
-        """None: without a key, low bits that carry something are as random as any."""
-        return {}
 
 
 def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
@@ -162,11 +157,11 @@ def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
 def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
     """What works for a cover whose low bits are not random."""
     if options.dither:
-        return _LEARNED
+        return _ANY
     try:
         prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))  # all: a sample shows few duplicates
     except InputError:
-        return _LEARNED
+        return _ANY
     fits = not requests or sum(each.count for each in requests) <= prepared.record_capacity(requests)
     return _DITHER if fits else _DITHER_AND_PRUNE
 
@@ -176,7 +171,7 @@ def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryO
 
     Raises UsageError if they do not fit.
     """
-    with advising(UsageError, _SIDECAR):
+    with advising(UsageError, _ANY):
         kept = subsampled_counts(prepared, models)  # refuses where pruning would not help either
     if options.prune_to_fit:
         return kept

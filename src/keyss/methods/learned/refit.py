@@ -2,7 +2,7 @@
 
 Where the published file keeps every bit, no Gaussian needs to serve two scenes. The cover is its plain model,
 so that nothing tells the file from a plain one but what low bits tell. Of a secret's plain model the
-Gaussians that contribute most are trained on, for as long as a joint training would, and carried as records.
+Gaussians that contribute most are trained on, for as long as the plain model was, and carried as records.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from typing import Any
 from keyss.channels.low_bits import LowBitsCover
 from keyss.channels.rooms import Room, room_in
 from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import refit_model
 from keyss.keys import DerivedKey
 from keyss.methods.base import Context, KeyedSource, Source, Stego
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.room import of_degree, prepared_cover, record_degree, secret_sizes
-from keyss.methods.learned.start import most_contributing
 from keyss.methods.records import whole
 from keyss.methods.records.embedding import (
     Embedded,
@@ -30,7 +31,9 @@ from keyss.methods.records.embedding import (
     shares_of,
 )
 from keyss.methods.records.encoding import subsampled_counts
+from keyss.rendering.contributions import contributions
 
+SELECTION_VIEWS = 64
 _FITTING = 0.97  # of the Gaussians that fit before they are trained on: packed, they get longer or shorter
 
 
@@ -75,7 +78,7 @@ def hide_refitted(
         seconds += found.seconds
     entropy = _entropy(b"embed", secret_of_writer, *map(_bytes, models))
     embedded, details = place.embed([each.key for each in secrets], models, entropy)
-    return Stego(embedded.stego, None, embedded.opened, seconds, fit.iterations, details)
+    return Stego(embedded.stego, embedded.opened, seconds, fit.iterations, details)
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,14 @@ class _Whole:
     ) -> tuple[EmbeddedWhole, dict[str, Any]]:
         found = embed_whole(self.room, keys, models, prune=True, entropy=entropy)
         return found, found.details
+
+
+def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
+    """The `count` Gaussians that add most to what the training views show, in their order."""
+    if count >= len(plain):
+        return plain
+    cameras = [view.camera for view in subsample_views(scene.train, SELECTION_VIEWS)]
+    return plain[contributions(plain, cameras).topk(count).indices.sort().values]
 
 
 def _bytes(model: Gaussians) -> bytes:
