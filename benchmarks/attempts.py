@@ -61,9 +61,7 @@ def main() -> None:
             )
             _compare(
                 f"reveal --decoy, {name}",
-                lambda key: keyss.reveal(
-                    path, key, decoy=True, out=Path(folder) / "out.ply", overwrite=True
-                ),
+                lambda key: keyss.reveal(path, key, decoy=True, out=Path(folder) / "out.ply", overwrite=True),
                 right,
                 wrong,
                 asked.rounds,

@@ -80,7 +80,7 @@ def demo(
             "index.html": "what would be published, in a browser: type the key there",
             "publish/stego.ply": "what would be published: opens in any 3DGS viewer",
             "secret.ply": "what the key brought back from it",
-            "web.spz": "the same for the web: hidden to survive conversion, and converted; the key opens it too",
+            "web.spz": "both for the web: hidden to survive conversion, and converted",
             "key.txt": "the key of this demo, known to everybody",
             "scenes": "the photos",
             "private/metrics.json": "the numbers",
