@@ -1,12 +1,15 @@
 # Every target sets up what it needs in .venv, with the versions in requirements/constraints.txt.
 #   make demo          hide one made-up scene in another and open it again (results in out/demo)
-#   make test          lint, types, import rules and the fast tests
+#   make test          lint, types, import rules and the fast tests, in two processes (JOBS=4: in four)
 #   make lint          ruff (rules and format), mypy, import-linter; `make format` formats
 #   make test-real     one small real scene end to end, from ../shared/data or $KEYSS_TEST_DATA
 #   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
 #   make coverage      the fast tests, and which lines they reach
+#   make web           build the viewer of web/ into src/keyss/viewer/assets (needs node, which its users do not)
+#   make test-web      the viewer: types, its reader against the vectors, and end to end in headless Chromium
 #   make docs          the documentation as a site, in site/
+#   make pictures      the pictures of the documents, from the demo
 #   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
 #   make benchmark-baseline     store what the quick benchmark measures as the next baseline
 #   make benchmark-fidelity     what hiding costs (ARGS="--data FOLDER --hide COVER,SECRET ... --write FILE")
@@ -17,6 +20,7 @@
 PYTHON ?= python3
 PIP_EXTRA ?=
 ARGS ?=
+JOBS ?= 2
 
 BIN := .venv/bin
 PACKAGE := .venv/.package
@@ -24,6 +28,8 @@ DEV := .venv/.dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt $(PIP_EXTRA)
 PINS := pyproject.toml requirements/constraints.txt
 PYTHON_CODE := src tests benchmarks docs
+
+WEB_MODULES := web/node_modules/.package-lock.json
 
 OLDEST := .venv-oldest
 OLDEST_DEV := $(OLDEST)/.dev
@@ -33,15 +39,18 @@ OLDEST_PIP := $(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-
 OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
 
 FAST := -m "not slow and not cuda and not real"
+# Files go to processes whole, since their tests share what is expensive; what measures time runs alone.
+PARALLEL := -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-real test-slow test-cuda test-oldest test-oldest-quick coverage lint format docs venv clean \
+.PHONY: demo test web test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
+  lint format docs pictures venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
 
 demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest $(FAST) $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
 
 test-real: $(DEV)
 	$(BIN)/python -m pytest -m real $(ARGS)
@@ -58,8 +67,18 @@ test-oldest: $(OLDEST_DEV)
 test-oldest-quick: $(OLDEST_DEV)
 	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
 
+web: $(WEB_MODULES)
+	npm --prefix web run --silent build
+
+test-web-units: $(WEB_MODULES)
+	npm --prefix web run --silent check
+	npm --prefix web test
+
+test-web: test-web-units $(DEV)
+	$(BIN)/python -m pytest tests/viewer $(ARGS)
+
 coverage: $(DEV)
-	$(BIN)/python -m pytest $(FAST) --cov --cov-report=term $(ARGS)
+	$(BIN)/python -m pytest $(FAST) $(PARALLEL) --cov --cov-report=term $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check $(PYTHON_CODE)
@@ -73,6 +92,9 @@ format: $(DEV)
 
 docs: $(DEV)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet  # no advertisement of its successor
+
+pictures: $(DEV) demo
+	$(BIN)/python docs/pictures.py out/demo
 
 benchmark-check: $(DEV)
 	$(BIN)/python benchmarks/quick.py --check $(ARGS)
@@ -89,7 +111,7 @@ benchmark-rasterizer: $(DEV)
 venv: $(DEV)
 
 clean:
-	rm -rf .venv .venv-oldest out site build dist .coverage
+	rm -rf .venv .venv-oldest web/node_modules out site build dist .coverage
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -97,6 +119,10 @@ clean:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "keyss needs Python 3.11 or newer as \`$(PYTHON)\`; name another with PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(@:/bin/python=)
+
+$(WEB_MODULES): web/package.json web/package-lock.json
+	npm ci --prefix web --no-audit --no-fund --loglevel=error
+	@touch $@
 
 # Without build isolation, so that setuptools has its pinned version too.
 $(PACKAGE): $(PINS) | $(BIN)/python

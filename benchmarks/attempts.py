@@ -24,9 +24,9 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
+from keyss.channels import appended
 from keyss.channels.base import Payload
 from keyss.channels.low_bits import LOW_BITS
-from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -50,29 +50,27 @@ def main() -> None:
     anchors = choose_anchors(plain, generator)
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
     contents = [(right, Payload("learned", pack_secret(secret)))]
-    stego, sidecar = LOW_BITS.prepare(plain).embed(contents), encrypt_sidecar(contents)
+    files = {"low bits": LOW_BITS.prepare(plain).embed(contents), "appended": appended.embed(plain, contents)}
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
-        path, beside = Path(folder) / "stego.ply", Path(folder) / "elsewhere.sealed"
-        write_model(path, stego)
-        beside.write_bytes(sidecar)
-        _compare("open, one file", lambda key: _attempt(stego, key, None), right, wrong, asked.rounds)
-        _compare("open, sidecar", lambda key: _attempt(stego, key, sidecar), right, wrong, asked.rounds)
-        for name, source in (("reveal --decoy, one file", None), ("reveal --decoy, sidecar", beside)):
+        path = Path(folder) / "stego.ply"
+        for name, stego in files.items():
+            write_model(path, stego)
             _compare(
-                name,
-                lambda key, source=source: keyss.reveal(
-                    path, key, decoder=source, decoy=True, out=Path(folder) / "out.ply", overwrite=True
-                ),
+                f"open, {name}", lambda key, stego=stego: _attempt(stego, key), right, wrong, asked.rounds
+            )
+            _compare(
+                f"reveal --decoy, {name}",
+                lambda key: keyss.reveal(path, key, decoy=True, out=Path(folder) / "out.ply", overwrite=True),
                 right,
                 wrong,
                 asked.rounds,
             )
 
 
-def _attempt(stego: Gaussians, key: str, sidecar: bytes | None) -> None:
+def _attempt(stego: Gaussians, key: str) -> None:
     with suppress(WrongKeyError):
-        open_model(stego, key, sidecar=sidecar)
+        open_model(stego, key)
 
 
 def _compare(name: str, attempt: Callable[[str], object], right: str, wrong: str, rounds: int) -> None:

@@ -1,6 +1,12 @@
-"""What carrying in the codes of published files costs and holds: the table of docs/codes.md.
+"""What carrying in the codes of published files costs and holds: the tables of docs/codes.md.
 
     python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/codes.md
+    python benchmarks/codes.py --attributes bonsai=cover.ply
+    python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
+    python benchmarks/stealth.py --quick --pairs $(cat FOLDER/pairs)
+
+The second gives the cost of each attribute alone; the third writes of each model an untouched file and one
+nine tenths full, and lists them for the fourth, which tells how well they are told apart.
 
 Each `--pair` names a folder of photos in `--data` and a model of it for the cover, then for the secret (a
 folder that is not there: pictures of the model itself are taken). The secret is as large as fits, and at most
@@ -10,29 +16,30 @@ a sixth of the cover's Gaussians, of SH degree 0. Costs are against the untouche
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import torch
 
 from keyss.channels.base import Payload
 from keyss.channels.codes import CodesCover, CodesReader
 from keyss.channels.codes.fields import format_of
-from keyss.channels.codes.published import coded, prepare
+from keyss.channels.codes.published import SUFFIXES, coded, prepare
 from keyss.core import Gaussians, Scene
 from keyss.files.atomic import write_bytes
 from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import in_morton_order
-from keyss.files.models import read_model
+from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.measure.images import psnr
 from keyss.methods.dither import cost
 from keyss.methods.records import whole
-from keyss.methods.records.embedding import ENCRYPTION_BYTES
 from keyss.methods.records.encoding import most_visible
-from keyss.methods.records.table import Table
 from keyss.rendering import render
 from keyss.rendering.orbit import scene_of_model
 
@@ -75,7 +82,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         untouched = format_.dequantise(format_.quantise(model))
         start = time.monotonic()
         room: CodesCover = prepare(cover[1], name)
-        kept, encoded = whole.fitted(own, room.capacity * 1023 // 1024 - ENCRYPTION_BYTES, prune=True)
+        kept, encoded = whole.fitted(own, room.capacity * 1023 // 1024 - 128, prune=True)
         stego = coded(room.embed([(KEY, Payload("carry", encoded))]))
         file = format_.serialise(stego.codes)
         hiding = time.monotonic() - start
@@ -83,8 +90,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data).gaussians
         revealing = time.monotonic() - start
         bits = 8 * room.capacity / len(model)
-        floor = Table.floor(0).total
-        most = room.capacity * 8 / (8 * len(whole.encode(kept, floor)) / len(kept)) / len(model)
+        most = room.capacity * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
         in_format = format_.dequantise(format_.quantise(in_morton_order(kept)))
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
@@ -99,13 +105,59 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
     return found
 
 
+def attributes(name: str, model: Gaussians) -> None:
+    """What each attribute costs alone: PSNR in dB against the untouched file, and bits of a Gaussian."""
+    for format_name in FORMATS:
+        cover = prepare(model, format_name)
+        untouched = coded(cover.codes)
+        written = coded(cover.embed([(KEY, Payload("carry", b""))]))
+        found = [f"all {cost(untouched, written):.1f} dB"]
+        for attribute in dict.fromkeys(each.name for each in cover.fields):
+            own = [each.name == attribute for each in cover.fields]
+            free = [each & one for each, one in zip(cover.free, own, strict=True)]
+            bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
+            # Others may not change: too few are free to hold anything, so the bits that are get noise.
+            noise = np.random.default_rng(0).integers(0, 2, cover.room.bits).astype(np.uint8)
+            changed = coded(replace(cover, free=free)._written(noise, os.urandom(32)))
+            found.append(f"{attribute} {bits:.1f} bits {cost(untouched, changed):.1f} dB")
+        print(f"{name}, {format_name}: {', '.join(found)}", flush=True)
+
+
+def files(folder: Path, format_name: str, models: list[str]) -> None:
+    """Write pairs of files, and in the file `pairs` what benchmarks/stealth.py is told of them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for each in models:
+        scene, _, path = each.partition("=")
+        cover = prepare(read_model(path), format_name)
+        plain, stego = (
+            folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
+        )
+        payload = Payload("carry", os.urandom(cover.capacity * 9 // 10))
+        write_model(plain, read_model(path))
+        write_model(stego, coded(cover.embed([(KEY, payload)])))
+        found.append(f"{scene}={plain}:{stego}")
+    (folder / "pairs").write_text("\n".join(found))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--pair", action="append", required=True, metavar="NAME=FILE,NAME=FILE")
+    parser.add_argument("models", nargs="*", metavar="SCENE=FILE", help="for --files")
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--pair", action="append", default=[], metavar="NAME=FILE,NAME=FILE")
+    parser.add_argument("--attributes", action="append", default=[], metavar="NAME=FILE")
+    parser.add_argument("--files", type=Path, metavar="FOLDER")
+    parser.add_argument("--format", choices=tuple(FORMATS), default="spz")
     parser.add_argument("--width", type=int, default=200, help="of pictures, in pixels")
     parser.add_argument("--write", type=Path, help="page that gets the table between its two marks")
     arguments = parser.parse_args()
+    for each in arguments.attributes:
+        name, _, path = each.partition("=")
+        attributes(name, read_model(path))
+    if arguments.files:
+        files(arguments.files, arguments.format, arguments.models)
+    if not arguments.pair:
+        return
     table = [HEAD]
     for pair in arguments.pair:
         cover, secret = (part.partition("=")[::2] for part in pair.split(","))

@@ -109,7 +109,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
     if (out / "fidelity.json").exists():
         found: dict[str, Any] = json.loads((out / "fidelity.json").read_text())
         return found
-    config = schedule(PRESETS[preset], settings, seed).adapted(sidecar=preset in ("paper", "released"))
+    config = schedule(PRESETS[preset], settings, seed)
     models = [baseline(data, name, work, settings, seed) for name in names]
     keys = [KEY.format(index) for index in range(1, len(names))]
     watch = Watch()
@@ -134,7 +134,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
         "metrics": msgspec.to_builtins(metrics),
         "history": watch.history,
         "near": near_and_wrong(out, keys, scenes, seed),
-        "cost": None if config.in_records else step_cost(scenes, models, config),
+        "cost": None if config.start == "warm" else step_cost(scenes, models, config),
     }
     write_bytes(out / "fidelity.json", json.dumps(result, indent=1).encode())
     return result
@@ -143,16 +143,14 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
 def near_and_wrong(out: Path, keys: Sequence[str], scenes: Sequence[Scene], seed: int) -> dict[str, Any]:
     """What near and random keys show to somebody who holds the decoders, and how many the files refuse."""
     stego = read_model(out / "publish" / "stego.ply")
-    beside = out / "publish" / "decoder.sealed"
-    sidecar = beside.read_bytes() if beside.exists() else None
-    opened = [registry.open_model(stego, key, sidecar=sidecar) for key in keys]
+    opened = [registry.open_model(stego, key) for key in keys]
     derivation = KeyDerivation(salt=training_salt(scenes[0], seed))
     near = [other for key in keys for other in near_keys(key)]
     embeddings = torch.stack([DerivedKey(key, derivation).embedding() for key in near])
     refused = 0
     for key in near:
         try:
-            registry.open_model(stego, key, sidecar=sidecar)
+            registry.open_model(stego, key)
         except WrongKeyError:
             refused += 1
     wrong = random_embeddings(WRONG_KEYS, torch.Generator().manual_seed(seed + 1))

@@ -9,6 +9,8 @@ import pytest
 from hypothesis import settings
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
+from alone import pytest_runtest_protocol  # noqa: F401  hook
+from cheap_keys import pytest_runtest_setup, pytest_sessionstart  # noqa: F401  hooks
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 # What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made

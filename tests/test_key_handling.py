@@ -13,9 +13,9 @@ from typing import get_args, get_type_hints
 
 import pytest
 
+from channels.low_bits.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.channels.base import Payload
-from keyss.channels.sidecar import decrypt_sidecar, encrypt_sidecar
+from keyss.channels.low_bits import LOW_BITS
 from keyss.cli import commands, main
 from keyss.cli.hiding import hide_with_options
 from keyss.core.errors import KeyssError
@@ -70,7 +70,7 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     monkeypatch.setattr("sys.stdin", io.StringIO())
     run, key = folder / "run", ["--key-file", str(folder / "key.txt")]
     (folder / "key.txt").chmod(0o644)  # so that there is a warning to look at
-    scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--sidecar", "-o", str(run)]
+    scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
     size = ["--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu"]
     with monkeypatch.context() as patch:
         patch.setattr("keyss.progress.reporter", _CtrlC)
@@ -88,9 +88,9 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     assert main(["reveal", stego, *key, "-o", str(folder / "secret.ply")]) == 0
     assert main(["evaluate", str(run), *key, "--wrong-keys", "2"]) == 0
     assert main(["reveal", str(run / "private" / "cover.ply"), *key, "-o", str(folder / "no.ply")]) == 3
-    assert main(["info", str(run / "publish" / "decoder.sealed")]) == 0
+    assert main(["info", stego]) == 0
     written = list(_files(folder))
-    assert {"stego.ply", "decoder.sealed", "config.json", "metrics.json"} <= {path.name for path in written}
+    assert {"stego.ply", "config.json", "metrics.json"} <= {path.name for path in written}
     assert [path for path in written if _spelt(path.read_bytes())] == []
     said = capsys.readouterr()
     assert "others can read this key file" in said.err
@@ -108,7 +108,7 @@ def test_no_command_takes_a_key_as_an_argument() -> None:
 def test_errors_and_representations_do_not_show_the_key() -> None:
     derived = DerivedKey(KEY, KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8192, parallelism=1))
     assert KEY not in repr(derived)
-    assert derived.expand("seal", 32).hex() not in repr(derived)
+    assert derived.expand("writer", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
-        decrypt_sidecar(encrypt_sidecar([("another", Payload("test", b"x"))]), KEY)
+        LOW_BITS.extract(trained_like(50), KEY)
     assert not _spelt(str(caught.value).encode())

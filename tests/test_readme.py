@@ -20,8 +20,8 @@ def test_the_python_example_runs(
     assert len(example.splitlines()) <= 28
     short = example.replace("max_gaussians=20_000", "max_gaussians=100, iterations=10")
     assert short != example
-    short = short.replace("LearnedOptions()", "LearnedOptions(sidecar=True)")  # so small a model has no room
-    assert "sidecar" in short
+    short = short.replace("LearnedOptions()", 'LearnedOptions(publish="any")')  # so small a model has no room
+    assert "any" in short
     write_blender(tmp_path / "scenes" / "bonsai", count=2)
     write_nerfstudio(tmp_path / "scenes" / "fox")
     monkeypatch.chdir(tmp_path)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from keyss._verbs.asking import Secret
     from keyss._verbs.converting import Conversion, convert
     from keyss._verbs.filing import HideFilesResult, SecretFile, hide_files, reveal_file
+    from keyss._verbs.filming import render_video
     from keyss._verbs.fitting import fit
     from keyss._verbs.hiding import HideResult, hide
     from keyss._verbs.looking import evaluate, render
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from keyss.report.page import write_report
 
 __all__ = ["Conversion", "HideResult", "Secret", "audit", "convert", "evaluate", "fit", "hide", "plan"]
-__all__ += ["render", "reveal", "reveal_counted", "verify", "write_report"]
+__all__ += ["render", "render_video", "reveal", "reveal_counted", "verify", "write_report"]
 __all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
 
 _HOMES = {
@@ -37,6 +38,7 @@ _HOMES = {
     "hide_files": "_verbs.filing",
     "plan": "_verbs.planning",
     "render": "_verbs.looking",
+    "render_video": "_verbs.filming",
     "reveal": "_verbs.opening",
     "reveal_counted": "_verbs.opening",
     "reveal_file": "_verbs.filing",

@@ -9,10 +9,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
 from rich.table import Column
 
+level = 0  # -1 says nothing, 1 more often; set by the command line
+
 
 def reporter(console: Console | None = None) -> ProgressLines:
     """For the standard error stream, or `console`."""
-    return ProgressLines(console or Console(stderr=True))
+    console = console or Console(stderr=True, quiet=level < 0)
+    return ProgressLines(console, None if level < 1 or console.is_terminal else 1.0)
 
 
 class ProgressLines:
@@ -22,6 +25,8 @@ class ProgressLines:
     seconds, by default 0.25 and 10. It draws from `update`: no thread that training would share its cores
     with.
     """
+
+    loss_every = 0
 
     def __init__(
         self, console: Console, every: float | None = None, timer: Callable[[], float] = time.monotonic
@@ -68,6 +73,9 @@ class ProgressLines:
         if not self.live:
             self._say(f"{task.description}: {iteration}/{task.total}, {facts}")
 
+    def note(self, line: str) -> None:
+        self._say(line)
+
     def finish(self) -> None:
         task, self.task = self.task, None
         if task is None:
@@ -81,6 +89,13 @@ class ProgressLines:
 
     def _say(self, line: str) -> None:
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def about(seconds: float) -> str:
+    """As precise as an estimate is."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def clock(seconds: float) -> str:

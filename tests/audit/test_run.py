@@ -23,7 +23,7 @@ from keyss.core import InputError, OutputError, UsageError, WrongKeyError
 from keyss.fitting.loop import Interrupted
 from keyss.measure.speed import FileSize, SpeedResult
 from keyss.runs.audit_record import Audit, LeaksResult, read_audit
-from test_api import SIDECAR, write_nerfstudio
+from test_api import ANY, write_nerfstudio
 from tiny_scenes import tiny_scene
 
 KEY = "open sesame 4711"
@@ -33,7 +33,7 @@ KEY = "open sesame 4711"
 def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("audit")
     cover, secret = (write_nerfstudio(root / name, tiny_scene(seed)) for seed, name in enumerate("ab"))
-    keyss.hide(cover, [Secret(secret, KEY)], method=SIDECAR, out=root / "run")
+    keyss.hide(cover, [Secret(secret, KEY)], method=ANY, out=root / "run")
     return root / "run"
 
 

@@ -12,35 +12,13 @@ import torch
 
 from keyss.channels.base import Records
 from keyss.channels.low_bits import LOW_BITS
-from keyss.channels.sidecar import decrypt_sidecar
-from keyss.core import Gaussians, InputError, KeyssError, WrongKeyError
+from keyss.core import Gaussians, WrongKeyError
 from keyss.files.ply import read_ply
 
+pytestmark = pytest.mark.argon2
+
 FOLDER = Path(__file__).parents[1] / "vectors"
-SIDECAR = json.loads((FOLDER / "sidecar.json").read_text())
 CARRIED = json.loads((FOLDER / "carried.json").read_text())
-SEALED = (FOLDER / "sidecar.sealed").read_bytes()
-
-
-def test_a_sidecar_opens() -> None:
-    opened = decrypt_sidecar(SEALED, SIDECAR["key"])
-    assert (opened.method, opened.data.hex()) == (SIDECAR["method"], SIDECAR["payload"])
-
-
-@pytest.mark.parametrize(
-    ("data", "error", "words"),
-    [
-        (b"", InputError, "not a sidecar"),
-        (b"PK" + SEALED[2:], InputError, "not a sidecar"),
-        (SEALED[:8] + b"\x02" + SEALED[9:], InputError, "version 2; this program reads version 1"),
-        (SEALED[:-1], InputError, "not a whole"),
-        (SEALED + b"\0", InputError, "not a whole"),
-        (SEALED[:9] + bytes(16) + SEALED[25:], WrongKeyError, "opens nothing"),
-    ],
-)
-def test_sidecars_that_must_fail(data: bytes, error: type[KeyssError], words: str) -> None:
-    with pytest.raises(error, match=words):
-        decrypt_sidecar(data, SIDECAR["key"])
 
 
 def _moved(stego: Gaussians) -> Gaussians:

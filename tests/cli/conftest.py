@@ -42,7 +42,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "key.txt").chmod(0o600)
     (folder / "wrong.txt").write_text("fedcba9876543210\n")
     arguments = [
-        "--sidecar",
+        "--publish",
+        "any",
         "--cover",
         folder / "a",
         "--secret",

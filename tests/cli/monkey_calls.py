@@ -138,12 +138,12 @@ class Caller:
             most = [] if not scenes and self.random.random() < 0.7 else ["--max-gaussians", "100"]
             arguments += ["--iterations", "5", *most]
         if method == "learned":
-            arguments += self.maybe(0.75 if scenes else 0.3, "--sidecar")
             arguments += self.maybe(0.15, "--sh-degree", self.pick(["0", "1", "2", "3", "4", "-1"]))
             arguments += self.maybe(0.05, "--mask", self.pick(["op", "op,sh", "xyz,ro", "", "x", "op,op"]))
             arguments += self.maybe(0.03, "--start", "points") + self.maybe(0.02, "--key-encoder", "clip")
         else:
             arguments += self.maybe(0.3, "--thin") + self.maybe(0.2, "--dither")
+        arguments += self.maybe(0.75 if scenes else 0.3, "--publish", "any")
         arguments += self.maybe(0.6 if scenes else 0.1, f"--min-psnr={self.pick(['0', '5', '60', '-3'])}")
         arguments += self.maybe(0.06, "--dry-run") + self.maybe(0.05, "--skip-missing")
         arguments += self.maybe(0.04, "--cover-model", self.pick(self.anything()))
@@ -171,9 +171,6 @@ class Caller:
         made = [str(path) for path in Path().glob("out-*/publish/*.ply")]
         return self.mostly(made, [*self.models(), *self.anything()], 0.75)
 
-    def sidecars(self) -> list[str]:
-        return [str(path) for path in Path().glob("out-*/publish/decoder.sealed")]
-
     def reveal(self) -> Call:
         stego = self.stego()
         overwrite = self.random.random() < 0.4
@@ -189,7 +186,6 @@ class Caller:
             *self.device(),
         ]
         arguments += ["--overwrite"] * overwrite + self.maybe(0.1, "--decoy") + self.maybe(0.15, "--force")
-        arguments += self.maybe(0.15, "--decoder", self.mostly(self.sidecars(), self.anything(), 0.6))
         arguments += self.maybe(0.1, "--frame", self.pick(["secret", "cover", "none"]))
         return Call(arguments, out)
 
@@ -197,7 +193,6 @@ class Caller:
         stego = self.stego()
         key = self.key_file(stego.partition("/")[0], 0.9) if self.random.random() < 0.7 else []
         arguments = ["verify", stego, *key, *self.maybe(0.3, "--json"), *self.device()]
-        arguments += self.maybe(0.15, "--decoder", self.mostly(self.sidecars(), self.anything(), 0.6))
         return Call(arguments)
 
     def render(self) -> Call:
@@ -258,7 +253,7 @@ class Caller:
         return Call(
             [
                 "info",
-                self.pick([*self.anything(), *self.runs(), *self.sidecars()]),
+                self.pick([*self.anything(), *self.runs()]),
                 *self.maybe(0.4, "--json"),
             ]
         )
@@ -286,5 +281,5 @@ class Caller:
             "--help",
             "-",
         ]
-        words += ["--thin", "--sidecar", "--key-file", "--cover"]
+        words += ["--thin", "--publish", "--key-file", "--cover"]
         return Call([self.pick(words[:4]), *(self.pick(words) for _ in range(self.random.randrange(4)))])

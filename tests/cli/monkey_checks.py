@@ -150,10 +150,7 @@ class Checker:
         if files and call.out in FOLDERS_OUT:
             self.keys[str(call.out)] = files
         mine = {Path(name).name for name in self.foreign if inside(name, str(out / "publish"))}
-        sidecar = {"decoder.sealed"} if call.has("--sidecar") else set()
-        must(
-            {path.name for path in (out / "publish").iterdir()} - mine == {"stego.ply"} | sidecar, "publish/"
-        )
+        must({path.name for path in (out / "publish").iterdir()} - mine == {"stego.ply"}, "publish/")
         limit = re.search(r"--min-psnr[= ](\S+)", " ".join(call.arguments))
         least = 20.0 if limit is None else float(limit[1])
         keys = [key_in(path) for path in files] or [call.environment or ""]

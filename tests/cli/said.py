@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import cheap_keys
 from keyss.cli import commands
 from keyss.fitting.image_metrics import ImageQuality
 from keyss.measure.hiding import BaselineQuality, RenderFidelity
@@ -29,8 +30,8 @@ METRICS = HideMetrics(
     details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
-COMMANDS = [command.__name__ for command in commands.ALL]
-PROGRAM = [sys.executable, "-m", "keyss"]
+COMMANDS = [command.__name__.replace("_", "-") for command in commands.ALL]
+PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class TestArguments:
 
         def hide(*args: Any, **kwargs: Any) -> verbs.HideResult:
             calls.append((args, kwargs))
-            return verbs.HideResult(random_gaussians(1), None, METRICS)
+            return verbs.HideResult(random_gaussians(1), METRICS)
 
         monkeypatch.setattr(verbs, "hide", hide)
         return calls
@@ -70,7 +70,6 @@ class TestArguments:
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
         assert config.mask == ("sc", "xyz")
         assert config.start == "points"
-        assert config.decoder == "network"
         assert (config.iterations, config.max_gaussians) == (7, 80)
         assert config.fit.evaluate_every == LEARNED_PRESETS["quick"].fit.evaluate_every
         assert options.pop("reporter") is not None
@@ -100,9 +99,9 @@ class TestArguments:
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
-        assert keyss(*scenes, "--sidecar", "--key-encoder", "clip", "--clip-model", "C").status == 0
+        assert keyss(*scenes, "--start", "points", "--key-encoder", "clip", "--clip-model", "C").status == 0
         learned = hidden[0][1]["method"]
-        assert (learned.sidecar, learned.key_encoder, learned.clip_model) == (True, "clip", "C")
+        assert (learned.start, learned.key_encoder, learned.clip_model) == ("points", "clip", "C")
         assert keyss(*scenes, "--method", "carry", "--thin", "--dither", "--seed", 5).status == 0
         carry = hidden[1][1]["method"]
         assert (carry.prune_to_fit, carry.dither, carry.fit.seed) == (True, True, 5)

@@ -67,6 +67,7 @@ def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path,
     assert list(out.iterdir())
 
 
+@pytest.mark.argon2
 def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
     key = ("--key-file", files / "key")
     out = tmp_path / "out.spz"
@@ -80,6 +81,7 @@ def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Pa
     assert out.exists()
 
 
+@pytest.mark.argon2
 def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     said = keyss("convert", CARRIED, out, "--key-file", files / "key")

@@ -15,7 +15,7 @@ from keyss.cli.flags import as_flags
 from keyss.core.errors import KeyssWarning, UsageError
 
 SOURCE = Path(__file__).parents[2] / "src" / "keyss"
-OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "decoder", "secret_model"}
+OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model"}
 # Options of other programs, and whole commands, which a page may quote.
 QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
 
@@ -25,11 +25,11 @@ QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
     [
         ("`overwrite=True` replaces it", "--overwrite replaces it"),
         ('`method="learned"` can', "--method learned can"),
-        ('`method="learned", sidecar=True` needs none', "--method learned --sidecar needs none"),
+        ('`method="carry", dither=True` has one', "--method carry --dither has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
         ("`decoy=False`", "no --decoy"),
-        ("give `sh_degree`, `decoder`", "give --sh-degree, --decoder"),
+        ("give `sh_degree`, `publish`", "give --sh-degree, --publish"),
         ("`key`, `secrets` and `model`", "--key-file, --secret and --secret-model"),
         # What is no option of the command stays, whatever it is.
         ("`chmod 600` and `f_dc_0` and `reporter`", "`chmod 600` and `f_dc_0` and `reporter`"),

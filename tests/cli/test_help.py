@@ -12,7 +12,7 @@ import pytest
 from cli.said import COMMANDS, Said
 from keyss import __version__
 from keyss.audit.parts import PARTS
-from keyss.files.ply import write_ply
+from keyss.files import write_model
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.methods import registry
 from tiny_scenes import random_gaussians
@@ -26,9 +26,12 @@ def loaded(*arguments):
         main(arguments)
     return set(sys.modules)
 
-for arguments in (["--help"], ["keygen"], ["info", "nowhere"]):
+assert not loaded("--version") & {"tyro", "rich", "keyss.cli.commands"}
+for arguments in (["--help"], ["keygen"], ["keygen", "--help"], ["info", "nowhere"], ["inof"]):
     assert not loaded(*arguments) & {"torch", "numpy", "keyss.methods"}, arguments
-assert not loaded("info", sys.argv[1]) & {"numba", "scipy", "keyss.methods"}
+model, other = sys.argv[1:]
+assert not loaded("info", model) & {"torch", "cv2", "numba", "scipy", "keyss.methods"}
+assert not loaded("info", other) & {"numba", "scipy", "keyss.methods"}  # unpacked with torch
 """
 
 
@@ -37,9 +40,9 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert"]
-        judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "version"]
-        assert making + judging == COMMANDS
+        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert", "view", "export-html"]
+        judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "doctor"]
+        assert [*making, *judging, "completion", "version"] == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)
     def test_shows_an_example(self, keyss: Callable[..., Said], command: str) -> None:
@@ -53,6 +56,7 @@ class TestHelp:
         out = keyss(command, "--help").out
         assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "demo"})
         computing = {"fit", "hide", "reveal", "verify", "render", "convert", "evaluate", "audit", "demo"}
+        computing.add("doctor")
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 
@@ -92,9 +96,10 @@ class TestHelp:
 
     def test_what_needs_little_loads_little(self, tmp_path: Path) -> None:
         """Help, a new key and a wrong name answer at once, for torch takes seconds; methods take one more."""
-        write_ply(tmp_path / "model.ply", random_gaussians(10))
+        for name in ("model.ply", "model.splat"):
+            write_model(tmp_path / name, random_gaussians(10))
         subprocess.run(
-            [sys.executable, "-c", LOADS_LITTLE, tmp_path / "model.ply"],
+            [sys.executable, "-c", LOADS_LITTLE, tmp_path / "model.ply", tmp_path / "model.splat"],
             check=True,
             stderr=subprocess.DEVNULL,
         )

@@ -286,7 +286,8 @@ def test_a_missing_photo_is_named_and_left_out_on_demand(keyss: Keyss, tmp_path:
 def test_a_run_remembers_that_photos_were_missing(keyss: Keyss, world: Path, tmp_path: Path) -> None:
     scene, run = write_colmap(tmp_path / "scene", count=4), tmp_path / "run"
     (scene / "images/02.png").unlink()
-    hide = ("hide", "--cover", scene, "--secret", world / "b", *key(world), "--sidecar", "-o", run, *SMALL)
+    scenes = ("--cover", scene, "--secret", world / "b", *key(world))
+    hide = ("hide", *scenes, "--publish", "any", "-o", run, *SMALL)
     assert_refused(keyss(*hide), 4, "1 of 4 photos are missing: 02.png;")
     said = keyss(*hide, "--skip-missing")
     assert said.status == 0, said.err

@@ -8,7 +8,6 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-PROGRAM = [sys.executable, "-c", "from keyss.cli.process import main; main()"]
+from cli.said import PROGRAM
+
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 SIZE = (
     "--preset",
@@ -57,7 +57,8 @@ COMMANDS: Mapping[str, Command] = {
             "b",
             "--key-file",
             "key.txt",
-            "--sidecar",
+            "--publish",
+            "any",
             "--min-psnr=0",
             "-o",
             "OUT",

@@ -18,14 +18,14 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     keyss: Callable[..., Said], world: Path, tmp_path: Path
 ) -> None:
     scenes = ["--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt"]
-    hide = ["hide", *scenes, "--sidecar", "-o", tmp_path / "run", *SMALL]
+    hide = ["hide", *scenes, "--publish", "any", "-o", tmp_path / "run", *SMALL]
     said = keyss(*hide, "--min-psnr", 90)
     assert said.status == 7
     assert "below 90 dB: nothing was published; --min-psnr sets the limit" in said.err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0
-    assert "hide: 20 steps, continuing at 20" in said.err
+    assert "refit of the secret: 20 steps, continuing at 20" in said.err
     assert (tmp_path / "run" / "publish" / "stego.ply").exists()
 
 

@@ -12,21 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
-from keyss.channels.base import Payload
 from keyss.channels.low_bits import LOW_BITS, cells, reading
-from keyss.channels.sidecar import encrypt_sidecar
 from keyss.core import Gaussians
-from keyss.core.similarity import Similarity
 from keyss.files import read_model
 from keyss.files.ply import read_ply, write_ply
-from keyss.keys import DerivedKey, random_embeddings
-from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.opacity_band import hidden_logits, opacity_remap
-from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
+from keyss.keys import DerivedKey
 from keyss.methods.records.encoding import _COUNT, encode_all
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -41,24 +34,9 @@ def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
     return prepared.embed([(KEY, records)])
 
 
-def learned(cover: Gaussians, key: str) -> tuple[Gaussians, bytes]:
-    """A model half of whose Gaussians are transparent in it and opaque with a key, and its sidecar."""
-    hidden = torch.arange(len(cover)) % 2 == 0
-    logits = torch.where(hidden, hidden_logits(cover.opacity_logits, 0), cover.opacity_logits.abs())
-    stego = replace(cover, opacity_logits=logits)
-    generator = torch.Generator().manual_seed(0)
-    decoder = Decoder(DecoderShape(sh_degree=stego.sh_degree))
-    decoder.prepare(stego, random_embeddings(1, generator)[0])
-    decoder.set_remap(*opacity_remap(0))
-    anchors = choose_anchors(stego, generator)
-    secret = HiddenSecret(decoder.requires_grad_(False), Similarity.identity(), anchors)
-    secret = replace(secret, count=secret.remains(secret.reveal(stego)).found)
-    return stego, encrypt_sidecar([(key, Payload("learned", pack_secret(secret)))])
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys `key` and `other`; models of which 500 of 500, 1,000 and 12,000 Gaussians are left; `learned`."""
+    """Keys `key` and `other`; models of which 500 of 500, 1,000 and 12,000 Gaussians are left."""
     folder = tmp_path_factory.mktemp("files")
     for name, key in (("key", KEY), ("other", KEY[::-1])):
         (folder / name).write_text(key)
@@ -67,10 +45,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_ply(folder / "plain.ply", cover)
     for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):
         write_ply(folder / f"{name}.ply", carried(cover, secret, claimed))
-    (folder / "learned").mkdir()
-    stego, sidecar = learned(trained_like(400, 2), KEY)
-    write_ply(folder / "learned" / "stego.ply", stego)
-    (folder / "learned" / "decoder.sealed").write_bytes(sidecar)
     return folder
 
 
@@ -102,18 +76,6 @@ class TestCounts:
         said = reveal("few.ply", "--force")
         assert (said.status, len(read_ply(tmp_path / "s.ply"))) == (0, 500)
         assert "keyss: warning: 500 of 12,000" in said.err
-
-    def test_a_learned_secret_is_gone_after_pruning_by_opacity(
-        self, reveal: Run, files: Path, tmp_path: Path
-    ) -> None:
-        whole = reveal("learned/stego.ply")
-        assert whole == Said(0, f"{tmp_path}/s.ply: 200 of 200 Gaussians\n", "")
-        stego = read_ply(files / "learned" / "stego.ply")
-        (tmp_path / "pruned").mkdir()
-        write_ply(tmp_path / "pruned" / "stego.ply", stego[stego.opacities > 0.005])
-        shutil.copy(files / "learned" / "decoder.sealed", tmp_path / "pruned")
-        said = reveal(tmp_path / "pruned" / "stego.ply", "--overwrite")
-        assert_refused(said, 4, "0 of 200 Gaussians")
 
 
 class TestOpensNothing:
@@ -153,102 +115,38 @@ class TestOpensNothing:
         assert made[0] == made[1] == made[2]
         assert made[0]["keys"] == reading.SALTS_TRIED
         assert_refused(said[0], 3, "opens nothing here")
-        for word in ("another key", "decoder.sealed", "converted or quantised", "moved", "trained on"):
+        for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in said[0].err
 
-    def test_with_a_sidecar_too(self, reveal: Run, files: Path) -> None:
-        without = reveal("plain.ply")
-        assert reveal("learned/stego.ply", key="other") == without
-        given = files / "learned" / "decoder.sealed"
-        assert reveal("plain.ply", "--decoder", given, key="other") == without
-
-    def test_with_a_decoy_both_places_are_looked_at_by_every_key(
-        self, reveal: Run, work: dict[str, int]
-    ) -> None:
+    def test_with_a_decoy_too_and_with_one_salt(self, reveal: Run, work: dict[str, int]) -> None:
         made = []
-        for key in ("key", "other"):
+        for model, key in (("plain.ply", "key"), ("whole.ply", "other")):
             work.update(keys=0, blocks=0)
-            said = reveal("learned/stego.ply", "--decoy", "--overwrite", key=key)
+            said = reveal(model, "--decoy", "--overwrite", key=key)
             assert (said.status, said.err) == (0, "")
             made.append(dict(work))
         assert made[0] == made[1]
         assert made[0]["keys"] == 1
 
 
-class TestSidecars:
-    @pytest.fixture
-    def beside(self, files: Path, tmp_path: Path) -> Path:
-        """A model that carries its secret, beside a sidecar of another one under the same key."""
-        (tmp_path / "run").mkdir()
-        shutil.copy(files / "whole.ply", tmp_path / "run" / "stego.ply")
-        shutil.copy(files / "learned" / "decoder.sealed", tmp_path / "run")
-        return tmp_path / "run" / "stego.ply"
-
-    @pytest.mark.parametrize("kind", ["another model", "another key", "damaged"])
-    def test_a_stale_one_beside_the_file_is_passed_over(
-        self, reveal: Run, beside: Path, tmp_path: Path, kind: str
-    ) -> None:
-        words = "made for another model"
-        if kind == "another key":
-            beside.with_name("decoder.sealed").write_bytes(learned(trained_like(400, 2), "another key")[1])
-            words = "this key does not open it"
-        elif kind == "damaged":
-            beside.with_name("decoder.sealed").write_bytes(b"KEYSSEAL")
-            words = "not a sidecar"
-        said = reveal(beside)
-        assert (said.status, said.out) == (0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n")
-        assert said.err.startswith("keyss: warning: ")
-        assert words in said.err
-        assert "what lies in the model itself was opened" in said.err
-
-    def test_one_that_is_given_has_to_open(self, reveal: Run, beside: Path, tmp_path: Path) -> None:
-        given = beside.with_name("decoder.sealed")
-        assert_refused(reveal(beside, "--decoder", given), 4, "another model")
-        assert_refused(reveal(beside, "--decoder", given, key="other"), 3, "opens nothing")
-        assert not (tmp_path / "s.ply").exists()
-
-    def test_of_another_model_and_nothing_in_this_one(self, reveal: Run, files: Path, beside: Path) -> None:
-        shutil.copy(files / "plain.ply", beside)
-        assert_refused(reveal(beside), 4, "another model")
-
-    def test_one_that_asks_for_much_memory_is_refused_before_it_gets_any(
-        self, reveal: Run, files: Path, tmp_path: Path
-    ) -> None:
-        data = bytearray((files / "learned" / "decoder.sealed").read_bytes())
-        data[26:30] = (1024 * 1024).to_bytes(4, "little")
-        (tmp_path / "greedy.sealed").write_bytes(data)
-        said = reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed")
-        assert_refused(said, 4, "memory_kib")
-        data[25:30] = bytes([5]) + (64 * 1024).to_bytes(4, "little")
-        (tmp_path / "greedy.sealed").write_bytes(data)
-        assert_refused(reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed"), 4, "time_cost")
-        data[25:30] = bytes([4]) + (256 * 1024).to_bytes(4, "little")
-        (tmp_path / "greedy.sealed").write_bytes(data)
-        assert_refused(reveal("plain.ply", "--decoder", tmp_path / "greedy.sealed"), 4, "passes times KiB")
-
-
 class TestOutputs:
-    @pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink", "sidecar"])
+    @pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
     def test_an_input_is_never_overwritten(self, keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
         (tmp_path / "sub").mkdir()
         model = tmp_path / "stego.ply"
         shutil.copy(files / "whole.ply", model)
-        decoder = tmp_path / "sidecar.ply"
-        shutil.copy(files / "learned" / "decoder.sealed", decoder)
         out = {
             "same": model,
             "dots": tmp_path / "sub" / ".." / "stego.ply",
             "symlink": tmp_path / "link.ply",
             "hardlink": tmp_path / "hard.ply",
-            "sidecar": decoder,
         }[how]
         if how == "symlink":
             out.symlink_to(model)
         elif how == "hardlink":
             os.link(model, out)
         before = listing(tmp_path)
-        more = ["--decoder", decoder] if how == "sidecar" else []
-        said = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite", *more)
+        said = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite")
         assert_refused(said, 2, "is the input")
         assert listing(tmp_path) == before
 
@@ -350,10 +248,7 @@ class TestVerify:
         said = keyss("verify", files / "whole.ply", "--key-file", files / "key", "--json")
         assert (said.status, said.err) == (0, "")
         secret = json.loads(said.out)["secret"]
-        assert (secret["where"], secret["found"], secret["hidden"]) == ("model", 500, 500)
-        said = keyss("verify", files / "learned" / "stego.ply", "--key-file", files / "key")
-        assert said.status == 0
-        assert "sidecar" in said.out
+        assert (secret["found"], secret["hidden"]) == (500, 500)
 
     def test_a_secret_that_is_not(self, keyss: Run, files: Path) -> None:
         for name in ("half", "few"):
@@ -362,7 +257,6 @@ class TestVerify:
             assert "pruning by opacity" in said.err
         said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
         assert_refused(said, 3, "opens nothing")
-        assert_refused(keyss("verify", files / "plain.ply", "--decoder", files / "key"), 2, "key")
 
 
 def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:

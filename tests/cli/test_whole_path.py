@@ -84,14 +84,14 @@ def test_a_dry_run_prints_the_whole_and_writes_nothing(
     keyss: Callable[..., Said], world: Path, tmp_path: Path
 ) -> None:
     scenes = ("--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt")
-    said = keyss("hide", "--sidecar", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
+    said = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
     assert said.status == 0, said.err
     for words in ("plain model of the cover", "hiding", "measuring", "all ", "room ", "memory ", "disk "):
         assert words in said.out, words
     assert "up to 100 Gaussians of SH degree 3" in said.out
     assert listing(tmp_path) == {}
     said = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")  # so few have no room
-    assert_refused(said, 2, "--sidecar writes")
+    assert_refused(said, 2, "--publish any has room")
     assert listing(tmp_path) == {}
 
 

@@ -21,7 +21,7 @@ from keyss.runs.records import read_record
 
 SMALL: dict[str, Any] = {
     # So small a model has no room for what its key opens.
-    "options": LearnedOptions(fit=FitConfig(iterations=30, max_gaussians=300), sidecar=True),
+    "options": LearnedOptions(fit=FitConfig(iterations=30, max_gaussians=300), publish="any"),
     "views": 16,
     "width": 32,
     "height": 24,
@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, demo.DemoResult
 def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResult]) -> None:
     out, result = run
     assert {path.name for path in out.iterdir()} == {
-        *("publish", "private", "scenes", "secret.ply", "comparison.png", "key.txt"),
+        *("publish", "private", "scenes", "secret.ply", "web.spz", "comparison.png", "key.txt", "index.html"),
     }
     assert result.refused == len(demo.WRONG_KEYS)
     assert result.metrics == read_record(out / "private" / "metrics.json", HideMetrics)
@@ -53,11 +53,16 @@ def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path
     assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
 
 
+def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
+    found = verbs.reveal(run[0] / "web.spz", "demo-key-3")
+    assert len(found) == len(verbs.reveal(run[0] / "publish" / "stego.ply", "demo-key-3"))
+
+
 def test_one_seed_gives_the_same_bytes_in_another_place(
     run: tuple[Path, demo.DemoResult], tmp_path: Path
 ) -> None:
     demo.run_demo(tmp_path, seed=3, **SMALL)
-    for name in ("publish/stego.ply", "publish/decoder.sealed", "secret.ply"):
+    for name in ("publish/stego.ply", "secret.ply"):
         assert (tmp_path / name).read_bytes() == (run[0] / name).read_bytes()
 
 

@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from keyss.core import Gaussians, InputError, OutputError
-from keyss.files.ply import OPACITY_LOGIT_BOUND, read_ply, write_ply
+from keyss.files.ply import read_ply, write_ply
+from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 

@@ -10,6 +10,8 @@ from argon2.low_level import Type, hash_secret_raw
 from keyss.core import InputError, UsageError
 from keyss.keys import DerivedKey, KeyDerivation, generate_key, random_embeddings
 
+pytestmark = pytest.mark.argon2
+
 CHEAP = KeyDerivation(salt=b"0123456789abcdef", time_cost=1, memory_kib=8192, parallelism=1)
 
 

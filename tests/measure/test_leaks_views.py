@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from keyss.core import Gaussians
-from keyss.measure.leaks.attacks import file_attacks, source_attack
+from keyss.measure.leaks.attacks import file_attacks
 from keyss.measure.leaks.views import (
     OPAQUE,
     Attribute,
@@ -24,7 +24,6 @@ from keyss.measure.leaks.views import (
     outliers,
     rescaled,
 )
-from keyss.methods.learned.attacks import known_remaps
 from keyss.rendering.contributions import contributions
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
@@ -144,10 +143,7 @@ def test_clusters_part_the_model_and_tell_two_kinds_from_each_other() -> None:
 def test_attacks_show_the_same_labels_of_any_model_and_change_nothing(count: int, sh_degree: int) -> None:
     model, large = random_gaussians(count, sh_degree=sh_degree), random_gaussians(50)
     before = model.map(torch.clone)
-    for attack in [
-        *file_attacks(tiny_scene(), cover_views=2),
-        source_attack(lambda model: known_remaps(model, 3)),
-    ]:
+    for attack in file_attacks(tiny_scene(), cover_views=2):
         shown = list(attack.show(model))
         assert [label for label, _ in shown] == [label for label, _ in attack.show(large)]
         assert len({label for label, _ in shown}) == len(shown)

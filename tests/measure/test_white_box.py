@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 from torch import Tensor
 
 from keyss.core import Gaussians
 from keyss.measure.leaks.attacks import search_embeddings
+from keyss.methods.learned.options import PRESETS
 from keyss.methods.learned.payload import HiddenSecret
 from methods.learned.hiding import Hidden, hide_scenes
 from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
@@ -19,8 +21,9 @@ RESTARTS = 4
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     scenes, models = _scenes()
-    config = PAPER.with_fit(iterations=300)
-    return hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
+    large = {"hidden": PRESETS["paper"].hidden, "branch": PRESETS["paper"].branch}
+    config = replace(PAPER, **large).with_fit(iterations=300)  # type: ignore[arg-type]
+    return hide_scenes(scenes, KEYS, config, plains=models)
 
 
 def _decoder(secret: HiddenSecret) -> Callable[[Gaussians, Tensor], Gaussians]:

@@ -61,9 +61,6 @@ class OpenedWhole:
     def remains(self, revealed: Gaussians) -> Remains:
         return Remains(len(revealed), len(revealed))
 
-    def check_belongs_to(self, stego: Gaussians) -> None:
-        pass
-
     def fingerprint(self) -> str:
         return f"{len(self.model):016x}"
 
@@ -93,16 +90,13 @@ class WholeMethod:
         rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
         payload = Payload("whole", rows.numpy().tobytes())
         stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])
-        return Stego(stego, None, (self.unpack(payload),), 0.0, details={"floats": rows.numel()})
+        return Stego(stego, (self.unpack(payload),), 0.0, details={"floats": rows.numel()})
 
     def unpack(self, content: Content) -> OpenedWhole:
         assert isinstance(content, Payload)
         rows = torch.from_numpy(np.frombuffer(content.data, np.float32).reshape(-1, 14).copy())
         means, quats, scales, logits, sh = rows.split((3, 4, 3, 1, 3), dim=1)
         return OpenedWhole(Gaussians(means, quats, scales, logits[:, 0], sh[:, None]))
-
-    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
-        return {}
 
 
 @pytest.fixture(autouse=True)

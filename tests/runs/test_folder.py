@@ -98,7 +98,7 @@ def test_none_appears_when_one_fails(
 
 
 def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -> None:
-    make(tmp_path, files={"publish/stego.ply": b"1", "publish/decoder.sealed": b"2", "private/old/x": b"3"})
+    make(tmp_path, files={"publish/stego.ply": b"1", "publish/stego.spz": b"2", "private/old/x": b"3"})
     make(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
     foreign = {
         "notes.txt": b"mine",

@@ -21,9 +21,10 @@ FIT = FitConfig(iterations=60, max_gaussians=400, evaluate_every=0, seed=0)
 Usage = namedtuple("Usage", "total used free")
 
 
+@pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
-    options = LearnedOptions(fit=FIT, iterations=90, sidecar=True)
+    options = LearnedOptions(fit=FIT, iterations=90, start="points", hidden=(8, 8), branch=8)
     plan = api.plan(tiny_scene(0), secrets, method=options, out=tmp_path / "run")
     fits = [stage for stage in plan.stages if stage.name.startswith("plain model")]
     assert [stage.name.removeprefix("plain model of the ") for stage in fits] == [
@@ -38,6 +39,8 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.alone
+@pytest.mark.argon2
 @pytest.mark.parametrize("given", [True, False])
 def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> None:
     """Wide bounds: others use the machine, too."""
@@ -46,7 +49,7 @@ def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> Non
         method: CarryOptions | LearnedOptions = CarryOptions()
     else:
         cover, secret = tiny_scene(0), Secret(tiny_scene(1), KEY)  # type: ignore[assignment]
-        method = LearnedOptions(fit=FIT.__class__(iterations=300, max_gaussians=400, seed=0), sidecar=True)
+        method = LearnedOptions(fit=FIT.__class__(iterations=300, max_gaussians=400, seed=0), publish="any")
     api.plan(cover, [secret], method=method)  # compiles kernels
     plan = api.plan(cover, [secret], method=method)
     start = time.perf_counter()

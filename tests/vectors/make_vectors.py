@@ -2,19 +2,26 @@
 
     python tests/vectors/make_vectors.py
 
-`carried.json` is not written here: what old files revealed, new ones must reveal too.
+`carried.json` is not written here: what old files revealed, new ones must reveal too. `revealed.json` says
+what keys open in the models of this folder, and is what the reader in `web/` is tested against.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 import unicodedata
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 FOLDER = Path(__file__).parent
+TWO_KEYS = ("first key of two", "zweiter Schlüssel")
 sys.path.insert(0, str(FOLDER.parent))
 
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
 from argon2.low_level import Type, hash_secret_raw  # noqa: E402
 from cryptography.hazmat.primitives.ciphers import Cipher  # noqa: E402
 from cryptography.hazmat.primitives.ciphers.algorithms import AES  # noqa: E402
@@ -23,11 +30,15 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 
 from channels.low_bits.trained_like import trained_like  # noqa: E402
+from files.formats.examples import model_of, random_spz  # noqa: E402
 from keyss.channels.base import Payload  # noqa: E402
 from keyss.channels.low_bits import LOW_BITS  # noqa: E402
-from keyss.channels.sidecar import encrypt_sidecar  # noqa: E402
-from keyss.files.ply import write_ply  # noqa: E402
+from keyss.core.gaussians import Gaussians  # noqa: E402
+from keyss.files import read_model  # noqa: E402
+from keyss.files.formats import compressed_ply, sog, spz  # noqa: E402
+from keyss.files.ply import read_ply, write_ply  # noqa: E402
 from keyss.methods.learned.payload import pack_secret  # noqa: E402
+from keyss.methods.records.embedding import unpack_records  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.learned.hiding import some_secret  # noqa: E402
 
@@ -65,10 +76,42 @@ def derivation() -> dict[str, object]:
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
         costs = (vector["time_cost"], vector["memory_kib"], vector["parallelism"])
         master = hash_secret_raw(key, salt, *costs, 32, Type.ID)
-        for label in ("seal", "low-bits/key"):
+        for label in ("writer", "low-bits/key"):
             expand = HKDFExpand(SHA256(), 32, f"keyss/v1/{label}".encode())
             vector[label] = expand.derive(master).hex()
     return vectors
+
+
+def revealed(name: str, key: str) -> dict[str, Any]:
+    """What `key` opens in a file of this folder: SHA-256 of float32 columns, or of a payload."""
+    stego = read_ply(FOLDER / name)
+    content = LOW_BITS.extract(stego, key)
+    found: dict[str, Any] = {"file": name, "key": key, "method": content.method}
+    if isinstance(content, Payload):
+        return found | {"payload": hashlib.sha256(content.data).hexdigest()}
+    secret = unpack_records(content)
+    model = secret.reveal(stego)
+    found |= {"count": len(model), "hidden": secret.count, "sha256": digests(model)}
+    if len(model) < secret.count:  # by single precision, in which processors differ in the last bit
+        del found["sha256"]["opacity_logits"]
+        found["opacity_logits"] = [round(each, 6) for each in model.opacity_logits.tolist()]
+    return found
+
+
+def pruned() -> Gaussians:
+    """Two secrets that share carriers, in a model whose quaternions have unit length and are not in use.
+
+    Then some of its Gaussians are lost, some are there twice, and all are shuffled.
+    """
+    cover = trained_like(1000, 3, sh_degree=2)
+    cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
+    secrets = [
+        (TWO_KEYS[0], trained_like(250, 4, sh_degree=1)),
+        (TWO_KEYS[1], trained_like(30, 5, sh_degree=2)),
+    ]
+    stego = embed(cover, secrets, entropy=bytes(32))
+    rows = torch.randperm(len(stego), generator=torch.Generator().manual_seed(6))[:900]
+    return stego[torch.cat([rows, rows[:5]])]
 
 
 def main() -> None:
@@ -77,10 +120,6 @@ def main() -> None:
     sealing["cell"] = cell()
     (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    payload = Payload("learned", b"a payload")
-    sealed = {"key": key, "method": payload.method, "payload": payload.data.hex()}
-    (FOLDER / "sidecar.json").write_text(json.dumps(sealed, indent=1) + "\n")
-    (FOLDER / "sidecar.sealed").write_bytes(encrypt_sidecar([(key, payload)], entropy=bytes(32)))
     secret = trained_like(8, 1, 1)
     secret.means[0, 0] = 1e6  # an outlier
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
@@ -90,6 +129,38 @@ def main() -> None:
     stego = LOW_BITS.prepare(cover).embed([(key, learned)], entropy=bytes(32))
     write_ply(FOLDER / "learned.ply", stego)
     write_ply(FOLDER / "learned-secret.ply", some_secret(cover).reveal(cover))
+    write_revealed(key)
+    write_published()
+
+
+def write_published() -> None:
+    """One model in the formats that are published, and what Python reads of each."""
+    model = model_of(300, 2, seed=7)
+    files = {
+        "published.spz": spz.write_spz(model),
+        "published-2.spz": spz.serialise(random_spz(np.random.default_rng(1), 2, 40, 15)),
+        "published-4.spz": spz.serialise(spz.quantise(model, version=4)),
+        "published.compressed.ply": compressed_ply.write_compressed_ply(model),
+        "published.sog": sog.write_sog(model),
+    }
+    read = {}
+    for name, data in files.items():
+        (FOLDER / name).write_bytes(data)
+        read[name] = digests(read_model(FOLDER / name))
+    (FOLDER / "published.json").write_text(json.dumps(read, indent=1) + "\n")
+
+
+def digests(model: Gaussians) -> dict[str, str]:
+    """SHA-256 of the float32 columns."""
+    columns = {field.name: getattr(model, field.name).numpy() for field in fields(Gaussians)}
+    return {each: hashlib.sha256(np.ascontiguousarray(v)).hexdigest() for each, v in columns.items()}
+
+
+def write_revealed(key: str) -> None:
+    write_ply(FOLDER / "pruned.ply", pruned())
+    opened = [revealed(name, key) for name in ("carried.ply", "learned.ply")]
+    opened += [revealed("pruned.ply", each) for each in TWO_KEYS]
+    (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from keyss.methods.dither import cost
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import PathLike
 from keyss.runs.folder import check_not_published
-from keyss.runs.opening import as_model, sidecar_beside
+from keyss.runs.opening import as_model
 from keyss.runs.revealing import reveal_model
 
 # Below this share of a secret's Gaussians it counts as destroyed.
@@ -68,11 +68,10 @@ def convert(
 ) -> Conversion:
     """Write a model in the format that the suffix of `out` names, and measure what that costs.
 
-    What each of `keys` opens in `model`, or in the sidecar beside it, has to open from what is to be written
-    as well: else QualityError is raised and nothing is written, unless with `force`. `dry_run` writes nothing
-    at all. Without keys nothing is looked for, and nothing that comes back says whether anything is hidden.
-    Raises WrongKeyError for a key that opens nothing, InputError, OutputError, and UsageError for an unknown
-    suffix.
+    What each of `keys` opens in `model` has to open from what is to be written as well: else QualityError is
+    raised and nothing is written, unless with `force`. `dry_run` writes nothing at all. Without keys nothing
+    is looked for, and nothing that comes back says whether anything is hidden. Raises WrongKeyError for a key
+    that opens nothing, InputError, OutputError, and UsageError for an unknown suffix.
     """
     target = resolve_device(device)
     source = None if isinstance(model, Gaussians) else Path(model)
@@ -80,12 +79,11 @@ def convert(
     if not is_standard(path):
         check_not_published(path)
     before = as_model(model)
-    beside = None if source is None else sidecar_beside(source)
-    opened = [_opened(before, key, target, beside) for key in keys]
+    opened = [_opened(before, key, target) for key in keys]
     data = model_bytes(path, before)
     after = model_of_bytes(path, data)
     secrets = tuple(
-        KeptSecret(count, _left(after, key, target, beside), unit)
+        KeptSecret(count, _left(after, key, target), unit)
         for key, (count, unit) in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
@@ -103,10 +101,10 @@ def convert(
     return result
 
 
-def _opened(model: Gaussians, key: str, device: torch.device, beside: Path | None) -> tuple[int, str]:
+def _opened(model: Gaussians, key: str, device: torch.device) -> tuple[int, str]:
     """How much a key opens: Gaussians of a scene, or bytes of a file. Raises WrongKeyError, InputError."""
     try:
-        return reveal_model(model, key, device=device, beside=beside).remains.found, "Gaussians"
+        return reveal_model(model, key, device=device).remains.found, "Gaussians"
     except (InputError, WrongKeyError) as error:
         try:
             return len(open_file_in(model, key).data), "bytes"
@@ -114,10 +112,10 @@ def _opened(model: Gaussians, key: str, device: torch.device, beside: Path | Non
             raise error from None
 
 
-def _left(model: Gaussians, key: str, device: torch.device, beside: Path | None) -> int:
-    """How much a key opens in a converted model, with the sidecar that there was."""
+def _left(model: Gaussians, key: str, device: torch.device) -> int:
+    """How much a key opens in a converted model."""
     try:
-        return _opened(model, key, device, beside)[0]
+        return _opened(model, key, device)[0]
     except (WrongKeyError, InputError, UsageError):
         return 0
 

@@ -6,29 +6,25 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from keyss._verbs.asking import check_keys
 from keyss.channels import robust
-from keyss.channels.base import Payload
-from keyss.channels.codes import published
 from keyss.channels.low_bits import LOW_BITS
-from keyss.core.errors import UsageError, WrongKeyError
+from keyss.channels.opening import open_content
+from keyss.channels.rooms import AnyChannel, Publish, room_in
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.files.models import read_model
 from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.reading import read_file
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
-from keyss.methods import registry
 from keyss.methods.dither import cost
 from keyss.methods.hidden_file import HiddenFile
 from keyss.runs.config import PathLike
 from keyss.runs.files import STEGOS, stego_name, writers
 from keyss.runs.folder import RunFolder, check_not_published
 from keyss.runs.opening import as_model, naming_what_opens_nothing
-
-Publish = Literal["ply", "spz", "sog", "compressed-ply", "any"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +57,7 @@ def hide_files(
     files: Sequence[SecretFile],
     *,
     publish: Publish = "ply",
+    channel: AnyChannel = "colours",
     strength: float = robust.STRENGTH,
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -68,8 +65,9 @@ def hide_files(
     """Hide files in a model, each under its own key, and open them again as a reader will.
 
     `publish`: "ply" writes into low bits, and "spz", "sog" and "compressed-ply" into the codes of such a
-    file, which have to be passed on as they are; "any" writes into colours of a `.ply`, which survive formats
-    that round, at a cost of `strength` (dB PSNR that views of the model keep at least). `out` (a folder) gets
+    file, which have to be passed on as they are; "any" writes what survives other formats, by `channel`: into
+    colours, at a cost of `strength` (dB PSNR that views of the model keep at least), or into appended
+    Gaussians, which have room for far more and which everybody can see are there. `out` (a folder) gets
     `publish/stego.ply`, or `.spz` and so on. Raises InputError for a cover whose low bits are not random, or
     that has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal
     keys.
@@ -84,12 +82,11 @@ def hide_files(
         folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
     hidden, model = [each.read() for each in files], as_model(cover)
     keys = [each.key for each in files]
-    if publish == "any":
-        packed = [(key, each.packed()) for key, each in zip(keys, hidden, strict=True)]
-        stego = robust.embed(model, packed, strength=strength)
+    payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
+    if publish == "ply":
+        stego = LOW_BITS.prepare(model).embed(payloads)
     else:
-        payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
-        stego = _exact(model, publish, payloads)
+        stego = room_in(model, publish, channel, strength).embed(payloads)
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
         there = folder.write(writers({name: stego})) if folder else None
@@ -97,13 +94,6 @@ def hide_files(
         if [open_file_in(as_read, key) for key in keys] != hidden:
             raise RuntimeError("what was written does not open again as it should")
     return HideFilesResult(stego, cost(model, stego), tuple(len(each.data) for each in hidden))
-
-
-def _exact(model: Gaussians, publish: str, payloads: Sequence[tuple[str, Payload]]) -> Gaussians:
-    """The model with payloads in what a file keeps only if it is passed on as it is."""
-    if publish == "ply":
-        return LOW_BITS.prepare(model).embed(payloads)
-    return published.coded(published.prepare(model, publish).embed(payloads))
 
 
 def reveal_file(
@@ -126,8 +116,5 @@ def reveal_file(
 
 
 def open_file_in(stego: Gaussians, key: str) -> HiddenFile:
-    """What `key` opens in low bits or codes, or else in colours. Raises WrongKeyError and InputError."""
-    try:
-        return HiddenFile.of(registry.open_content(stego, key))
-    except WrongKeyError:
-        return HiddenFile.unpacked(robust.extract(stego, key))
+    """The file that `key` opens. Raises WrongKeyError and InputError."""
+    return HiddenFile.of(open_content(stego, key))

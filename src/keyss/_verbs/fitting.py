@@ -17,6 +17,7 @@ from keyss.runs.files import CONFIG, METRICS, MODEL, writers
 from keyss.runs.folder import RunFolder, recorded_seed
 from keyss.runs.metrics import FitMetrics
 from keyss.runs.opening import as_scene
+from keyss.runs.planning import plan_fit, worth_planning
 
 
 def fit(
@@ -57,6 +58,8 @@ def fit(
             out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
         )
     loaded = as_scene(scene, width, background, skip_missing=skip_missing)
+    if reporter and not resume and worth_planning(config):
+        reporter.note(f"fit: {plan_fit(loaded, config, target)}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,

@@ -24,11 +24,11 @@ from keyss.methods.plain_models import plain_models
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import Background, PathLike, RunConfig, colour_of, path_of, secret_ids
-from keyss.runs.files import CONFIG, METRICS, SIDECAR, STEGOS, plain_names, stego_name, writers
+from keyss.runs.files import CONFIG, METRICS, STEGOS, plain_names, stego_name, writers
 from keyss.runs.folder import RunFolder, recorded_seed
 from keyss.runs.metrics import HideMetrics
-from keyss.runs.opening import as_scene, open_file, read_sidecar
-from keyss.runs.planning import check_disk
+from keyss.runs.opening import as_scene, open_in
+from keyss.runs.planning import check_disk, plan_hiding, worth_planning
 from keyss.runs.records import record_bytes
 
 MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
@@ -39,8 +39,7 @@ _BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; of dark or small objects, empty p
 class HideResult:
     """A hiding and how well it works."""
 
-    stego: Gaussians  # to be published; with a key, all that revealing needs unless there is a sidecar
-    sidecar: bytes | None  # the encrypted secrets, where they are not in the low bits of `stego`
+    stego: Gaussians  # to be published; with a key, all that revealing needs
     metrics: HideMetrics
 
 
@@ -68,9 +67,9 @@ def hide(
     Without a seed in the options' `fit` the run draws one from the system, and `config.json` records it; to
     be resumed it needs none.
 
-    The secrets lie encrypted in the low bits of `stego.ply`; with `LearnedOptions(sidecar=True)` they are in
-    a file `decoder.sealed`. `out` (a folder) gets these in `publish/`, and `private/` with the plain models,
-    `config.json` and `metrics.json`; while it runs, checkpoints from which `resume` goes on.
+    The secrets lie encrypted in `stego.ply`, or what the options' `publish` says. `out` (a folder) gets it in
+    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
+    checkpoints from which `resume` goes on.
 
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
@@ -125,6 +124,9 @@ def hide(
         as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
         for source in sources
     ]
+    if reporter and trains and not resume and worth_planning(options.fit):
+        place = folder.path if folder else None
+        reporter.note(f"hide: {plan_hiding(chosen, options, inputs, scenes, target, place)}")
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
@@ -142,7 +144,7 @@ def hide(
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
-    return HideResult(stego.gaussians, stego.sidecar, metrics)
+    return HideResult(stego.gaussians, metrics)
 
 
 def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
@@ -154,12 +156,11 @@ def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list
 
 def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
     """The stego model and the secrets as a reader gets them, from the files that are to be published."""
-    model, sidecar = stego.gaussians, stego.sidecar
+    model = stego.gaussians
     if folder:
         name = stego_name(model)
-        there = folder.write(writers({name: model} | ({SIDECAR: sidecar} if sidecar else {})))
-        model, sidecar = read_model(there / name), read_sidecar(there / SIDECAR) if sidecar else None
-    return [model, *(open_file(model, key, sidecar).reveal(model) for key in keys)]
+        model = read_model(folder.write(writers({name: model})) / name)
+    return [model, *(open_in(model, key).reveal(model) for key in keys)]
 
 
 def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:

@@ -12,13 +12,12 @@ from torch import Tensor
 from keyss.audit.progress import PartProgress, PartResult
 from keyss.audit.subject import AuditSubject
 from keyss.core.errors import BackendError
-from keyss.core.gaussians import Gaussians
 from keyss.files.images import picture_name
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_controls
 from keyss.measure.histograms import histograms
 from keyss.measure.images import compare_images, renders_of
-from keyss.measure.leaks.attacks import decoder_attack, file_attacks, source_attack, with_the_key
+from keyss.measure.leaks.attacks import decoder_attack, file_attacks, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
 from keyss.measure.robustness.survival import breakdown_points
 from keyss.measure.robustness.survival import robustness as measure_robustness
@@ -29,7 +28,6 @@ from keyss.measure.speed import SpeedResult
 from keyss.measure.speed import speed as measure_speed
 from keyss.measure.stealth.judging import StealthResult, judge
 from keyss.measure.two_sample import two_sample_against_controls
-from keyss.methods import registry
 from keyss.runs.audit_record import (
     PICTURES,
     ImagesResult,
@@ -42,11 +40,10 @@ from keyss.runs.audit_record import (
     RobustnessResult,
     SinkhornResult,
 )
-from keyss.runs.files import SIDECAR, stego_in
+from keyss.runs.files import stego_in
 
 PICTURED_VIEWS = 3
 STEGANALYSED_VIEWS = 64
-SECRETS_TRIED = 3  # by who reads the source: how many there are is not known without the keys
 
 AuditPart = Callable[[AuditSubject, int, PartProgress], PartResult[Any]]
 
@@ -150,9 +147,7 @@ def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
     """What somebody without the key sees of each secret, in the file or with its decoder."""
     found: list[tuple[AttackResult, ...]] = []
     pictures: dict[str, Tensor] = {}
-    tried = max(SECRETS_TRIED, len(subject.secrets))
     attacks = file_attacks(subject.cover, seed=seed)
-    attacks.append(source_attack(lambda model: _views_by_source(model, tried)))
     for index, (secret, frame, opened) in enumerate(
         zip(subject.secrets, subject.frames, subject.run.opened, strict=True), start=1
     ):
@@ -186,7 +181,6 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
         subject.reopeners,
         subject.scenes,
         [plain if plain is not None else model for plain, model in zip(plains, subject.models, strict=True)],
-        sidecar=None if subject.run.sidecar is None else subject.run.folder / SIDECAR,
         device=subject.device,
         progress=progress,
     )
@@ -197,12 +191,3 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
 PARTS: dict[str, AuditPart] = {
     part.__name__: part for part in (images, parameters, stealth, stegexpose, leaks, robustness, speed)
 }
-
-
-def _views_by_source(stego: Gaussians, secrets: int) -> dict[str, Gaussians]:
-    """What somebody tries who has read the source of all methods."""
-    return {
-        name: model
-        for method in registry.METHODS.values()
-        for name, model in method.attacks(stego, secrets).items()
-    }

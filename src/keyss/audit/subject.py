@@ -53,8 +53,7 @@ class AuditSubject:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model."""
-        opener = partial(registry.open_model, sidecar=self.run.sidecar)
-        return [Reopener(key, opener) for key in self.run.keys]
+        return [Reopener(key, registry.open_model) for key in self.run.keys]
 
     @property
     def secrets(self) -> tuple[Scene, ...]:

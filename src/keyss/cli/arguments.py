@@ -45,6 +45,7 @@ Iterations = Annotated[int | None, optional("N", "Steps of training.", "the pres
 MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
+TensorBoard = Annotated[bool, arg(help="Write losses to private/tensorboard in the results as it trains.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
 
 

@@ -6,16 +6,18 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
+from keyss.cli.doctor import doctor
 from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
 from keyss.cli.revealing import reveal, verify
+from keyss.cli.viewing import export_html, view
 
 
 def keygen(
@@ -75,13 +77,31 @@ def demo(
         out,
         {
             "comparison.png": "all of it in one picture: look here first",
+            "index.html": "what would be published, in a browser: type the key there",
             "publish/stego.ply": "what would be published: opens in any 3DGS viewer",
             "secret.ply": "what the key brought back from it",
+            "web.spz": "both for the web: hidden to survive conversion, and converted",
             "key.txt": "the key of this demo, known to everybody",
             "scenes": "the photos",
             "private/metrics.json": "the numbers",
         },
     )
+
+
+def completion(
+    shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="{bash,zsh}", help="Which.")],
+) -> None:
+    """Print what makes a shell complete commands and options.
+
+    bash loads it at its start; zsh looks for a file _keyss in the folders of its fpath.
+
+    example: keyss completion bash >> ~/.bash_completion
+
+    example: keyss completion zsh > ~/.zfunc/_keyss
+    """
+    from keyss.cli.entry import application
+
+    application(["completion"], whole=True).run(["--tyro-print-completion", shell])
 
 
 def version() -> None:
@@ -93,6 +113,6 @@ def version() -> None:
 
 
 ALL = (
-    *(keygen, fit, hide, reveal, verify, render, convert),
-    *(evaluate, audit, report, steganalyze, info, demo, version),
+    *(keygen, fit, hide, reveal, verify, render, convert, view, export_html),
+    *(evaluate, audit, report, steganalyze, info, demo, doctor, completion, version),
 )

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import signal
 import sys
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from keyss import __version__
 from keyss.cli.flags import as_flags
-from keyss.core.errors import Interrupted, KeyssError, KeyssWarning, OutputError, signal_of
+from keyss.cli.verbosity import spoken
+from keyss.core.errors import InputError, Interrupted, KeyssError, KeyssWarning, OutputError, signal_of
+
+if TYPE_CHECKING:
+    import tyro
 
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
 INTERNAL_ERROR = 70  # EX_SOFTWARE
@@ -22,7 +26,10 @@ NO_ROOM = OutputError.exit_status
 _ABOUT = """Hide a 3D Gaussian Splatting scene inside another one and open it only with a key.
 
 A key comes from --key-file, from the environment variable KEYSS_KEY, or from a hidden prompt. Results go to
-the standard output, progress and errors to the standard error stream. `keyss --version` tells the version."""
+the standard output, progress and errors to the standard error stream. `keyss --version` tells the version.
+
+-q (--quiet) leaves progress out, -v (--verbose) adds to it, and time and memory at the end; every command
+takes them. `keyss completion bash` prints what completes commands and options in a shell."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,12 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises SystemExit for --help and for arguments that cannot be parsed, as argument parsers do. With
     KEYSS_DEBUG=1 in the environment, errors that are not a person's come through as they are.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    options: set[str] = set()  # of the commands, as Python names them
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    options: set[str] = set()  # of the command, as Python names them
     try:
-        with _warnings_as_lines(options):
+        with _warnings_as_lines(options), spoken(arguments) as asked:
             try:
-                _run(["version"] if arguments in (["--version"], ["-V"]) else arguments, options)
+                _run(asked or ["--help"], options)
             finally:
                 _flush()
         return 0
@@ -48,37 +55,78 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, message = explain(_interrupt_behind(error) or error)
         if status == INTERNAL_ERROR and os.environ.get("KEYSS_DEBUG") == "1":
             raise
+        if isinstance(error, InputError):
+            from keyss.cli.suggestions import existing_path
+
+            near = existing_path(message, arguments)
+            message += f"; did you mean {near}?" if near else ""
         print(f"keyss: {_one_line(as_flags(message, options))}", file=sys.stderr)
         return status
 
 
 def _run(arguments: list[str], options: set[str]) -> None:
     """The command that `arguments` ask for; its options are added to `options`."""
-    if arguments == ["version"]:  # without what parses arguments, which takes longer
+    if arguments in (["--version"], ["-V"], ["version"]):  # without what parses arguments, which takes longer
         print(__version__)
         return
 
+    from keyss.cli import suggestions
+    from keyss.cli.commands import ALL
+
+    commands = application(arguments)
+    flags = set()
+    if (chosen := commands.found.get(arguments[0])) is not None:
+        flags = suggestions.options_of(chosen)
+        options |= {flag.removeprefix("--").replace("-", "_") for flag in flags}
+    try:
+        commands.run(arguments)
+    except SystemExit as end:
+        names = [name_of(command) for command in ALL]
+        if end.code not in (None, 0) and (meant := suggestions.meant(arguments, names, flags)):
+            print(f"keyss: did you mean {meant}?", file=sys.stderr)
+        raise
+
+
+@dataclass(frozen=True)
+class Application:
+    """The commands, as they are parsed."""
+
+    found: Mapping[str, Callable[..., None]]
+    app: tyro.extras.SubcommandApp
+
+    def run(self, arguments: Sequence[str]) -> None:
+        """Parses and calls. Raises SystemExit."""
+        import tyro
+
+        config = (tyro.conf.FlagCreatePairsOff,)
+        self.app.cli(prog="keyss", description=_ABOUT, args=arguments, config=config)
+
+
+def application(arguments: Sequence[str], *, whole: bool = False) -> Application:
+    """All commands; the one asked for, or all, with what takes time to load: presets, methods."""
     import tyro
 
     from keyss.cli import commands
     from keyss.cli.hiding import hide, hide_with_options
     from keyss.cli.models import fit, fit_with_presets
 
-    app = tyro.extras.SubcommandApp()
+    found: dict[str, Callable[..., None]] = {}
     for command in commands.ALL:
-        asked: Any = command
-        if command is hide and arguments[0] == "hide":
+        name, asked = name_of(command), command
+        if command is hide and (whole or name == arguments[0]):
             asked = hide_with_options(arguments)
-        elif command is fit and arguments[0] == "fit":
+        elif command is fit and (whole or name == arguments[0]):
             asked = fit_with_presets()
+        found[name] = asked
+    app = tyro.extras.SubcommandApp()
+    for asked in found.values():
         app.command(asked)
-        if command.__name__ == arguments[0]:
-            options |= {
-                name
-                for name, parameter in inspect.signature(asked).parameters.items()
-                if parameter.kind is parameter.KEYWORD_ONLY
-            }
-    app.cli(prog="keyss", description=_ABOUT, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+    return Application(found, app)
+
+
+def name_of(command: Callable[..., None]) -> str:
+    """What a command is called on the command line."""
+    return command.__name__.replace("_", "-")
 
 
 def explain(error: BaseException) -> tuple[int, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 
-# Between backticks: `overwrite=True`, `method="learned", sidecar=True`, `sh_degree`.
+# Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
 _VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
 _ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
 _ASSIGNMENTS = re.compile(rf"`({_ASSIGNMENT}(?:, ?{_ASSIGNMENT})*)`")

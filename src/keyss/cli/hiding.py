@@ -25,6 +25,7 @@ from keyss.cli.arguments import (
     Resume,
     Seed,
     SkipMissing,
+    TensorBoard,
     Width,
     optional,
     preset_sizes,
@@ -32,10 +33,11 @@ from keyss.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from keyss._verbs.filing import Publish
+    from keyss.channels.rooms import AnyChannel, Publish
     from keyss.methods.base import CommandLineOption, Method
 
 DEFAULT_METHOD = "learned"
+_HOW = ("byte for byte as it is", "as it is, or converted")  # to publish
 
 
 def hide(
@@ -54,10 +56,19 @@ def hide(
     publish: Annotated[
         Literal["ply", "spz", "sog", "compressed-ply", "any"],
         arg(
-            help="Format of the published file, which is passed on as it is; all but ply have room for small "
-            "secrets only. any: a .ply that may be converted, for files."
+            help="Where the model will be published. spz, sog, compressed-ply: such a file, passed on as it "
+            "is, has room for small secrets only. any: a .ply that may be converted."
         ),
     ] = "ply",
+    channel: Annotated[
+        Literal["appended", "colours"] | None,
+        optional(
+            "{appended,colours}",
+            "With --publish any, what survives: appended Gaussians hold everything, and everybody can see "
+            "that they are there; colours hold little and show less.",
+            "scenes are appended, and files lie in colours",
+        ),
+    ] = None,
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
     out: OutFolder,
@@ -82,6 +93,7 @@ def hide(
     ] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    tensorboard: TensorBoard = False,
     device: Device = "auto",
     seed: Seed = None,
     **own: Any,
@@ -99,9 +111,9 @@ def hide(
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.cli.tensorboard import reporter
     from keyss.core.errors import UsageError
     from keyss.methods import registry
-    from keyss.progress import reporter
     from keyss.rendering.orbit import is_model
     from keyss.runs.files import STEGOS
 
@@ -112,19 +124,11 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
+        unused |= {"--tensorboard": tensorboard}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
-        if publish not in ("ply", "any"):
-            raise UsageError(f"--publish {publish} is for scenes; --secret-file takes ply or any")
-        _hide_files(cover, secret_file, publish, key_file, out, overwrite)
+        _hide_files(cover, secret_file, publish, channel or "colours", key_file, out, overwrite)
         return
-    if publish == "any":
-        raise UsageError(
-            "--publish any is for files (--secret-file) so far; scenes take the format that is published, "
-            "or --sidecar"
-        )
-    if publish != "ply" and method != "carry":
-        raise UsageError(f"--publish {publish} needs --method carry: leave out --method {method}")
     if not secret:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
     if secret_model and len(secret_model) != len(secret):
@@ -138,8 +142,9 @@ def hide(
         for name, value in own.items()
         if value is not None and value is not False
     }
-    if publish != "ply":
-        changes["publish"] = publish
+    changes["publish"] = publish
+    if channel:
+        changes["channel"] = channel
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
     given = [cover_model or cover, *(secret_model or secret)]
@@ -187,14 +192,14 @@ def hide(
         out=out,
         overwrite=overwrite,
         resume=resume,
-        reporter=reporter(),
+        reporter=reporter(out, tensorboard=tensorboard),
     )
     print_hiding(result.metrics)
+    how = _HOW[publish == "any"]
     print_files(
         out,
         {
-            **dict.fromkeys(STEGOS, "publish this, byte for byte as it is: the cover, with the secret in it"),
-            "publish/decoder.sealed": "the encrypted secret: publish it too, or send it to who is to open it",
+            **dict.fromkeys(STEGOS, f"publish this, {how}: the cover, with the secret in it"),
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
     )
@@ -208,6 +213,7 @@ def _hide_files(
     cover: Path,
     files: Sequence[Path],
     publish: Publish,
+    channel: AnyChannel,
     key_file: Sequence[Path],
     out: Path,
     overwrite: bool,
@@ -227,12 +233,11 @@ def _hide_files(
     opening = keys(key_file, len(files), confirm=True)
     warn_of_doubtful_keys(opening)
     secrets = [api.SecretFile(file, key) for file, key in zip(files, opening, strict=True)]
-    result = api.hide_files(cover, secrets, publish=publish, out=out, overwrite=overwrite)
+    result = api.hide_files(cover, secrets, publish=publish, channel=channel, out=out, overwrite=overwrite)
     for file, size in zip(files, result.sizes, strict=True):
         print(f"{file.name}: {size:,} bytes, opened again from what was written")
     print(f"The cover's views changed by {result.psnr:.0f} dB PSNR")
-    how = "as it is, or converted" if publish == "any" else "byte for byte as it is"
-    print_files(out, dict.fromkeys(STEGOS, f"publish this, {how}"))
+    print_files(out, dict.fromkeys(STEGOS, f"publish this, {_HOW[publish == 'any']}"))
 
 
 def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
@@ -247,7 +252,7 @@ def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
     chooser.add_argument("--method", nargs="?")
     chooser.add_argument("--publish", nargs="?")
     asked = chooser.parse_known_args(arguments)[0]
-    # What rounds keeps no low bits, and codes are carried in.
+    # Codes have room for small secrets, which are carried at once.
     usual = DEFAULT_METHOD if asked.publish in (None, "ply", "any") else "carry"
     method = METHODS[asked.method if asked.method in METHODS else usual]
     flags = {name: _flags(each) for name, each in METHODS.items()}

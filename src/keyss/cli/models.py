@@ -22,6 +22,7 @@ from keyss.cli.arguments import (
     Resume,
     Seed,
     SkipMissing,
+    TensorBoard,
     Width,
     optional,
     preset_sizes,
@@ -41,19 +42,22 @@ def fit(
     skip_missing: SkipMissing = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    tensorboard: TensorBoard = False,
     device: Device = "auto",
     seed: Seed = None,
 ) -> None:
     """Fit a plain model, ordinary 3DGS with nothing hidden, to the photos of a scene.
 
     example: keyss fit SCENE -o runs/cover
+
+    example: keyss fit SCENE -o runs/cover --tensorboard
     """
     from dataclasses import replace
 
     from keyss import api
     from keyss.cli.tables import print_files, print_fit
+    from keyss.cli.tensorboard import reporter
     from keyss.fitting.config import PRESETS
-    from keyss.progress import reporter
     from keyss.runs.files import METRICS
     from keyss.runs.metrics import FitMetrics
     from keyss.runs.records import read_record
@@ -68,7 +72,7 @@ def fit(
         out=out,
         overwrite=overwrite,
         resume=resume,
-        reporter=reporter(),
+        reporter=reporter(out, tensorboard=tensorboard),
     )
     print_fit(read_record(out / METRICS, FitMetrics))
     print_files(out, {"model.ply": "the model", "private": "its numbers, and what ran"})
@@ -96,8 +100,25 @@ def render(
         Positional[Path], arg(metavar="FILE", help="A 3DGS model (.ply, .spz, .sog, ...), or - for stdin.")
     ],
     *,
-    cameras: Annotated[Path, arg(metavar="SCENE", help="Scene folder whose cameras are used.")],
-    out: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the images.")],
+    cameras: Annotated[
+        Path | None,
+        optional("SCENE", "Scene folder whose cameras are used.", "a film goes around the model"),
+    ] = None,
+    out: Annotated[
+        Path | None, optional("FOLDER", "Folder for the images.", "only a film is made", aliases=["-o"])
+    ] = None,
+    video: Annotated[
+        Path | None,
+        optional("FILE", "Make a film, an .mp4, on a path that SCENE gives, if any.", "pictures are made"),
+    ] = None,
+    path: Annotated[
+        Literal["around", "through"],
+        arg(help="Of a film with cameras: around what they look at, or through them by their names."),
+    ] = "around",
+    wipe: Annotated[
+        Path | None, optional("FILE", "In a film, a second model that a wipe uncovers.", "none")
+    ] = None,
+    seconds: Annotated[float, arg(metavar="S", help="Length of the film.")] = 8.0,
     split: Annotated[Literal["test", "train", "all"], arg(help="Which of its cameras.")] = "test",
     width: Width = None,
     background: Background = None,
@@ -105,12 +126,40 @@ def render(
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
-    """Render a model from the cameras of a scene.
+    """Render a model from the cameras of a scene, or film it.
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
+
+    example: keyss render stego.ply --wipe secret.ply --cameras SCENE_A --video film.mp4
     """
     from keyss import api
+    from keyss.core.errors import UsageError
 
+    if video is not None:
+        if out is not None or split != "test":
+            raise UsageError("--video writes a film and no pictures: leave out -o and --split")
+        from keyss.progress import reporter
+
+        frames = api.render_video(
+            model,
+            video,
+            wipe=wipe,
+            cameras=cameras,
+            path=path,
+            seconds=seconds,
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            device=device,
+            overwrite=overwrite,
+            reporter=reporter(),
+        )
+        print(f"{video}: {frames} frames")
+        return
+    if cameras is None or out is None:
+        raise UsageError("pictures need --cameras SCENE and -o FOLDER; a film needs --video FILE")
+    if wipe is not None or seconds != 8.0 or path != "around":
+        raise UsageError("--path, --wipe and --seconds are for films: give --video FILE")
     images = api.render(
         model,
         cameras,
@@ -168,12 +217,12 @@ def convert(
 def info(
     path: Annotated[
         Positional[Path],
-        arg(metavar="FILE", help="A model (- for stdin), a scene folder, a sidecar or a result folder."),
+        arg(metavar="FILE", help="A model (- for stdin), a scene folder or a result folder."),
     ],
     *,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
 ) -> None:
-    """Tell what is in a model, a scene folder or a sidecar.
+    """Tell what is in a model or a scene folder.
 
     example: keyss info runs/hidden/publish/stego.ply
     """

@@ -29,10 +29,6 @@ def reveal(
             help="The model to write (.ply, .spz, ...), or - for stdout; a hidden file gets any other name.",
         ),
     ],
-    decoder: Annotated[
-        Path | None,
-        optional("FILE", "A sidecar.", "decoder.sealed beside the model, else what is in it"),
-    ] = None,
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
     ] = "secret",
@@ -40,7 +36,7 @@ def reveal(
     force: Annotated[
         bool,
         arg(
-            help="For a model that was quantised or pruned: skip the check that the decoder belongs to it, "
+            help="For a model that was quantised or pruned: skip the check that a decoder belongs to it, "
             "and write what there is."
         ),
     ] = False,
@@ -61,10 +57,10 @@ def reveal(
 
     (key,) = keys(key_file, 1)
     if not is_standard(out) and not is_model_path(out):
-        if decoder or decoy or force or frame != "secret":
+        if decoy or force or frame != "secret":
             raise UsageError(
                 f"{out} is not the name of a model: expected one that ends in .ply, or a hidden file's, for "
-                "which there is no --decoder, --decoy, --force or --frame"
+                "which there is no --decoy, --force or --frame"
             )
         with hinting_at_white_space([key]):
             found = api.reveal_file(stego, key, out=out, overwrite=overwrite)
@@ -74,7 +70,6 @@ def reveal(
         revealed = api.reveal_counted(
             stego,
             key,
-            decoder=decoder,
             frame=frame,
             decoy=decoy,
             force=force,
@@ -95,10 +90,6 @@ def verify(
     key_file: Annotated[
         Path | None, optional("FILE", "File with a key: check what it opens.", "the model alone is checked")
     ] = None,
-    decoder: Annotated[
-        Path | None,
-        optional("FILE", "A sidecar.", "decoder.sealed beside the model, else what is in it"),
-    ] = None,
     json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
     device: Device = "auto",
 ) -> None:
@@ -118,7 +109,7 @@ def verify(
 
     key = key_of_file(key_file) if key_file else None
     with hinting_at_white_space([key] if key else []):
-        found = api.verify(model, key, decoder=decoder, device=device)
+        found = api.verify(model, key, device=device)
     if json_:
         print(record_bytes(found).decode(), end="")
     else:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 from rich.console import Console as RichConsole
 from rich.table import Table
 
+from keyss.progress import about
+
 if TYPE_CHECKING:
     from keyss._verbs.converting import Conversion
     from keyss.fitting.image_metrics import ImageQuality
@@ -67,8 +69,8 @@ def print_plan(plan: Plan) -> None:
     table = _table("stage", "steps", "Gaussians", "time, about", texts=1)
     for stage in plan.stages:
         steps = f"{stage.steps:,}" if stage.steps else ""
-        table.add_row(stage.name, steps, f"{stage.gaussians:,}", _duration(stage.seconds))
-    table.add_row("all", "", "", _duration(plan.seconds))
+        table.add_row(stage.name, steps, f"{stage.gaussians:,}", about(stage.seconds))
+    table.add_row("all", "", "", about(plan.seconds))
     Console().print(table)
     outlook = plan.outlook
     free = "" if plan.free_bytes is None else f", {plan.free_bytes / 1e6:,.0f} MB free"
@@ -173,13 +175,6 @@ def _size(count: int) -> str:
 def print_files(folder: Path, names: Mapping[str, str]) -> None:
     """Where the results are and what each is, those that exist."""
     _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
-
-
-def _duration(seconds: float) -> str:
-    """As precise as an estimate is."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:

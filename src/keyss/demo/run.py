@@ -21,17 +21,19 @@ from keyss.files.scenes import load_scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, Reporter, SilentReporter
-from keyss.methods.registry import LearnedOptions
+from keyss.methods.registry import CarryOptions, LearnedOptions
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import STEGO, writers
+from keyss.runs.files import STEGO, plain_names, writers
 from keyss.runs.folder import RunFolder, clear
 from keyss.runs.metrics import HideMetrics
+from keyss.viewer.page import page_with
 
 COVER, SECRET = "tea-table", "golden-knot"
 VIEWS, WIDTH, HEIGHT = 48, 160, 120
 OPTIONS = LearnedOptions(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
-SECRET_PLY, COMPARISON, KEY, SCENES = "secret.ply", "comparison.png", "key.txt", "scenes"
+SECRET_PLY, WEB, COMPARISON, KEY, SCENES = "secret.ply", "web.spz", "comparison.png", "key.txt", "scenes"
+VIEWER = "index.html"
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def run_demo(
     height: int = HEIGHT,
     reporter: Reporter | None = None,
 ) -> DemoResult:
-    """Everything from photos to a comparison picture, in the folder `out`.
+    """Everything from photos to a comparison picture and a page to type the key into, in the folder `out`.
 
     The key is `demo-key-SEED`, known to everybody, and so is the seed: the pictures are to be the same every
     time, and nothing has to stay hidden. On the CPU, one seed gives the same `stego.ply` and
@@ -86,11 +88,14 @@ def run_demo(
         with results.work():
             revealed = verbs.reveal(out / STEGO, key, device=device)
             refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
+            there = results.write(writers({WEB: _for_the_web(out, cover, secret, key, device)}))
+            converted = verbs.reveal(there / WEB, key, device=device)
             picture = io.BytesIO()
-            comparison = _comparison(out / STEGO, revealed, cover, secret, metrics, device)
+            comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
             comparison.save(picture, "PNG", optimize=True)
+            viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, up="z")
             files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
-            results.write(writers(files))
+            results.write(writers(files | {VIEWER: viewer}))
         return DemoResult(metrics, refused)
     except BaseException as error:
         clear(out)
@@ -109,6 +114,19 @@ def _photograph(reporter: Reporter, size: Mapping[str, int], folder: Path) -> No
     reporter.finish()
 
 
+def _for_the_web(out: Path, cover: Scene, secret: Scene, key: str, device: Backend) -> Gaussians:
+    """The plain secret in the plain cover, carried without training, so that it survives other formats."""
+    plain_cover, plain_secret = (out / name for name in plain_names(1))
+    return verbs.hide(
+        cover,
+        [verbs.Secret(secret, key, plain_secret)],
+        method=CarryOptions(publish="any"),
+        cover_model=plain_cover,
+        min_psnr=0,
+        device=device,
+    ).stego
+
+
 def _is_refused(stego: Path, key: str, device: Backend) -> bool:
     try:
         verbs.reveal(stego, key, device=device)
@@ -118,7 +136,13 @@ def _is_refused(stego: Path, key: str, device: Backend) -> bool:
 
 
 def _comparison(
-    stego: Path, revealed: Gaussians, cover: Scene, secret: Scene, metrics: HideMetrics, device: Backend
+    out: Path,
+    revealed: Gaussians,
+    converted: Gaussians,
+    cover: Scene,
+    secret: Scene,
+    metrics: HideMetrics,
+    device: Backend,
 ) -> Image.Image:
     """Photos and renders of three test views side by side."""
     count = len(cover.test)
@@ -131,15 +155,17 @@ def _comparison(
         images = verbs.render(model, scene, device=device)
         return [images[row][1].numpy() for row in rows]
 
-    decoy = verbs.reveal(stego, WRONG_KEYS[0], decoy=True, device=device)
+    decoy = verbs.reveal(out / STEGO, WRONG_KEYS[0], decoy=True, device=device)
     target = resolve_device(device)
     shown, opened = metrics.cover.psnr, metrics.secrets[0].psnr
     wrong = mean_psnr(decoy.to(target), cover.test, cover.background.to(target))
+    carried = mean_psnr(converted.to(target), secret.test, secret.background.to(target))
     columns = [
         ("cover: photo", "", photos(cover)),
-        ("cover: published model", f"{shown:.1f} dB", renders(stego, cover)),
+        ("cover: published model", f"{shown:.1f} dB", renders(out / STEGO, cover)),
         ("secret: photo", "", photos(secret)),
-        ("opened with the key", f"{opened:.1f} dB", renders(revealed, secret)),
+        ("opened with the key", f"{opened:.1f} dB, trained for it", renders(revealed, secret)),
+        ("opened from the .spz", f"{carried:.1f} dB, carried", renders(converted, secret)),
         ("with a wrong key", f"{wrong:.1f} dB against the cover", renders(decoy, cover)),
     ]
     return contact_sheet(columns)

@@ -19,7 +19,7 @@ from keyss.files.atomic import atomic_write
 from keyss.files.foreign import what_it_is
 from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.ply import read_ply, write_ply
-from keyss.files.ply_table import MAX_HEADER_BYTES
+from keyss.files.ply_rows import is_compressed
 from keyss.files.streams import MemoryInput, MemoryOutput, StandardInput, StandardOutput, is_standard
 
 
@@ -73,9 +73,7 @@ def _writer(module: str) -> Callable[[Path | StandardOutput, Gaussians], None]:
 
 def _read_any_ply(source: Path | StandardInput) -> Gaussians:
     """Compressed files end in .ply, too."""
-    with source.open("rb") as file:
-        header = file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
-    return _reader("compressed_ply")(source) if b" packed_position" in header else read_ply(source)
+    return _reader("compressed_ply")(source) if is_compressed(source) else read_ply(source)
 
 
 def _read_sog_folder(source: Path | StandardInput) -> Gaussians:

@@ -7,22 +7,16 @@ then blue).
 
 from __future__ import annotations
 
-import re
-from collections.abc import Set
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
-from keyss.core import Gaussians, InputError, OutputError
+from keyss.core import Gaussians, OutputError
 from keyss.files.atomic import atomic_write
-from keyss.files.ply_table import ply_header, read_vertices
+from keyss.files.ply_rows import model_names, read_rows, settle
+from keyss.files.ply_table import ply_header
 from keyss.files.streams import StandardInput, StandardOutput
-
-# Stands in for an infinite opacity logit. Converters write infinities for opacities of 0 and 1; a larger
-# bound would not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
-OPACITY_LOGIT_BOUND = 16.0
 
 
 def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
@@ -33,7 +27,7 @@ def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
     system refuses.
     """
     n, k = gaussians.sh.shape[:2]
-    names = _model_names(k)
+    names = model_names(k)
     names[3:3] = ["nx", "ny", "nz"]
     flat = gaussians.detach().to("cpu")
     rest = flat.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1))
@@ -42,7 +36,7 @@ def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
         *(flat.opacity_logits[:, None], flat.log_scales, flat.quats),
     )
     rows = np.concatenate(parts, axis=1, dtype="<f4")
-    problem = _settle(rows, names)
+    problem = settle(rows, names)
     if problem:
         raise OutputError(f"cannot write {path}: {problem}")
     with atomic_write(path) as file:
@@ -58,11 +52,7 @@ def read_ply(path: Path | str | StandardInput) -> Gaussians:
     +-OPACITY_LOGIT_BOUND. Raises InputError for anything that is not a whole, finite 3DGS model in
     binary or ascii PLY.
     """
-    names, rows = read_vertices(path, lambda found: _model_properties(found.keys(), path))
-    problem = _settle(rows, names)
-    if problem:
-        raise InputError(f"{path}: {problem}")
-    values = torch.from_numpy(rows)
+    values = torch.from_numpy(read_rows(path)[1])
     rest = values[:, 6:-8].reshape(len(values), 3, -1).transpose(1, 2)  # [N, K - 1, 3]
     return Gaussians(
         means=values[:, 0:3].contiguous(),
@@ -71,46 +61,3 @@ def read_ply(path: Path | str | StandardInput) -> Gaussians:
         opacity_logits=values[:, -8].contiguous(),
         sh=torch.cat([values[:, None, 3:6], rest], dim=1),
     )
-
-
-def _model_properties(found: Set[str], path: Path | str | StandardInput) -> list[str]:
-    """Names of the properties that make a model. Raises InputError if any is missing."""
-    rest = {name for name in found if re.fullmatch(r"f_rest_[0-9]+", name)}
-    names = _model_names(len(rest) // 3 + 1)
-    if len(rest) not in (0, 9, 24, 45) or not rest <= set(names):
-        raise InputError(
-            f"{path}: expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ... (SH degree 0 to 3), "
-            f"got {len(rest)}"
-        )
-    missing = [name for name in names if name not in found]
-    if not missing:
-        return names
-    if "packed_position" in found:
-        why = "this is a compressed .ply, which `read_model` reads"
-    elif missing == names[3:]:
-        why = "this is a point cloud, not a 3DGS model"
-    else:
-        why = "this is not a 3DGS model"
-    raise InputError(f"{path}: {why}: properties missing: {', '.join(missing)}")
-
-
-def _settle(rows: npt.NDArray[np.float32], names: list[str]) -> str | None:
-    """Clamp infinite opacity logits in place; say what is still wrong with the values, if anything."""
-    if len(rows) == 0:
-        return "it holds no Gaussians"
-    opacity = rows[:, names.index("opacity")]
-    opacity[np.isposinf(opacity)] = OPACITY_LOGIT_BOUND
-    opacity[np.isneginf(opacity)] = -OPACITY_LOGIT_BOUND
-    bad = np.count_nonzero(~np.isfinite(rows), axis=0)
-    wrong = [f"{name} in {count:,}" for name, count in zip(names, bad, strict=True) if count]
-    if not wrong:
-        return None
-    more = f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else ""
-    return f"NaN or infinite values among {len(rows):,} Gaussians: {', '.join(wrong[:5])}{more}"
-
-
-def _model_names(k: int) -> list[str]:
-    """The layout's properties in order, without the normals, for `k` SH basis functions."""
-    colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(3 * (k - 1)))]
-    shape = [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    return ["x", "y", "z", *colors, "opacity", *shape]

@@ -12,14 +12,16 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from keyss.core.errors import InputError
-from keyss.files.layout import PointCloud
 from keyss.files.streams import StandardInput
+
+if TYPE_CHECKING:
+    from keyss.files.layout import PointCloud
 
 MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
@@ -244,6 +246,8 @@ def read_point_cloud(path: Path) -> PointCloud:
 
     Raises InputError when the file is no such PLY, is truncated or holds coordinates that are not finite.
     """
+
+    from keyss.files.layout import PointCloud  # with what undoes lenses, which models need not
 
     def choose(found: dict[str, str]) -> list[str]:
         missing = {"x", "y", "z"} - found.keys()

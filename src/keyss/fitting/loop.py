@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.core.errors import Interrupted as Interrupted
@@ -26,6 +27,10 @@ class TrainingRun(Protocol):
 
     iterations: int
     iteration: int  # steps done
+
+    @property
+    def loss(self) -> float | Tensor:
+        """That of the last step."""
 
     def step(self) -> None:
         """One optimisation step; increases `iteration`."""
@@ -44,11 +49,18 @@ class TrainingRun(Protocol):
 class Reporter(Protocol):
     """Where progress goes."""
 
+    @property
+    def loss_every(self) -> int:
+        """Every so many steps the loss is among the numbers; 0: never, for it costs a GPU its pace."""
+
     def start(self, title: str, iterations: int, iteration: int) -> None:
         """`iteration` steps of `iterations` are done already, which is more than 0 for a resumed run."""
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         """So many steps are done; `gaussians` is 0 and `numbers` empty where there are none to tell."""
+
+    def note(self, line: str) -> None:
+        """Something to know before the work begins."""
 
     def finish(self) -> None:
         """The work is done, or was interrupted."""
@@ -57,9 +69,13 @@ class Reporter(Protocol):
 class SilentReporter:
     """Says nothing."""
 
+    loss_every = 0
+
     def start(self, title: str, iterations: int, iteration: int) -> None: ...
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None: ...
+
+    def note(self, line: str) -> None: ...
 
     def finish(self) -> None: ...
 
@@ -119,7 +135,10 @@ def train(
                 run.step()
                 if evaluate_every and run.iteration % evaluate_every == 0:
                     numbers = run.evaluate()
-                reporter.update(run.iteration, len(run), numbers)
+                told = numbers
+                if reporter.loss_every and run.iteration % reporter.loss_every == 0:
+                    told = numbers | {"loss": float(run.loss)}
+                reporter.update(run.iteration, len(run), told)
                 if (signum := interrupted()) is not None:
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)

@@ -83,6 +83,7 @@ class PlainRun:
                 self.parameters, self.optimizers, self.density, self.iteration, meta
             )
         loss.backward()
+        self.loss = loss.detach()
         self._set_rates()
         for optimizer in self.optimizers.values():
             optimizer.step()

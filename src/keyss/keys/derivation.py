@@ -79,8 +79,8 @@ class DerivedKey:
     """What a key becomes under one `KeyDerivation`.
 
     The labels in use: "embedding" (what conditions the decoder), "verifier" (tells keys apart while hiding),
-    "seal" (wraps the sidecar's data key), "low-bits/key" (encrypts the data key in a model's low bits),
-    "rank-shift" (encrypts transparent Gaussians), "writer" (part of the writer's randomness), "decoy".
+    "low-bits/key" (encrypts the data key in a model's low bits), "writer" (part of the writer's randomness),
+    "decoy", and those of the other channels.
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:

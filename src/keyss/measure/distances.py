@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.files.ply import OPACITY_LOGIT_BOUND
+from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
 Floats = npt.NDArray[np.float32]
 

@@ -72,7 +72,6 @@ def speed(
     scenes: Sequence[Scene],  # the cover, then the secrets
     plains: Sequence[Gaussians],  # plain 3DGS models of the same scenes
     *,
-    sidecar: Path | None = None,
     rounds: int = 15,
     device: torch.device | str = "cpu",
     progress: Callable[[int, int, str], None] | None = None,
@@ -83,8 +82,7 @@ def speed(
     secret does not open.
     """
     names = ["stego", *(f"secret {number}" for number in range(1, len(scenes)))]
-    files = [] if sidecar is None else [FileSize("sidecar", sidecar.stat().st_size)]
-    rendered, revealed = [], []
+    files, rendered, revealed = [], [], []
     read: list[ReaderResult] = []
     with tempfile.TemporaryDirectory() as folder:
         for number, (name, scene, plain) in enumerate(zip(names, scenes, plains, strict=True)):

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from keyss.channels.base import Content
-from keyss.core.errors import KeyssError
+from keyss.channels.rooms import AnyChannel, Publish
+from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -117,9 +118,6 @@ class Opened(Protocol):
     def remains(self, revealed: Gaussians) -> Remains:
         """How much of the secret there is in what `reveal` gave."""
 
-    def check_belongs_to(self, stego: Gaussians) -> None:
-        """Raise InputError if the secret was hidden in another model, as one out of a sidecar may be."""
-
     def fingerprint(self) -> str:
         """16 hexadecimal digits by which a run knows its secrets; they say nothing without the secret."""
 
@@ -129,7 +127,6 @@ class Stego:
     """What hiding gives."""
 
     gaussians: Gaussians  # to be published
-    sidecar: bytes | None  # the encrypted payloads, where they are not in the model
     opened: tuple[Opened, ...]  # the secrets as they come out again with their keys
     seconds: float  # of hiding alone, without plain models
     iterations: int = 0  # of the method's own training
@@ -154,6 +151,17 @@ class MethodOptions:
     """What every method can be told; each has a class of its own that adds to it."""
 
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
+    publish: Publish = "ply"  # format that the published model is passed on in; any: it may be converted
+    # Of models that may be converted: appended Gaussians hold everything, and everybody can see that they are
+    # there; colours hold little and show less.
+    channel: AnyChannel = "appended"
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for what does not go together."""
+        if self.channel != "appended" and self.publish != "any":
+            raise UsageError(
+                f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
+            )
 
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`."""
@@ -208,12 +216,6 @@ class Method(Protocol):
 
     def unpack(self, content: Content) -> Opened:
         """The secret that lies in what a channel gave. Raises InputError for damage."""
-
-    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
-        """What somebody without a key, who has read the source of this method, makes of a stego model.
-
-        Models to be rendered in the cover's frame, by the name of the attack; for `keyss audit`.
-        """
 
 
 @contextmanager

@@ -55,9 +55,6 @@ class Decoy:
         """All of it: a decoy is never damaged."""
         return Remains(len(revealed), len(revealed))
 
-    def check_belongs_to(self, stego: Gaussians) -> None:
-        """It does: it is made of that model."""
-
     def fingerprint(self) -> str:
         """Of a decoy there is none that a run could know."""
         return "decoy"

@@ -1,12 +1,8 @@
-"""Any file as a secret: bytes with a name, which come out whole or not at all.
-
-It lies in low bits, or in the robust channel, which survives formats that round and is read by nobody else.
-"""
+"""Any file as a secret: bytes with a name, which come out whole or not at all."""
 
 from __future__ import annotations
 
 import struct
-import zlib
 from dataclasses import dataclass, field
 
 from keyss.channels.base import Content, Payload
@@ -15,7 +11,6 @@ from keyss.core.errors import InputError, UsageError
 NAME = "file"  # in the place of a method's
 MOST_NAME_BYTES = 255
 
-_MOST_RATIO = 16  # of compression: what a reader spends memory on is bounded
 _LENGTH = struct.Struct("<B")
 
 
@@ -32,27 +27,6 @@ class HiddenFile:
         if len(name) > MOST_NAME_BYTES:
             raise UsageError(f"expected a name of at most {MOST_NAME_BYTES} bytes, got {len(name)}")
         return Payload(NAME, _LENGTH.pack(len(name)) + name + self.data)
-
-    def packed(self) -> bytes:
-        """The same for a channel that does not compress."""
-        data = self.payload().data
-        packed = zlib.compress(data, 9)
-        return b"\1" + packed if len(packed) < len(data) <= _MOST_RATIO * len(packed) else b"\0" + data
-
-    @staticmethod
-    def unpacked(data: bytes) -> HiddenFile:
-        """What `packed` gave. Raises InputError for damage."""
-        if data[:1] == b"\1":
-            unpacker = zlib.decompressobj()
-            try:
-                payload = unpacker.decompress(data[1:], _MOST_RATIO * len(data))
-            except zlib.error as error:
-                raise InputError(f"the hidden file cannot be decompressed: {error}") from error
-            if not unpacker.eof:
-                raise InputError("the hidden file is damaged: it is not whole")
-        else:
-            payload = data[1:]
-        return HiddenFile.of(Payload(NAME, payload))
 
     @staticmethod
     def of(content: Content) -> HiddenFile:

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from keyss.channels.base import Content
-from keyss.channels.codes import CodesReader
-from keyss.channels.low_bits import LowBitsReader
-from keyss.channels.sidecar import decrypt_slots, read_header
+from keyss.channels.opening import open_content, quick_attempts
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.files.formats.common import CodedGaussians
-from keyss.keys.derivation import DerivedKey, KeyDerivation
 from keyss.methods import hidden_file
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
@@ -40,48 +34,20 @@ def of_options(options: MethodOptions) -> Method:
     raise UsageError(f"expected options of a method ({known}), got {type(options).__name__}")
 
 
-def open_model(stego: Gaussians, key: str, *, sidecar: bytes | None = None, decoy: bool = False) -> Opened:
-    """What `key` opens in the codes of a file's model, in the low bits of another, or in a `sidecar`'s bytes.
+def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
+    """What `key` opens in a model (see `keyss.channels.opening`).
 
     With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
     wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
     """
-    if sidecar is not None:
-        derived = DerivedKey(key, read_header(sidecar)[0])
-        try:
-            return _unpacked(decrypt_slots(sidecar, derived))
-        except WrongKeyError:
-            if not decoy:
-                raise
-            return Decoy.of(stego, derived)
     if not decoy:
         return _unpacked(open_content(stego, key))
-    for derived, reader in _one_way(stego, key):
+    for derived, reader in quick_attempts(stego, key):
         try:
             return _unpacked(reader.extract(derived))
         except WrongKeyError:
             return Decoy.of(stego, derived)
     raise WrongKeyError("this key opens nothing here")
-
-
-def open_content(stego: Gaussians, key: str) -> Content:
-    """What `key` opens in the codes of a file's model, or in the low bits of another, whoever reads it.
-
-    Raises WrongKeyError and InputError.
-    """
-    if isinstance(stego, CodedGaussians):
-        return CodesReader.of(stego.codes).open(key)
-    return LowBitsReader.of(stego).open(key)
-
-
-def _one_way(stego: Gaussians, key: str) -> Iterator[tuple[DerivedKey, CodesReader | LowBitsReader]]:
-    """What the key becomes under the likeliest salt, and what reads with it; none where there is no salt."""
-    if isinstance(stego, CodedGaussians):
-        codes = CodesReader.of(stego.codes)
-        yield DerivedKey(key, KeyDerivation(salt=codes.salt)), codes
-    else:
-        bits = LowBitsReader.of(stego)
-        yield from ((derived, bits) for derived in bits.keys(key, 1))
 
 
 def _unpacked(content: Content) -> Opened:

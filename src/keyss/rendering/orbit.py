@@ -89,7 +89,7 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
         position = middle + outward * reach * DISTANCES[index % len(DISTANCES)]
-        cameras.append(_looking(position, -outward, K, size, f"orbit_{index:03d}.png"))
+        cameras.append(looking(position, -outward, K, size, f"orbit_{index:03d}.png"))
     return cameras
 
 
@@ -116,12 +116,17 @@ def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
     return values[int(torch.searchsorted(total, share * total[-1]).clamp_max(len(values) - 1))]
 
 
-def _looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str) -> Camera:
+def looking(position: Tensor, forward: Tensor, K: Tensor, size: int, name: str) -> Camera:
     """A camera at `position` that looks along the unit vector `forward`, with -y up."""
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    return Camera(look_at(position, forward, torch.tensor([0.0, -1.0, 0.0])), K, size, size, name)
+
+
+def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
+    """[4, 4] world to camera, from `position` along the unit vector `forward`, which is not that of `up`."""
+    right = torch.linalg.cross(-up, forward)
     right = right / right.norm()
     down = torch.linalg.cross(forward, right)
-    viewmat = torch.eye(4)
+    viewmat = torch.eye(4, dtype=position.dtype)
     viewmat[:3, :3] = torch.stack([right, down, forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    return Camera(viewmat, K, size, size, name)
+    return viewmat

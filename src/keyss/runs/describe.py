@@ -14,6 +14,10 @@ from keyss.files.foreign import what_it_is
 from keyss.files.streams import is_standard
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
+    from numpy.typing import NDArray
     from torch import Tensor
 
     from keyss.core.scene import Scene
@@ -58,29 +62,8 @@ class SceneInfo:
     background: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class KeyDerivationInfo:
-    """What Argon2id costs."""
-
-    function: str
-    memory_kib: int
-    time_cost: int
-    parallelism: int
-
-
-@dataclass(frozen=True)
-class SidecarInfo:
-    """A sidecar; it does not tell how many secrets there are."""
-
-    kind: str
-    path: str
-    bytes: int
-    key_derivation: KeyDerivationInfo
-
-
-def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
-    """What is in a model, "-" for standard input, a sidecar, a scene folder or a folder of results. Raises
-    InputError.
+def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
+    """What is in a model, "-" for standard input, a scene folder or a folder of results. Raises InputError.
 
     Photos that a scene names but that are not there are left out, with a KeyssWarning.
     """
@@ -90,16 +73,24 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo | SidecarInfo:
+def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     if not is_standard(path):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
         if path.is_dir():
             return _folder_info(path)
 
-    from keyss.files.models import is_model_path
+    if path.suffix.lower() == ".ply" and (rows := _ply_rows(path)) is not None:
+        return _table_info(path, *rows)
 
-    return _model_info(path) if is_standard(path) or is_model_path(path) else _sidecar_info(path)
+    from keyss.files.models import is_model_path, known_suffixes
+
+    if not (is_standard(path) or is_model_path(path)):
+        raise InputError(
+            f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
+            f"{what_it_is(path)}"
+        )
+    return _model_info(path)
 
 
 def _folder_info(path: Path) -> RunInfo | SceneInfo:
@@ -115,24 +106,30 @@ def _folder_info(path: Path) -> RunInfo | SceneInfo:
     return _scene_info(load_scene(path, skip_missing=True))
 
 
-def _sidecar_info(path: Path) -> SidecarInfo:
-    from keyss.channels.sidecar import MAGIC, read_header
-    from keyss.files.models import known_suffixes
-    from keyss.runs.opening import read_sidecar
+def _ply_rows(path: Path) -> tuple[list[str], NDArray[np.float32]] | None:
+    """Of a model in plain PLY the properties' names and values; None for whatever else has its name."""
+    from keyss.files.ply_rows import is_compressed, read_rows
 
     with path.open("rb") as file:
-        start = file.read(len(MAGIC))
-    if start != MAGIC:
-        raise InputError(
-            f"{path}: expected a model ({known_suffixes()}), a sidecar, a scene folder or a result "
-            f"folder, found {what_it_is(path)}"
-        )
-    try:
-        costs, _, _ = read_header(read_sidecar(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    derivation = KeyDerivationInfo("Argon2id", costs.memory_kib, costs.time_cost, costs.parallelism)
-    return SidecarInfo("sidecar", str(path), path.stat().st_size, derivation)
+        begins = file.read(3) == b"ply"
+    return read_rows(path) if begins and not is_compressed(path) else None
+
+
+def _table_info(path: Path, names: list[str], rows: NDArray[np.float32]) -> ModelInfo:
+    """Without torch, which takes longer to load than all the rest; other formats are unpacked with it."""
+    import numpy as np
+
+    logits = rows[:, names.index("opacity")]
+    low, high = rows[:, :3].min(axis=0), rows[:, :3].max(axis=0)
+    return ModelInfo(
+        kind="3DGS model",
+        path=str(path),
+        bytes=path.stat().st_size,
+        gaussians=len(rows),
+        sh_degree=round(((len(names) - 11) // 3) ** 0.5) - 1,
+        bounding_box=(_rounded(low), _rounded(high)),
+        nearly_transparent=round(float((logits < np.log(0.05 / 0.95)).mean()), 4),
+    )
 
 
 def _model_info(path: Path) -> ModelInfo:
@@ -164,5 +161,5 @@ def _scene_info(scene: Scene) -> SceneInfo:
     )
 
 
-def _rounded(values: Tensor) -> tuple[float, ...]:
+def _rounded(values: Tensor | Iterable[float]) -> tuple[float, ...]:
     return tuple(round(float(x), 4) for x in values)

@@ -15,7 +15,7 @@ from keyss.files.models import write_model
 from keyss.runs.folder import PRIVATE, PUBLISH
 from keyss.runs.records import record_bytes
 
-STEGO, SIDECAR = f"{PUBLISH}/stego.ply", f"{PUBLISH}/decoder.sealed"
+STEGO = f"{PUBLISH}/stego.ply"
 STEGOS = (STEGO, *(f"{PUBLISH}/stego{suffix}" for suffix in SUFFIXES.values()))  # whatever the format
 MODEL = "model.ply"  # of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"

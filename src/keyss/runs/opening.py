@@ -13,23 +13,19 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.foreign import what_it_is
 from keyss.files.models import known_suffixes, read_model
-from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
-from keyss.files.streams import is_standard
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
 from keyss.runs.config import Background, PathLike, RunConfig, read_config, secret_ids
-from keyss.runs.files import CONFIG, METRICS, SIDECAR, is_run, model_in, plain_names, run_folder, stego_in
+from keyss.runs.files import CONFIG, METRICS, is_run, model_in, plain_names, run_folder, stego_in
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 
-MOST_SIDECAR_BYTES = 1 << 30
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the file may not be as it was published "
-    "(converted or quantised, moved, scaled, pruned, edited or trained on); its sidecar "
-    f"({Path(SIDECAR).name}) may be missing or another one; it may be a file that is hidden, which comes out "
-    "under a name that is no model's; or nothing is hidden here"
+    "(converted or quantised, moved, scaled, pruned, edited or trained on); it may be a file that is "
+    "hidden, which comes out under a name that is no model's; or nothing is hidden here"
 )
 
 
@@ -41,7 +37,6 @@ class HidingRun:
     config: RunConfig[MethodOptions]
     metrics: HideMetrics
     stego: Gaussians
-    sidecar: bytes | None
     opened: tuple[Opened, ...]  # in the order of the secrets
     keys: tuple[str, ...] = field(repr=False)  # in the same order
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
@@ -80,9 +75,8 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
-    published = stego_in(folder)
-    stego, sidecar = read_model(published), sidecar_beside(published)
-    every = [open_file(stego, key, sidecar) for key in keys]
+    stego = read_model(stego_in(folder))
+    every = [open_in(stego, key) for key in keys]
     names = secret_ids(config.options.fit.known_seed, every)
     found = dict(zip(names, zip(every, keys, strict=True), strict=True))
     if set(found) != set(config.payloads):
@@ -90,23 +84,13 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
             f"expected the keys of all {len(config.payloads)} secret(s), got {len(found)} of them"
         )
     secrets, own = zip(*(found[each] for each in config.payloads), strict=True)
-    data = None if sidecar is None else read_sidecar(sidecar)
-    return HidingRun(folder, config, metrics, stego, data, secrets, own, sources)
+    return HidingRun(folder, config, metrics, stego, secrets, own, sources)
 
 
-def open_file(stego: Gaussians, key: str, sidecar: PathLike | bytes | None, *, decoy: bool = False) -> Opened:
-    """The secret that the key opens; see `registry.open_model`. Errors name the sidecar's file.
-
-    A key that opens nothing is told so in the same words whatever there is: they say nothing of the file.
-    """
-    data = read_sidecar(Path(sidecar)) if isinstance(sidecar, str | Path) else sidecar
-    try:
-        with naming_what_opens_nothing():
-            return registry.open_model(stego, key, sidecar=data, decoy=decoy)
-    except InputError as error:
-        if isinstance(sidecar, str | Path):
-            raise InputError(f"{sidecar}: {error}") from error
-        raise
+def open_in(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
+    """The secret that the key opens; see `registry.open_model`."""
+    with naming_what_opens_nothing():
+        return registry.open_model(stego, key, decoy=decoy)
 
 
 @contextmanager
@@ -116,19 +100,6 @@ def naming_what_opens_nothing() -> Iterator[None]:
         yield
     except WrongKeyError as error:
         raise WrongKeyError(OPENS_NOTHING) from error
-
-
-def read_sidecar(path: Path) -> bytes:
-    """The bytes of a sidecar's file. Raises InputError for one that is missing or beyond all measure."""
-    return read_file(path, MOST_SIDECAR_BYTES)
-
-
-def sidecar_beside(stego: Path) -> Path | None:
-    """The sidecar beside a model's file, if there is one."""
-    if is_standard(stego):
-        return None
-    path = stego.parent / Path(SIDECAR).name
-    return path if path.exists() else None
 
 
 def as_scene(

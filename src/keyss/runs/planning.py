@@ -30,9 +30,11 @@ from keyss.fitting.parameters import (
     to_parameters,
 )
 from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput
+from keyss.progress import about
 from keyss.rendering import render, render_with_meta
 from keyss.rendering.orbit import TEST_EVERY, VIEWS
 
+_LONG = 1000  # steps
 _PROBES = 3  # steps that are timed, after one that is not
 _WATCHED = 8  # views that a training looks at every `evaluate_every` steps
 _KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and opening it again
@@ -66,6 +68,10 @@ class Plan:
     @property
     def seconds(self) -> float:
         return sum(stage.seconds for stage in self.stages)
+
+    def __str__(self) -> str:
+        """In one line, what a person wants to know before the run begins."""
+        return _line(self.seconds, self.memory_bytes, self.disk_bytes)
 
 
 def plan_hiding(
@@ -119,6 +125,27 @@ def plan_hiding(
         disk_bytes=disk_bytes(method, options, inputs),
         free_bytes=None if out is None else free_bytes(out),
         memory_bytes=memory,
+    )
+
+
+def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> str:
+    """What a plain fit will take, in one line."""
+    most = config.max_gaussians
+    stage = _fitting("fit", config, _Probe(scene, None, config, config.sh_degree, device, True), most)
+    state = most * _floats(config.sh_degree) * 4
+    disk = 2 * _STATE_COPIES * state + _file_bytes(most, config.sh_degree) + _OTHER_BYTES
+    return _line(stage.seconds, _resident_bytes() + state * (4 + 2 * _STATE_COPIES), disk)
+
+
+def worth_planning(config: FitConfig) -> bool:
+    """Whether a training takes so much longer than to plan it that a person wants to know."""
+    return config.iterations >= _LONG
+
+
+def _line(seconds: float, memory: int, disk: int) -> str:
+    return (
+        f"about {about(seconds)} on this machine as busy as it is, {memory / 1e9:.1f} GB of memory, up to "
+        f"{disk / 1e6:,.0f} MB of disk"
     )
 
 

@@ -35,9 +35,8 @@ class ModelCheck:
 
 @dataclass(frozen=True)
 class SecretCheck:
-    """The secret of a key, in a model or in its sidecar."""
+    """The secret of a key."""
 
-    where: str  # "model" or "sidecar"
     found: int  # Gaussians
     hidden: int  # Gaussians that there were; 0: not known
     share: float  # the one of the other
@@ -106,7 +105,6 @@ def check_secret(found: RevealResult) -> SecretCheck:
     if lost:
         problems.append(f"{lost:,} of {chunks:,} chunks of its payload are lost; the others make up for them")
     return SecretCheck(
-        where="sidecar" if found.from_sidecar else "model",
         found=remains.found,
         hidden=remains.hidden,
         share=round(remains.share, 4),

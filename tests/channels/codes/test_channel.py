@@ -14,7 +14,6 @@ from channels.codes.published import FORMATS, codes_of, model_of, there_and_back
 from keyss.channels.base import Payload
 from keyss.channels.codes import CodesCover, CodesReader, payload_size
 from keyss.channels.codes.fields import Field, format_of
-from keyss.channels.codes.layout import SLOT_BYTES
 from keyss.channels.codes.order import Counted
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files.formats import sog, spz
@@ -32,7 +31,13 @@ def key(number: int) -> DerivedKey:
 
 def written(cover: CodesCover, *payloads: bytes, entropy: bytes = ENTROPY) -> Any:
     secrets = [(key(i), Payload("carry", data)) for i, data in enumerate(payloads)]
-    return cover._embedded(secrets, cover._mixed(entropy, [each for _, each in secrets]))
+    for attempt in range(20):
+        found = cover._embedded(
+            secrets, cover._mixed(entropy + bytes([attempt]), [each for _, each in secrets])
+        )
+        if found is not None:
+            return found
+    raise AssertionError
 
 
 @EVERY
@@ -79,10 +84,11 @@ def test_capacity_is_exact(suffix: str) -> None:
 def test_what_carries_is_known_from_what_stays(suffix: str) -> None:
     """Writing ten times over what was written leaves the places where they are."""
     codes = codes_of(suffix)
-    masks = [each.usable for each in Counted.of(codes).fields]
+    bits = [each.bits for each in Counted.of(codes).fields]
+    assert sum(int(each.sum()) for each in bits) > 10 * len(codes)
     for round_ in range(10):
         codes = written(CodesCover.of(codes), b"data", entropy=bytes([round_]) * 32)
-        assert all(map(np.array_equal, masks, (each.usable for each in Counted.of(codes).fields)))
+        assert all(map(np.array_equal, bits, (each.bits for each in Counted.of(codes).fields)))
 
 
 @EVERY
@@ -90,16 +96,14 @@ def test_levels_move_by_as_little_as_can_be(suffix: str) -> None:
     before, model = codes_of(suffix), model_of()
     cover = CodesCover.of(before, model)
     after = Counted.of(written(cover, bytes(1000)))
-    for old, new in zip(cover.fields, after.fields, strict=True):
+    for old, new, free in zip(cover.fields, after.fields, cover.free, strict=True):
         moved = np.abs(new.levels - old.levels)
-        if old.name != "positions":  # which stay in their cells
-            inside = (old.levels - old.low >= 1 << old.bits) & (old.high - old.levels >= 1 << old.bits)
-            further = moved[inside] > (1 << old.bits) // 2
-            # A part of a quaternion goes the other way where it would become larger than the largest.
-            assert further.mean() < (0.01 if old.name == "rotations" else 1e-9)
-        assert moved.max() <= 1 << old.bits
-        assert not moved[~old.usable].any()
-        assert (new.levels[new.usable] >= new.low[new.usable]).all()
+        assert not moved[~free].any()
+        assert (moved <= (1 << old.bits) // 2).all()
+        # Of uniform residues half lie as far away as a quarter of their range; rounding takes a little of it.
+        large = free & (old.bits >= 3)
+        if large.any():
+            assert 0.3 < (moved[large] > (1 << old.bits[large]) // 4).mean() < 0.55
 
 
 @EVERY
@@ -115,20 +119,21 @@ def test_nothing_else_changes(suffix: str) -> None:
 
 
 @EVERY
-def test_every_usable_bit_is_written(suffix: str) -> None:
+def test_every_bit_that_may_change_is_written(suffix: str) -> None:
     """Each of them is 0 in half of the files and 1 in the others, however short the payload is."""
     cover = CodesCover.of(codes_of(suffix, 3000))
     reads = np.stack(
-        [
-            np.concatenate(CodesReader.of(written(cover, b"data", entropy=bytes([i]) * 32)).bits)
-            for i in range(64)
-        ]
+        [CodesReader.of(written(cover, b"data", entropy=bytes([i]) * 32)).bits for i in range(64)]
     )
-    ones = reads.mean(axis=0)
+    dry = cover._dry().astype(bool)
+    assert 0.8 < dry.mean() < 1
+    kept = np.concatenate([each.read() for each in cover.fields])[~dry]
+    assert (reads[:, ~dry] == kept).all()
+    ones = reads[:, dry].mean(axis=0)
     assert not ((ones == 0) | (ones == 1)).any()  # none is left alone: by chance 2^-63 of them
-    assert abs(float(ones.mean()) - 0.5) < 6 * 0.5 / reads.size**0.5
-    pairs = (reads[:, 1:] == reads[:, :-1]).mean()
-    assert abs(float(pairs) - 0.5) < 6 * 0.5 / reads.size**0.5
+    assert abs(float(ones.mean()) - 0.5) < 6 * 0.5 / (64 * dry.sum()) ** 0.5
+    pairs = (reads[1:, dry] == reads[:-1, dry]).mean()
+    assert abs(float(pairs) - 0.5) < 6 * 0.5 / (63 * dry.sum()) ** 0.5
 
 
 @EVERY
@@ -142,12 +147,21 @@ def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str)
 
 @EVERY
 def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
+    """But for the few bits that hold salt and slots, or nothing."""
     cover = CodesCover.of(codes_of(suffix))
-    file = written(cover, bytes(range(256)) * 20)
-    colors = file.colors.copy()
-    colors[colors % 2 == 0] += 1
-    with pytest.raises(InputError, match="damaged"):
-        CodesReader.of(replace(file, colors=colors)).extract(key(0))
+    data = np.random.default_rng(0).bytes(cover.capacity * 9 // 10)
+    file = written(cover, data)
+    damaged = 0
+    for row in range(0, 6000, 400):
+        rotations = file.rotations.copy()
+        rotations[row, 0] ^= 1
+        try:
+            assert CodesReader.of(replace(file, rotations=rotations)).extract(key(0)).data == data
+        except WrongKeyError:
+            continue
+        except InputError as error:
+            damaged += "damaged" in str(error)
+    assert damaged > 10
 
 
 def test_equal_keys_no_secrets_and_too_many() -> None:
@@ -170,20 +184,15 @@ def test_small_models_have_no_room(suffix: str) -> None:
         CodesReader.of(codes_of(suffix, 300))
 
 
-def test_columns_on_a_lattice_carry_nothing_and_the_rest_does() -> None:
+def test_columns_on_a_lattice_stay_and_the_rest_carries() -> None:
     codes = codes_of(".spz")
     positions = codes.positions.copy()
     positions[:, 0] = positions[:, 0] // 64 * 64 + 7
     positions[:, 1] = 1000
-    colors = np.where(codes.colors > 0, 128, 0).astype(np.uint8)
-    cover = CodesCover.of(replace(codes, positions=positions, colors=colors))
+    cover = CodesCover.of(replace(codes, positions=positions))
     file = written(cover, b"data" * 99)
-    # Of the first column only what holds salt and slots is written.
-    changed = (file.positions[:, 0] != positions[:, 0]).sum()
-    assert 0 < changed <= (16 + cover.room.slots * SLOT_BYTES) * 8 / 4
-    assert np.array_equal(file.positions[:, 1], positions[:, 1])
-    assert np.array_equal(file.colors, colors)
-    assert (file.positions[:, 2] != positions[:, 2]).mean() > 0.8
+    assert np.array_equal(file.positions[:, :2], positions[:, :2])
+    assert (file.positions[:, 2] != positions[:, 2]).mean() > 0.5
     assert CodesReader.of(file).extract(key(0)).data == b"data" * 99
 
 
@@ -209,20 +218,19 @@ def test_rotations_keep_both_zeros() -> None:
 
 @EVERY
 def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None:
-    """But for about as many as rounding alone makes."""
+    """But for those that rounding alone makes, which stay, too."""
     cover = CodesCover.of(codes_of(suffix, 20_000), model_of(20_000))
     after = Counted.of(written(cover, b"data"))
     centre, step = format_of(cover.codes).turns(cover.codes) or (0.0, 0.0)
 
-    def wrong(fields: list[Field]) -> int:
+    def wrong(fields: list[Field]) -> Any:
         levels = np.stack([each.levels for each in fields if each.name == "rotations"], axis=1)
         parts = np.abs(levels - centre) * step
         rest = 1 - np.square(parts).sum(axis=1)
-        return int((np.square(parts.max(axis=1)) > rest).sum())
+        return np.square(parts.max(axis=1)) > rest
 
-    assert wrong(cover.fields) > 5
-    assert wrong(after.fields) <= wrong(cover.fields)
-    assert CodesReader.of(after.codes).extract(key(0)).data == b"data"
+    assert wrong(cover.fields).sum() > 5
+    assert np.array_equal(wrong(after.fields), wrong(cover.fields))
 
 
 def test_old_spz_carries_too() -> None:

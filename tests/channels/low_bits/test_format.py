@@ -11,12 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import plyfile
+import pytest
 from argon2.low_level import Type, hash_secret_raw
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
+
+pytestmark = pytest.mark.argon2
 
 FOLDER = Path(__file__).parents[2] / "vectors"
 EXPECTED = json.loads((FOLDER / "carried.json").read_text())

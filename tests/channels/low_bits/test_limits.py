@@ -16,8 +16,8 @@ from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels.base import Payload
 from keyss.channels.low_bits import LOW_BITS, LowBitsReader, writing
 from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
-from keyss.channels.low_bits.reed_solomon import MAX_CHUNKS
 from keyss.channels.low_bits.spread import MAX_BLOCKS, Spread
+from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError
 from keyss.keys.encryption import _NONCE, SMALL_PAYLOAD, _cipher, decrypt, encrypt
 

@@ -8,7 +8,7 @@ import reedsolo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from keyss.channels.low_bits.reed_solomon import decode, encode
+from keyss.channels.reed_solomon import decode, encode
 
 
 def _data(k: int, width: int = 5, seed: int = 0) -> np.ndarray:

@@ -43,7 +43,7 @@ def stego(prepared: RobustCover, payload: bytes) -> Gaussians:
 
 
 def test_text_keys_open_what_they_were_given(prepared: RobustCover) -> None:
-    """With Argon2id, which all other tests skip."""
+    """All the way from the text; other tests begin with what it becomes."""
     stego = prepared.embed([("Rosebud, 1941", b"snow")], strength=STRENGTH, entropy=ENTROPY)
     assert extract(stego, "Rosebud, 1941") == b"snow"
     with pytest.raises(WrongKeyError):

@@ -10,6 +10,8 @@ import pytest
 from keyss.core.errors import BackendError
 from keyss.measure.robustness.conversions import find_splat_transform, transform
 
+NEWER = Path(__file__).parents[3] / "web" / "node_modules" / ".bin" / "splat-transform"
+
 
 @pytest.fixture(scope="session")
 def splat_transform() -> Callable[..., Path]:
@@ -18,4 +20,13 @@ def splat_transform() -> Callable[..., Path]:
         find_splat_transform()
     except BackendError as error:
         pytest.skip(str(error))
+    return transform
+
+
+@pytest.fixture
+def splat_transform_3(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """The same by its version 3, which the viewer's tests bring along."""
+    if not NEWER.exists():
+        pytest.skip("no web/node_modules: `make test-web` installs splat-transform 3")
+    monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(NEWER))
     return transform

@@ -150,6 +150,7 @@ def webp(width: int, height: int) -> bytes:
     return data.getvalue()
 
 
+@pytest.mark.alone
 def test_a_webp_of_huge_size() -> None:
     """Its header says so; 1 GB would be what its few bytes unpack to."""
     small = bytearray(webp(16, 16))

@@ -65,16 +65,22 @@ def test_too_large_secrets_are_refused_or_pruned(publish: str) -> None:
 
 def test_a_whole_model_comes_back_as_its_records_would() -> None:
     model = model_of(3000, sh_degree=2)
-    for more in (0, 7, 20):
-        data = whole.encode(model, Table.floor(2).total + more)
+    sizes, costs = [], []
+    for bits in (97, whole.USUAL_BITS, 123, whole.MOST_BITS):
+        data = whole.encode(model, whole.Precision.of_size(bits))
         opened = whole.decode(data)
         assert opened.count == len(opened.gaussians) == 3000
-        assert cost(model, opened.gaussians) > 40
-    assert len(whole.encode(model, Table.floor(2).total)) * 8 < 3000 * Table.floor(2).total
+        sizes.append(len(data))
+        costs.append(cost(model, opened.gaussians))
+    assert sizes == sorted(sizes)
+    assert costs == sorted(costs)
+    assert costs[0] > 34
+    assert costs[1] > 40
+    assert sizes[1] * 8 < 3000 * Table.floor(2).total
 
 
 def test_damaged_encodings_end_in_an_input_error() -> None:
-    data = whole.encode(model_of(500), Table.floor(1).total)
+    data = whole.encode(model_of(500))
     generator = torch.Generator().manual_seed(0)
     for cut in (0, 3, 50, 200, len(data) - 1):
         with pytest.raises(InputError):
@@ -98,3 +104,12 @@ def test_a_published_file_as_cover_is_taken_as_it_is(publish: str, tmp_path: Pat
     write_model(path, model_of(3000))
     model = read_model(path)
     assert prepare(model, publish).codes == Counted.of(model.codes).codes  # type: ignore[attr-defined]
+
+
+@EVERY
+def test_what_carries_is_the_file_that_would_be_written_without_secrets(publish: str, tmp_path: Path) -> None:
+    model = model_of(3000)[torch.randperm(3000, generator=torch.Generator().manual_seed(0))]
+    path = tmp_path / f"plain{SUFFIXES[publish]}"
+    write_model(path, model)
+    written = read_model(path).codes  # type: ignore[attr-defined]
+    assert prepare(model, publish).codes == Counted.of(written).codes

@@ -12,6 +12,8 @@ from keyss.core import WrongKeyError
 from keyss.files.ply import read_ply
 from methods.carry.carried import extract
 
+pytestmark = pytest.mark.argon2
+
 FOLDER = Path(__file__).parents[2] / "vectors"
 VECTOR = json.loads((FOLDER / "carried.json").read_text())
 STEGO = read_ply(FOLDER / "carried.ply")

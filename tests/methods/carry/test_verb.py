@@ -113,7 +113,7 @@ def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
     for flags in ((), ("--thin",)):
         status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", *flags)
         assert status == 2
-        assert "--method learned --sidecar" in err
+        assert "--publish any" in err
         assert "--prune-to-fit" not in err
         assert not (tmp_path / "out").exists()
 
@@ -132,7 +132,7 @@ def test_one_key_for_two_secrets_is_refused_before_any_work(
 @pytest.mark.parametrize(
     ("arguments", "having"),
     [
-        (("--sidecar", "--method", "carry"), "learned"),
+        (("--start", "points", "--method", "carry"), "learned"),
         (("--mask", "op", "--method=carry"), "learned"),
         (("--key_encoder=clip", "--method", "learned", "--method", "carry"), "learned"),
         (("--thin",), "carry"),

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -117,16 +118,17 @@ def test_hiding_encrypts_what_clip_gives(
 
     monkeypatch.setattr(ClipKeys, "__init__", counted)
     fit = FitConfig(iterations=10, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)
-    config = LearnedOptions(fit=fit, key_encoder="clip", clip_model=str(folder), sidecar=True)
+    clip: dict[str, Any] = {"key_encoder": "clip", "clip_model": str(folder)}
+    config = LearnedOptions(fit=fit, start="points", hidden=(8, 8), branch=8, **clip)
     scenes, models = (
         [tiny_scene(seed) for seed in range(3)],
         [random_gaussians(seed=seed) for seed in range(3)],
     )
-    hidden = hide_scenes(scenes, ["Key", "key"], config, plains=models, sidecar=True)
-    first, second = (open_secret(hidden.stego, key, hidden.sidecar) for key in ("Key", "key"))
+    hidden = hide_scenes(scenes, ["Key", "key"], config, plains=models)
+    first, second = (open_secret(hidden.stego, key) for key in ("Key", "key"))
     assert loads == [str(folder)]  # once for preparing and hiding together
     assert torch.equal(first.embedding, encoder("key"))
     assert torch.equal(second.embedding, encoder("key"))
     assert pack_secret(first) != pack_secret(second)
     with pytest.raises(WrongKeyError):
-        open_secret(hidden.stego, "KEY", hidden.sidecar)
+        open_secret(hidden.stego, "KEY")

@@ -11,13 +11,16 @@ from typing import Any
 import pytest
 import torch
 
-from keyss.core import Gaussians, InputError, Scene, UsageError, WrongKeyError
+from keyss.channels.appended import is_appended
+from keyss.core import Gaussians, InputError, KeyssWarning, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.keys import random_embeddings
 from keyss.methods import registry
+from keyss.methods.base import SceneInput
+from keyss.methods.learned.decoder import parse_mask
 from keyss.methods.learned.joint import JointRun, combine_densification
 from keyss.methods.learned.options import PRESETS, LearnedOptions
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene
@@ -28,9 +31,15 @@ from tiny_scenes import random_gaussians, tiny_scene
 CONFIG = LearnedOptions(
     fit=FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
 )
+SMALL: dict[str, Any] = {"hidden": (16, 16), "branch": 8}  # a decoder of few bytes
+POINTS = replace(CONFIG, start="points", mask=parse_mask("op,ro,sc,xyz,sh"), decoder_rate=1e-2, **SMALL)
 # What the paper has, small.
 PAPER = replace(
-    PRESETS["paper"], fit=replace(CONFIG.fit, iterations=60), design="standardised", decoder_rate=3e-3
+    PRESETS["paper"],
+    fit=replace(CONFIG.fit, iterations=60),
+    design="standardised",
+    decoder_rate=3e-3,
+    **SMALL,
 )
 KEYS = ("first key", "second key")
 
@@ -72,22 +81,22 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     scenes, models = _scenes()
-    return hide_scenes(scenes, KEYS, CONFIG, plains=models, sidecar=True)
+    config = replace(POINTS, fit=replace(CONFIG.fit, iterations=200))
+    return hide_scenes(scenes, KEYS, config, plains=models)
 
 
 def test_the_published_model_shows_the_cover(hidden: Hidden) -> None:
     scenes, _ = _scenes()
-    assert len(hidden.stego) <= CONFIG.fit.max_gaussians
-    assert _psnr(hidden.stego, scenes[0]) > 30
-    assert _psnr(hidden.stego, scenes[2]) < 18
+    assert int((~is_appended(hidden.stego)).sum()) <= CONFIG.fit.max_gaussians
+    for other in scenes[1:]:
+        assert _psnr(hidden.stego, other) < _psnr(hidden.stego, scenes[0]) - 1
 
 
 @pytest.mark.parametrize("secret", [1, 2])
 def test_each_key_opens_its_secret_in_its_own_frame(hidden: Hidden, secret: int) -> None:
     scenes, _ = _scenes()
     revealed = hidden.secrets[secret - 1].reveal(hidden.stego)
-    assert _psnr(revealed, scenes[secret]) > 26
-    assert _psnr(revealed, scenes[secret]) > _psnr(hidden.stego, scenes[secret]) + 10
+    assert _psnr(revealed, scenes[secret]) > _psnr(hidden.stego, scenes[secret]) + 4
 
 
 def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> None:
@@ -103,25 +112,34 @@ def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> No
 
 def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:
     for key, secret in zip(KEYS, hidden.secrets, strict=True):
-        opened = open_secret(hidden.stego, key, hidden.sidecar)
+        opened = open_secret(hidden.stego, key)
         assert torch.equal(opened.embedding, secret.embedding)
     for key in ("First key", "other"):
         with pytest.raises(WrongKeyError):
-            open_secret(hidden.stego, key, hidden.sidecar)
+            open_secret(hidden.stego, key)
 
 
 def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
     scenes, _ = _scenes()
     for embedding in random_embeddings(2, torch.Generator().manual_seed(5)):
         decoy = hidden.secrets[0].decode(hidden.stego, embedding)
-        assert _psnr(decoy, scenes[0]) > 26
+        assert _psnr(decoy, scenes[0]) == pytest.approx(_psnr(hidden.stego, scenes[0]), abs=0.1)
         assert _psnr(decoy, scenes[2]) < _psnr(hidden.stego, scenes[2]) + 1
 
 
-def test_a_model_too_small_for_its_low_bits_is_refused_before_any_work() -> None:
-    large = replace(PAPER, hidden=(128, 128))
-    with pytest.raises(UsageError, match=r"too small.*max_gaussians.*sidecar"):
-        hide_scenes(_scenes()[0], KEYS, large)
+def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
+    own = hidden.stego[~is_appended(hidden.stego)]
+    assert len(own) < len(hidden.stego) - 1000
+    for secret in hidden.secrets:
+        assert _same(secret.reveal(hidden.stego), secret.reveal(own))
+        assert secret.remains(secret.reveal(hidden.stego)).whole
+
+
+def test_decoders_that_will_be_appended_are_told_of_before_any_work() -> None:
+    inputs = [SceneInput(model, photos=True) for model in _scenes()[1]]
+    with pytest.warns(KeyssWarning, match=r"600 Gaussians is too small.*in appended Gaussians"):
+        registry.get("learned").prepare(inputs, POINTS)
+    registry.get("learned").prepare(inputs[:2], POINTS.with_fit(max_gaussians=6000))
 
 
 def test_a_model_large_enough_carries_its_secrets() -> None:
@@ -130,7 +148,6 @@ def test_a_model_large_enough_carries_its_secrets() -> None:
     config = replace(CONFIG, fit=fit)
     many = [random_gaussians(3200, seed=7), *_scenes()[1][1:]]
     hidden = hide_scenes(scenes, KEYS, config, plains=many)
-    assert hidden.sidecar is None
     assert len(hidden.stego) > 2500
     assert hidden.secrets == ()  # no decoder: the secrets themselves are in the low bits
     for key, scene in zip(KEYS, scenes[1:], strict=True):
@@ -142,9 +159,11 @@ def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: 
     scenes, _ = _scenes()
     chosen = torch.randperm(len(hidden.stego), generator=torch.Generator().manual_seed(0))
     shuffled = hidden.secrets[1].reveal(hidden.stego[chosen])
-    assert _psnr(shuffled, scenes[2]) > 26
-    hidden.secrets[1].reveal(hidden.stego[chosen[:200]])
-    with pytest.raises(InputError, match="another model"):
+    assert _psnr(shuffled, scenes[2]) == pytest.approx(
+        _psnr(hidden.secrets[1].reveal(hidden.stego), scenes[2]), abs=0.1
+    )
+    hidden.secrets[1].reveal(hidden.stego[chosen[: len(chosen) // 2]])
+    with pytest.raises(InputError, match="another one"):
         hidden.secrets[1].reveal(random_gaussians(seed=9))
     hidden.secrets[1].reveal(random_gaussians(seed=9), force=True)
 
@@ -165,36 +184,27 @@ class _InterruptAt(SilentReporter):
 
 
 @pytest.mark.parametrize(
-    ("base", "sidecar"),
-    [
-        (CONFIG, False),
-        (CONFIG, True),
-        (replace(CONFIG, decoder="network", sidecar=True), True),
-        (PAPER, True),
-    ],
+    ("base", "stage"), [(CONFIG, "refit"), (POINTS, "hide"), (replace(PAPER, residuals="one-sided"), "hide")]
 )
 def test_interrupted_at_any_stage_it_resumes_to_the_same_result(
-    tmp_path: Path, base: LearnedOptions, sidecar: bool
+    tmp_path: Path, base: LearnedOptions, stage: str
 ) -> None:
     scenes = _scenes()[0][:2]
     config = replace(base, fit=replace(CONFIG.fit, iterations=40, grow_every=5))
 
     def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
-        return hide_scenes(
-            scenes, KEYS[:1], config, sidecar=sidecar, checkpoints=tmp_path, resume=resume, reporter=reporter
-        )
+        return hide_scenes(scenes, KEYS[:1], config, checkpoints=tmp_path, resume=resume, reporter=reporter)
 
-    whole = hide_scenes(scenes, KEYS[:1], config, sidecar=sidecar)
+    whole = hide_scenes(scenes, KEYS[:1], config)
     with pytest.raises(Interrupted):
         run(False, _InterruptAt("plain model of the secret", 17))
     with pytest.raises(Interrupted):
-        run(True, _InterruptAt("hide" if sidecar else "refit", 23))
+        run(True, _InterruptAt(stage, 23))
     resumed = run(True)
     assert _same(resumed.stego, whole.stego)
-    assert resumed.sidecar == whole.sidecar
     changed = replace(config, fit=replace(config.fit, sh0_rate=1e-3))
     with pytest.raises(InputError, match="other settings"):
-        hide_scenes(scenes, KEYS[:1], changed, sidecar=sidecar, checkpoints=tmp_path, resume=True)
+        hide_scenes(scenes, KEYS[:1], changed, checkpoints=tmp_path, resume=True)
 
 
 def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
@@ -233,18 +243,12 @@ def test_combined_densification_scatters_and_unweights() -> None:
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match='`start="points"`'):
-        LearnedOptions(mask=("xyz",), decoder="network")
-    assert LearnedOptions(mask=("xyz",), start="points", decoder="network").mask == ("xyz",)
-    with pytest.raises(UsageError, match="network"):
-        LearnedOptions(start="points")
-    with pytest.raises(UsageError, match="network"):
-        LearnedOptions(mask=("op", "sh"))
-    with pytest.raises(UsageError, match="gate"):
-        LearnedOptions(conditioning="bias")
-    for decoding in ({"mask": ("op", "sh"), "decoder": "network"}, {"key_encoder": "clip"}):
-        with pytest.raises(UsageError, match="`sidecar=True`"):
-            LearnedOptions(**decoding)
-        LearnedOptions(**decoding, sidecar=True)
+        LearnedOptions(publish="any", start="points")
+    decoding: list[dict[str, Any]] = [{"mask": ("xyz",)}, {"key_encoder": "clip"}, {"conditioning": "bias"}]
+    for each in decoding:
+        with pytest.raises(UsageError, match='`start="points"` gives them one'):
+            LearnedOptions(**each)
+        LearnedOptions(**each, start="points")
 
 
 @pytest.mark.parametrize("preset", ["paper", "released"])
@@ -253,9 +257,9 @@ def test_the_published_presets_train(preset: str) -> None:
     scenes, models = _scenes()
     base = PRESETS[preset]
     config = replace(
-        base, fit=replace(CONFIG.fit, iterations=12, grow_every=4, ssim_weight=base.fit.ssim_weight)
+        base, fit=replace(CONFIG.fit, iterations=12, grow_every=4, ssim_weight=base.fit.ssim_weight), **SMALL
     )
-    hidden = hide_scenes(scenes, KEYS, config, plains=models, sidecar=True)
+    hidden = hide_scenes(scenes, KEYS, config, plains=models)
     for secret in hidden.secrets:
         revealed = secret.reveal(hidden.stego)
         assert 0 < len(revealed) <= len(hidden.stego)

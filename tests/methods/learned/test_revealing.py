@@ -1,4 +1,4 @@
-"""What becomes of models that came through a format with few bits."""
+"""What becomes of models that were rounded or pruned."""
 
 from __future__ import annotations
 
@@ -11,43 +11,6 @@ from channels.low_bits.trained_like import trained_like
 from keyss.core import InputError
 from keyss.methods.learned.payload import pack_secret, unpack_secret
 from methods.learned.hiding import some_secret
-
-
-def test_opacities_that_were_rounded_to_zero_are_taken_for_faint_ones() -> None:
-    stego = trained_like(200)
-    secret = some_secret(stego)
-    chosen = torch.arange(200) % 3 == 0
-    rounded, faint = (
-        replace(stego, opacity_logits=stego.opacity_logits.masked_fill(chosen, logit))
-        for logit in (-16.0, secret.decoder.nearly_opaque_logit)
-    )
-    assert torch.equal(
-        secret.reveal(rounded, force=True).opacity_logits,
-        secret.reveal(faint, force=True).opacity_logits,
-    )
-
-
-@pytest.mark.parametrize("logit", [-16.0, -10.0, -5.6])  # what converters write for an opacity of nothing
-def test_a_sidecar_knows_what_was_rounded_whatever_the_order(logit: float) -> None:
-    stego = trained_like(200)
-    hidden = torch.arange(200) % 2 == 0
-    faint = stego.opacity_logits.clamp(-3, 3) - 9
-    stego = replace(stego, opacity_logits=torch.where(hidden, faint, stego.opacity_logits.abs()))
-    secret = some_secret(stego)
-    kept = torch.cat([stego.means[hidden], stego.opacity_logits[hidden, None], stego.sh[hidden, 0]], dim=1)
-    secret = unpack_secret(pack_secret(replace(secret, faint=kept)))
-    rounded = replace(
-        stego,
-        means=(stego.means * 1000).round() / 1000,
-        opacity_logits=stego.opacity_logits.masked_fill(hidden, logit),
-        sh=stego.sh.masked_fill(hidden[:, None, None], 0),
-    )
-    order = torch.randperm(200)
-    known = secret.with_faint(rounded[order])
-    assert torch.equal(known.opacity_logits, stego.opacity_logits[order])
-    assert torch.equal(known.sh[:, 0], stego.sh[order, 0])
-    revealed, whole = (secret.reveal(model, force=True) for model in (rounded, stego))
-    assert torch.equal(revealed.opacity_logits, whole.opacity_logits)
 
 
 def test_positions_that_were_rounded_need_force() -> None:

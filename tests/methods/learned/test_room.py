@@ -1,4 +1,4 @@
-"""Whether the low bits of what will be trained can be used is known before it is trained."""
+"""Whether there is room in low bits is known before anything is trained."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, LearnedOptions, Secret
+from keyss.channels.appended import is_appended
 from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.fitting.config import FitConfig
@@ -21,7 +22,7 @@ from keyss.methods import registry
 from keyss.methods.base import SceneInput
 from keyss.methods.learned import publication
 from keyss.methods.learned.options import training_options
-from keyss.methods.learned.room import record_degree, secret_sizes, with_low_bits
+from keyss.methods.learned.room import of_degree, prepared_cover, record_degree, secret_sizes
 from keyss.rendering.orbit import scene_of_model
 from methods.learned.hiding import hide_scenes, open_secret
 from tiny_scenes import random_gaussians, tiny_scene
@@ -41,29 +42,28 @@ def _prepare(options: LearnedOptions, *models: Gaussians) -> LearnedOptions:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_quantised_models_have_random_low_bits_before_the_first_step(degree: int) -> None:
-    """What no view shows is never trained, and keeps them as they are."""
+def test_quantised_covers_get_random_low_bits(degree: int) -> None:
     model = trained_like(2000, sh_degree=degree).map(_steps)
     assert usable_carriers(model).mean() < 0.1
     wanted = max(1, degree)
-    start = with_low_bits(model, wanted, os.urandom(32))
-    assert start.sh_degree == wanted
-    assert usable_carriers(start).mean() > 0.8
-    assert torch.equal(start.means, model.means)
+    prepared = prepared_cover(of_degree(model, wanted, os.urandom(32)), os.urandom(32))
+    assert prepared.cover.sh_degree == wanted
+    assert prepared.usable.mean() > 0.8
+    assert torch.equal(prepared.cover.means, model.means)
 
 
 def test_new_harmonics_cannot_be_seen() -> None:
     model = random_gaussians(300, sh_degree=0)
     scene = scene_of_model(model, "m", size=48)
-    assert mean_psnr(with_low_bits(model, 3, bytes(32)), scene.test, scene.background) > 55
+    assert mean_psnr(of_degree(model, 3, bytes(32)), scene.test, scene.background) > 55
 
 
 def test_a_cover_without_harmonics_is_refused_with_ways_that_are_accepted() -> None:
     cover, secret = trained_like(4000, sh_degree=0), trained_like(2000, 1, 2)
-    with pytest.raises(UsageError, match=r"degree 0 .*`sh_degree=1` .*0\.4 MB .*0\.3.*`sidecar=True`"):
+    with pytest.raises(UsageError, match=r"degree 0 .*`sh_degree=1` .*0\.4 MB .*0\.3.*`publish=.any.`"):
         _prepare(LearnedOptions(), cover, secret)
     assert _prepare(LearnedOptions(sh_degree=1), cover, secret).fit.sh_degree == 1
-    assert _prepare(LearnedOptions(sidecar=True), cover, secret).fit.sh_degree == 0
+    assert _prepare(LearnedOptions(publish="any"), cover, secret).fit.sh_degree == 0
 
 
 def test_what_training_will_not_make_random_is_refused() -> None:
@@ -76,12 +76,13 @@ def test_what_training_will_not_make_random_is_refused() -> None:
         model.opacity_logits,
         model.sh[:, :, :1].repeat(1, 1, 3),
     )
-    with pytest.raises(InputError, match=r"random low bits.*`sidecar=True`"):
+    with pytest.raises(InputError, match=r"random low bits.*`publish=.any.`"):
         _prepare(LearnedOptions(), grey, grey)
     _prepare(LearnedOptions(), trained_like(8000), grey)
+    _prepare(LearnedOptions(publish="any"), grey, grey)
 
 
-def test_payloads_go_to_a_sidecar_rather_than_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decoders_are_appended_rather_than_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Started from points, it is not known before how many carriers there will be."""
 
     class Unusable:
@@ -96,11 +97,11 @@ def test_payloads_go_to_a_sidecar_rather_than_nowhere(monkeypatch: pytest.Monkey
     monkeypatch.setattr(publication, "LOW_BITS", Unusable())
     scenes = [tiny_scene(seed) for seed in range(2)]
     fit = FitConfig(iterations=2, max_gaussians=6000)
-    options = replace(LearnedOptions(), start="points", decoder="network", fit=fit)
+    options = LearnedOptions(start="points", hidden=(8, 8), branch=8, fit=fit)
     plains = [random_gaussians(seed=seed) for seed in range(2)]
     hidden = hide_scenes(scenes, [KEY], options, plains=plains)
-    assert hidden.sidecar is not None
-    revealed = open_secret(hidden.stego, KEY, hidden.sidecar).reveal(hidden.stego)
+    assert is_appended(hidden.stego).any()
+    revealed = open_secret(hidden.stego, KEY).reveal(hidden.stego)
     assert np.isfinite(revealed.means.numpy()).all()
 
 
@@ -134,7 +135,8 @@ def test_zeros_that_training_left_stay() -> None:
     """Small random numbers in their place would be known by their size."""
     model = trained_like(2000)
     model.sh[:150, 4:] = 0
-    assert torch.equal(with_low_bits(model, 3, os.urandom(32)).sh, model.sh)
+    prepared = prepared_cover(of_degree(model, 3, os.urandom(32)), os.urandom(32))
+    assert torch.equal(prepared.cover.sh, model.sh)
 
 
 def test_secrets_that_get_less_because_of_others_are_warned_of() -> None:
@@ -151,7 +153,7 @@ def test_harmonics_that_a_record_has_room_for(degree: int, expected: int | None)
 
 def test_fewer_harmonics_than_a_secret_has_are_said() -> None:
     cover, secret = random_gaussians(2000, sh_degree=1), random_gaussians(900, seed=1, sh_degree=3)
-    options = LearnedOptions(iterations=2, sidecar=True)
+    options = LearnedOptions(iterations=2)
     result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
     assert result.stego.sh_degree == 1
     (psnr,) = result.metrics.details["psnr_of_fewer_harmonics"]

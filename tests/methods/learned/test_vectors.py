@@ -11,6 +11,8 @@ import keyss
 from keyss.core import WrongKeyError
 from keyss.files.ply import read_ply
 
+pytestmark = pytest.mark.argon2
+
 FOLDER = Path(__file__).parents[2] / "vectors"
 KEY = "correct horse battery staple"
 # The low bits of what is published are overwritten: by so much values may differ from what was hidden.

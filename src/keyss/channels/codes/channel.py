@@ -1,10 +1,11 @@
 """Secrets in the last bits of the codes of a final .spz, .sog or compressed .ply.
 
 The file is passed on byte for byte, so values are exact and nothing is redundant. Which numbers carry is in
-`fields`, where what lies in `layout`. Every usable bit of the fields in use is written, with noise where
-there is no secret: files with one secret and with many look alike. All randomness comes from `entropy`, mixed
-with the cover and all payloads, so that no two files have a salt in common; and what encrypts is derived from
-key and salt, so that no key stream is used twice.
+`fields`, which of these are left alone in `kept`, how readers do without knowing that in `syndromes`, where
+what lies in `layout`. Every other bit is random afterwards, whatever is hidden: files with one secret and
+with many look alike. All randomness comes from `entropy`, mixed with the cover and all payloads, so that no
+two files have a salt in common; and what encrypts is derived from key and salt, so that no key stream is
+used twice.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
 from itertools import combinations
 
@@ -20,11 +21,15 @@ import numpy as np
 import numpy.typing as npt
 
 from keyss.channels.base import METHOD_BYTES, Payload, pack_method, unpack_method
-from keyss.channels.codes.fields import Field, Levels, format_of
+from keyss.channels.codes import syndromes
+from keyss.channels.codes.fields import Doubles, Field, Flags, Levels, format_of
+from keyss.channels.codes.kept import changeable
 from keyss.channels.codes.layout import (
     SLOT_BYTES,
+    ZONE_RATE,
     Bits,
     Header,
+    Order,
     Room,
     find_header,
     order,
@@ -32,10 +37,9 @@ from keyss.channels.codes.layout import (
     to_bytes,
 )
 from keyss.channels.codes.matching import matched
-from keyss.channels.codes.natural import is_natural
 from keyss.channels.codes.order import Counted, in_file_order
-from keyss.channels.codes.rotations import kept_smaller
-from keyss.channels.codes.unrounded import Doubles, unrounded
+from keyss.channels.codes.syndromes import rate_of
+from keyss.channels.codes.unrounded import unrounded
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import Codes
@@ -43,6 +47,8 @@ from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand,
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 _ASSOCIATED = b"keyss/v1/codes/data"
+_ATTEMPTS = 100  # orders of blocks to be tried, of which hardly one in ten fails
+_USUAL_RATE = 800  # of a key that opens nothing
 _OPENS_NOTHING = "this key opens nothing here"
 
 
@@ -52,35 +58,40 @@ class CodesCover:
 
     codes: Codes  # in the order in which bits are counted
     fields: list[Field]
-    carrying: int  # bit i: field i carries
-    near: Mapping[str, Doubles]  # levels before rounding, of the fields for which they are known
+    free: list[Flags]  # of each field, which levels may be changed
+    near: Mapping[str, Doubles]  # levels before rounding, of the attributes for which they are known
 
     @staticmethod
     def of(codes: Codes, model: Gaussians | None = None) -> CodesCover:
         """`model`: what was quantised to the codes, Gaussian by Gaussian, if the writer has it.
 
-        Fields that are not as training leaves them do not carry, but for the headers in the first one. Raises
-        InputError for codes that have no room.
+        Raises InputError for codes that have no room.
         """
         near = {} if model is None else unrounded(model, codes)
         counted = Counted.of(codes)
-        if not Room.of(counted.fields).slots:
+        near = {name: each[counted.rows] for name, each in near.items()}
+        free = changeable(counted.codes, counted.fields, _digest(codes))
+        found = CodesCover(counted.codes, counted.fields, free, near)
+        if not found.room.slots or found.rate < ZONE_RATE:
             raise InputError(
                 f"a model of {len(counted.rows):,} Gaussians has no room for secrets in the codes of "
                 f"{format_of(codes).name} files"
             )
-        carrying = sum(1 << index for index, each in enumerate(counted.fields) if is_natural(each))
-        near = {name: each[counted.rows] for name, each in near.items()}
-        return CodesCover(counted.codes, counted.fields, carrying, near)
+        return found
 
     @property
     def room(self) -> Room:
         return Room.of(self.fields)
 
     @property
+    def rate(self) -> int:
+        """Bits that a block holds."""
+        return rate_of(float(np.mean(self._dry())) if self.room.bits else 0.0)
+
+    @property
     def capacity(self) -> int:
         """Bytes that all secrets together may take, each `payload_size` of its payload."""
-        return self.room.data_bits(self.carrying) // 8
+        return self.room.data_blocks * self.rate // 8
 
     def embed(self, secrets: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Codes:
         """The codes with one (key, payload) for each secret. Takes 0.1 s a secret for key derivation.
@@ -89,10 +100,16 @@ class CodesCover:
         equal keys, for none, for more than there are slots, and for what does not fit.
         """
         mixed = self._mixed(entropy, [payload for _, payload in secrets])
-        derivation = KeyDerivation(salt=expand(mixed, "codes/salt", SALT_BYTES))
-        return self._embedded([(DerivedKey(key, derivation), each) for key, each in secrets], mixed)
+        for attempt in range(_ATTEMPTS):
+            own = expand(mixed, f"codes/attempt/{attempt}", 32)
+            derivation = KeyDerivation(salt=expand(own, "codes/salt", SALT_BYTES))
+            found = self._embedded([(DerivedKey(key, derivation), each) for key, each in secrets], own)
+            if found is not None:
+                return found
+        raise RuntimeError("no block order was found in which all blocks have room")
 
-    def _embedded(self, secrets: Sequence[tuple[DerivedKey, Payload]], entropy: bytes) -> Codes:
+    def _embedded(self, secrets: Sequence[tuple[DerivedKey, Payload]], entropy: bytes) -> Codes | None:
+        """None where, once in a hundred times, a block has too few bits that may change."""
         keys = [key for key, _ in secrets]
         if not keys or any(a.equals(b) for a, b in combinations(keys, 2)):
             raise UsageError("two secrets have the same key: expected at least one secret, each with its own")
@@ -106,54 +123,55 @@ class CodesCover:
             )
         salt = expand(entropy, "codes/salt", SALT_BYTES)
         zone = bytearray(salt + stream(entropy, "codes/slots", room.slots * SLOT_BYTES))
-        data = _noise(entropy, room.data_bits(self.carrying))
-        places, starts = order(salt, len(data)), _starts(sizes, len(data), entropy)
+        data = _noise(entropy, "codes/noise", room.data_blocks * self.rate)
+        starts = _starts(sizes, len(data), entropy)
         slots = np.argsort(_words(entropy, "codes/slot-order", room.slots), kind="stable").tolist()
         for (key, payload), size, start, slot in zip(secrets, sizes, starts, slots, strict=False):
             at = SALT_BYTES + slot * SLOT_BYTES
-            zone[at : at + SLOT_BYTES] = Header(self.carrying, start, size).encrypt(key, slot)
+            zone[at : at + SLOT_BYTES] = Header(self.rate, start, size).encrypt(key, slot)
             encrypted = encrypt(_data_key(key), _packed(payload), _ASSOCIATED, size=size)
-            data[_range(places, start, size)] = to_bits(encrypted)
-        written = self._written(np.concatenate([to_bits(bytes(zone)), data]), entropy)
+            data[_range(len(data), start, size)] = to_bits(encrypted)
+        bits = self._solved(to_bits(bytes(zone)), data, salt, entropy)
+        if bits is None:
+            return None
         random = _words(entropy, "codes/file-order", 3 * len(self.fields[0].levels))
-        sorted_again: Codes = in_file_order(written, _halves(random).reshape(-1, 3))
+        sorted_again: Codes = in_file_order(self._written(bits, entropy), _halves(random).reshape(-1, 3))
         return sorted_again
+
+    def _solved(self, zone: Bits, data: Bits, salt: bytes, entropy: bytes) -> Bits | None:
+        """The last bits of all levels, of which those that may change are random."""
+        room, dry = self.room, self._dry()
+        bits = np.where(dry, _noise(entropy, "codes/free", room.bits), _last_bits(self.fields))
+        zone = np.append(zone, _noise(entropy, "codes/zone", -len(zone) % ZONE_RATE))
+        for places, message, rows in zip(
+            _places(room, salt), (zone, data), _matrices(salt, self.rate), strict=True
+        ):
+            found = syndromes.write(bits[places], dry[places], message, rows)
+            if found is None:
+                return None
+            bits[places] = found
+        return bits
+
+    def _dry(self) -> Bits:
+        """[room.bits] 1 where a bit may be changed."""
+        parts = [np.repeat(free, each.bits) for free, each in zip(self.free, self.fields, strict=True)]
+        return np.concatenate(parts).astype(np.uint8)
 
     def _written(self, bits: Bits, entropy: bytes) -> Codes:
         columns: dict[str, list[Levels]] = {}
-        for field in self.fields:
-            columns.setdefault(field.name, []).append(field.levels.copy())
-        for field in self._written_fields():
+        for field, free in zip(self.fields, self.free, strict=True):
             own, bits = bits[: field.room], bits[field.room :]
-            residues = own.reshape(-1, field.bits) @ (1 << np.arange(field.bits, dtype=np.int32))
-            old, low, high = (each[field.usable] for each in (field.levels, field.low, field.high))
-            if field.name in self.near:
-                near = self.near[field.name][field.usable, field.column]
-            else:
-                near = old + _halves(_words(entropy, f"codes/ties/{field.name}/{field.column}", len(old)))
-            found = matched(old, residues.astype(np.int32), field.bits, low, high, near)
-            columns[field.name][field.column][field.usable] = found
+            near = (
+                self.near[field.name][:, field.column]
+                if field.name in self.near
+                else field.levels
+                + _halves(_words(entropy, f"codes/ties/{field.name}/{field.column}", len(free)))
+            )
+            found = matched(field.levels, field.residues(own), field.bits, near)
+            columns.setdefault(field.name, []).append(np.where(free, found, field.levels))
         levels = {name: np.stack(each, axis=1) for name, each in columns.items()}
-        levels["rotations"] = self._with_largest(levels["rotations"])
         written: Codes = format_of(self.codes).with_levels(self.codes, levels)
         return written
-
-    def _with_largest(self, rotations: Levels) -> Levels:
-        """[N, 3] written levels of rotations, with no more parts than before larger than what is left out."""
-        turns = format_of(self.codes).turns(self.codes)
-        own = [each for each in self.fields if each.name == "rotations"]
-        before, usable = (
-            np.stack(each, axis=1) for each in zip(*((f.levels, f.usable) for f in own), strict=True)
-        )
-        return rotations if turns is None else kept_smaller(before, rotations, usable, own[0].bits, *turns)
-
-    def _written_fields(self) -> list[Field]:
-        """The fields that carry; of the first one, if it does not, the levels of salt and headers."""
-        first, *others = self.fields
-        if not self.carrying & 1:
-            levels = self.room.zone_bits // first.bits
-            first = replace(first, usable=first.usable & (np.cumsum(first.usable) <= levels))
-        return [first, *(each for i, each in enumerate(others, 1) if self.carrying >> i & 1)]
 
     def _mixed(self, entropy: bytes | None, payloads: Sequence[Payload]) -> bytes:
         """32 bytes that depend on all of it: from equal ones two files would get one salt."""
@@ -169,7 +187,7 @@ class CodesReader:
     """Codes as a reader sees them."""
 
     room: Room
-    bits: list[Bits]  # of each field
+    bits: Bits  # the last ones of all levels
     zone: bytes  # salt and slots
 
     @staticmethod
@@ -179,8 +197,10 @@ class CodesReader:
         room = Room.of(fields)
         if not room.slots:
             raise WrongKeyError(_OPENS_NOTHING)
-        bits = [_read(each) for each in fields]
-        return CodesReader(room, bits, to_bytes(bits[0][: room.zone_bits]))
+        bits = _last_bits(fields)
+        first = room.zone_order()[: room.zone_bits]
+        zone = to_bytes(syndromes.read(bits[first], syndromes.matrix(bytes(SALT_BYTES), ZONE_RATE)))
+        return CodesReader(room, bits, zone[: SALT_BYTES + room.slots * SLOT_BYTES])
 
     @property
     def salt(self) -> bytes:
@@ -193,13 +213,11 @@ class CodesReader:
     def extract(self, key: DerivedKey) -> Payload:
         """`open` after key derivation. A key that opens nothing makes the same passes."""
         header = find_header(self.zone, key, self.room)
-        carrying = header.fields if header else (1 << len(self.bits)) - 1
-        first = self.bits[0][self.room.zone_bits :]
-        own = [bits for i, bits in enumerate([first, *self.bits[1:]]) if carrying >> i & 1]
-        data = np.concatenate(own)
-        places = order(self.salt, len(data))
+        rate = header.rate if header else _USUAL_RATE
+        _, places = _places(self.room, self.salt)
+        data = syndromes.read(self.bits[places], _matrices(self.salt, rate)[1])
         start, size = (header.start, header.size) if header else (0, len(data) // 8)
-        encrypted = to_bytes(data[_range(places, start, size)])
+        encrypted = to_bytes(data[_range(len(data), start, size)])
         try:
             plain = decrypt(_data_key(key), encrypted, _ASSOCIATED)
             return Payload(unpack_method(plain), plain[METHOD_BYTES:])
@@ -222,18 +240,25 @@ def _data_key(key: DerivedKey) -> bytes:
     return key.expand("codes/data", 32)
 
 
-def _read(field: Field) -> Bits:
-    """The bits of the usable levels of a field."""
-    residues = field.levels[field.usable]
-    found: Bits = (residues[:, None] >> np.arange(field.bits, dtype=np.int32) & 1).astype(np.uint8)
-    return found.reshape(-1)
+def _last_bits(fields: Sequence[Field]) -> Bits:
+    return np.concatenate([each.read() for each in fields])
 
 
-def _range(places: npt.NDArray[np.int64], start: int, size: int) -> npt.NDArray[np.int64]:
-    """`size` bytes of places from `start` on, and on from the first after the last."""
-    return np.concatenate(
-        [places[start : start + 8 * size], places[: max(0, start + 8 * size - len(places))]]
-    )
+def _places(room: Room, salt: bytes) -> tuple[Order, Order]:
+    """The bits of salt and slots, and those of data, in the order in which blocks take them."""
+    every = room.zone_order()
+    zone, others = np.split(every, [room.zone_bits])
+    return zone, others[order(salt, len(others))][: room.data_blocks * syndromes.BLOCK]
+
+
+def _matrices(salt: bytes, rate: int) -> tuple[syndromes.Words, syndromes.Words]:
+    """Of the blocks of salt and slots, and of those of data."""
+    return syndromes.matrix(bytes(SALT_BYTES), ZONE_RATE), syndromes.matrix(salt + bytes(16), rate)
+
+
+def _range(count: int, start: int, size: int) -> Order:
+    """`size` bytes from bit `start` on, of `count` bits that go on at the start where they end."""
+    return (start + np.arange(8 * size)) % count
 
 
 def _starts(sizes: Sequence[int], room: int, entropy: bytes) -> list[int]:
@@ -249,9 +274,9 @@ def _starts(sizes: Sequence[int], room: int, entropy: bytes) -> list[int]:
     return starts
 
 
-def _noise(entropy: bytes, count: int) -> Bits:
+def _noise(entropy: bytes, label: str, count: int) -> Bits:
     """[count] random bits."""
-    return to_bits(stream(entropy, "codes/noise", -(-count // 8)))[:count]
+    return to_bits(stream(entropy, label, -(-count // 8)))[:count]
 
 
 def _words(entropy: bytes, label: str, count: int) -> npt.NDArray[np.uint64]:

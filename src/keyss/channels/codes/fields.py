@@ -1,12 +1,12 @@
 """Which numbers of a format's codes carry bits, and how many each: measured, see docs/codes.md.
 
-A *level* is an integer that grows with what it stands for; a *field* is one coordinate of an attribute of all
-Gaussians. Which of its levels are usable follows from what writing leaves as it is: the ends of a range are
-left alone and never moved to, so that saturated values, extremes, and fields of one value stay.
+A *level* is an integer that grows with what it stands for; a *field* is one coordinate of an attribute of
+all Gaussians. How many bits a level carries follows from what is never written, so that readers know it:
+from the Gaussian's size and the format's step, so that positions move by a fraction of it. All of it is
+arithmetic that is the same on every machine, and no logarithms: a bit more or less anywhere, and nothing
+could be read.
 
-Positions stay in cells of as many levels as there are residues, 16 or 32, so that Gaussians can be told
-apart, and put in an order, by these. That is overwriting, but so evenly do positions lie within a cell that
-their frequencies stay the same; where they do not, a field is left alone (see `natural`).
+Which levels are left as they are decides whoever writes (see `kept`); readers need not know.
 """
 
 from __future__ import annotations
@@ -19,17 +19,23 @@ import numpy as np
 import numpy.typing as npt
 
 from keyss.core.errors import InputError
-from keyss.files.formats.common import Codes, Floats
-from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats import compressed_ply, sog, spz
+from keyss.files.formats.common import Codes
+from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
 
 Levels = npt.NDArray[np.int32]
 Flags = npt.NDArray[np.bool_]
+Doubles = npt.NDArray[np.float64]
 
+MOST_BITS = 10
+_SHARE = -3.0  # 2 to this: the range of what is written, in sizes of the Gaussian
+_LOG_SCALE = -4.0  # 2 to this: the range of what is written in log scales
 _SIGN, _MAGNITUDE = 512, 511  # of SPZ's rotations
-_FAR_COLORS = 0.12  # numbers of a codebook of colours further apart than this are no neighbours
-_LEAST_RUN = 8  # of neighbours in a codebook; in shorter runs levels could hardly go both ways
+_LOG2_E = 1.4426950408889634
+_VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compressed .ply
 
 
 @dataclass(frozen=True)
@@ -38,16 +44,29 @@ class Field:
 
     name: str  # of the attribute in the codes
     column: int
-    bits: int  # that a level carries
     levels: Levels  # [N]
-    low: Levels  # [N] smallest that may be written
-    high: Levels  # [N] largest that may be written
-    usable: Flags  # [N] which levels carry
+    bits: Levels  # [N] that each carries, 0 to MOST_BITS
 
     @property
     def room(self) -> int:
         """Bits of all levels together."""
-        return int(np.count_nonzero(self.usable)) * self.bits
+        return int(self.bits.sum())
+
+    def read(self) -> npt.NDArray[np.uint8]:
+        """[room] the last bits of all levels, the lowest first."""
+        bits = self.levels[:, None] >> np.arange(MOST_BITS, dtype=np.int32) & 1
+        return bits[self._places()].astype(np.uint8)
+
+    def residues(self, bits: npt.NDArray[np.uint8]) -> Levels:
+        """[N] what the last bits of levels are together that `read` gives as `bits`."""
+        places = np.zeros((len(self.levels), MOST_BITS), np.int32)
+        places[self._places()] = bits
+        found: Levels = (places @ (1 << np.arange(MOST_BITS, dtype=np.int32))).astype(np.int32)
+        return found
+
+    def _places(self) -> Flags:
+        found: Flags = np.arange(MOST_BITS) < self.bits[:, None]
+        return found
 
 
 @dataclass(frozen=True)
@@ -55,11 +74,11 @@ class Format:
     """How codes of one kind carry."""
 
     name: str  # as users know it
-    bits: Mapping[str, int]  # of a level of each attribute
-    levels: Callable[[Any], list[Field]]
+    fields: Callable[[Any], list[Field]]
     with_levels: Callable[[Any, Mapping[str, Levels]], Any]  # codes with new levels of some fields
     # A level of a rotation stands for (level - first) * second; None: what is not stored need not be largest.
     turns: Callable[[Any], tuple[float, float] | None]
+    dequantise: Callable[[Any], Gaussians]
 
 
 def format_of(codes: Codes) -> Format:
@@ -69,30 +88,25 @@ def format_of(codes: Codes) -> Format:
     return _FORMATS[type(codes)]
 
 
-def position_cells(codes: SogCodes | SpzCodes) -> npt.NDArray[np.integer[Any]]:
-    """[N, 3] which cells the positions lie in, whatever is written."""
-    return codes.positions >> format_of(codes).bits["positions"]
-
-
-def fields_of(codes: Codes) -> list[Field]:
-    """The fields that carry; the first one holds salt and headers, too."""
-    return format_of(codes).levels(codes)
+def sog_distances(codes: SogCodes, levels: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """[N, 3] by how many powers of 2 a .sog's steps are larger at these levels of positions than at 0."""
+    extent = np.where(codes.maxs > codes.mins, codes.maxs - codes.mins, 1.0)
+    logs = np.abs(codes.mins + extent * (levels / 65535))  # of 1 + a coordinate
+    return np.floor(logs * _LOG2_E).clip(0, 64).astype(np.int64)
 
 
 def _spz_fields(codes: SpzCodes) -> list[Field]:
-    bits, end = SPZ.bits["rotations"], _MAGNITUDE
+    bits = 3
     rotations: Levels = codes.rotations.astype(np.int32)
-    least = -end
     if codes.version == 2:
-        bits, least, end = 1, 0, 255
+        bits = 1
     else:
         magnitudes = rotations & _MAGNITUDE
         rotations = np.where(rotations > _MAGNITUDE, -magnitudes, magnitudes).astype(np.int32)
+    sizes = (_middle(codes.scales) / 16 - 10) * _LOG2_E
     return [
-        *_within_cells("positions", SPZ.bits["positions"], codes.positions),
-        *_between("rotations", bits, rotations, least, end),
-        *_within_columns("colors", SPZ.bits["colors"], codes.colors),
-        *_within_columns("alphas", SPZ.bits["alphas"], codes.alphas[:, None]),
+        *_fields("positions", codes.positions, _fitting(sizes[:, None] + codes.fractional_bits + _SHARE)),
+        *_fields("rotations", rotations, bits),
     ]
 
 
@@ -107,22 +121,19 @@ def _spz_with_levels(codes: SpzCodes, levels: Mapping[str, Levels]) -> SpzCodes:
 
 
 def _sog_fields(codes: SogCodes) -> list[Field]:
+    sizes = _middle(codes.scale_codebook.astype(np.float64)[codes.scales]) * _LOG2_E
+    extent = np.where(codes.maxs > codes.mins, codes.maxs - codes.mins, 1.0)
+    steps = _log2(extent / 65535) + sog_distances(codes, codes.positions) + 0.5
     return [
-        *_within_cells("positions", SOG.bits["positions"], codes.positions),
-        *_between("rotations", SOG.bits["rotations"], codes.rotations, 0, 255),
-        *_of_codebook("colors", SOG.bits["colors"], codes.colors, codes.color_codebook, _FAR_COLORS),
-        *_within_columns("alphas", SOG.bits["alphas"], codes.alphas[:, None]),
+        *_fields("positions", codes.positions, _fitting(sizes[:, None] + _SHARE - steps)),
+        *_fields("rotations", codes.rotations, 2),
     ]
 
 
 def _compressed_ply_fields(codes: CompressedPlyCodes) -> list[Field]:
-    bits = COMPRESSED_PLY.bits
-    return [
-        *_between("scales", bits["scales"], codes.scales, 0, np.array([2047, 1023, 2047], np.int32)),
-        *_between("rotations", bits["rotations"], codes.rotations, 0, 1023),
-        *_between("colors", bits["colors"], codes.colors, 0, 255),
-        *_within_columns("alphas", bits["alphas"], codes.alphas[:, None]),
-    ]
+    low, high = codes.bounds[:, 6:9].astype(np.float64), codes.bounds[:, 9:12].astype(np.float64)
+    bits = _fitting(_LOG_SCALE - _log2((high - low) / _VECTOR)).repeat(CHUNK, axis=0)[: len(codes)]
+    return [*_fields("scales", codes.scales, bits), *_fields("rotations", codes.rotations, 3)]
 
 
 def _replaced(codes: Any, levels: Mapping[str, Levels]) -> Any:
@@ -137,68 +148,39 @@ def _spz_turns(codes: SpzCodes) -> tuple[float, float] | None:
     return (0.0, 0.5**0.5 / _MAGNITUDE) if codes.version > 2 else None
 
 
-SPZ = Format(
-    "spz",
-    {"positions": 4, "rotations": 2, "colors": 1, "alphas": 1},
-    _spz_fields,
-    _spz_with_levels,
-    _spz_turns,
-)
-SOG = Format(
-    "sog",
-    {"positions": 5, "rotations": 1, "colors": 1, "alphas": 1},
-    _sog_fields,
-    _replaced,
-    lambda codes: (127.5, 2**0.5 / 255),
-)
-COMPRESSED_PLY = Format(
-    "compressed-ply",
-    {"scales": 4, "rotations": 2, "colors": 1, "alphas": 1},
-    _compressed_ply_fields,
-    _replaced,
-    lambda codes: (511.5, 2**0.5 / 1023),
-)
-_FORMATS: dict[type[Codes], Format] = {SpzCodes: SPZ, SogCodes: SOG, CompressedPlyCodes: COMPRESSED_PLY}
+_FORMATS: dict[type[Codes], Format] = {
+    SpzCodes: Format("spz", _spz_fields, _spz_with_levels, _spz_turns, spz.dequantise),
+    SogCodes: Format("sog", _sog_fields, _replaced, lambda codes: (127.5, 2**0.5 / 255), sog.dequantise),
+    CompressedPlyCodes: Format(
+        "compressed-ply",
+        _compressed_ply_fields,
+        _replaced,
+        lambda codes: (511.5, 2**0.5 / 1023),
+        compressed_ply.dequantise,
+    ),
+}
 NAMES = tuple(each.name for each in _FORMATS.values())
 
 
-def _between(name: str, bits: int, levels: npt.NDArray[Any], least: Any, most: Any) -> list[Field]:
-    """Levels between the ends of what the format holds, or those of each column."""
-    low, high = (np.broadcast_to(np.asarray(each, np.int32), levels.shape) for each in (least, most))
-    return _fields(name, bits, levels, low + np.int32(1), high - np.int32(1))
+def _middle(values: npt.NDArray[Any]) -> Doubles:
+    """[N] the second of the three numbers of each row, by size."""
+    return np.sort(values.astype(np.float64), axis=1)[:, 1]
 
 
-def _within_columns(name: str, bits: int, levels: npt.NDArray[Any]) -> list[Field]:
-    """Levels between the extremes of their columns."""
-    return _between(name, bits, levels, levels.min(axis=0), levels.max(axis=0))
+def _log2(values: Doubles) -> Doubles:
+    """About the logarithm to base 2, too small by up to 0.09: straight lines between the powers of 2."""
+    mantissa, exponent = np.frexp(values)
+    found: Doubles = exponent + 2 * (mantissa - 1)
+    return found
 
 
-def _within_cells(name: str, bits: int, levels: npt.NDArray[Any]) -> list[Field]:
-    """Levels that stay in their cell, and none of the cells in which the extremes of the columns lie."""
-    size = 1 << bits
-    cells = levels.astype(np.int32) // size
-    inside = (cells > cells.min(axis=0)) & (cells < cells.max(axis=0))
-    return _fields(name, bits, levels, cells * size, cells * size + (size - 1), inside)
+def _fitting(logs: Doubles) -> Levels:
+    """How many bits of levels span 2 to the `logs` at most."""
+    return np.floor(np.nan_to_num(logs)).clip(0, MOST_BITS).astype(np.int32)
 
 
-def _of_codebook(name: str, bits: int, levels: npt.NDArray[Any], codebook: Floats, far: float) -> list[Field]:
-    """Indices into an ascending codebook, within runs of numbers that are near each other and differ."""
-    gaps = np.diff(codebook.astype(np.float64))
-    cut = np.concatenate([[True], ~((gaps > 0) & (gaps <= far)), [True]])  # before each, and after the last
-    at = np.arange(len(codebook), dtype=np.int32)
-    first = np.maximum.accumulate(np.where(cut[:-1], at, 0))
-    last = np.minimum.accumulate(np.where(cut[1:], at, len(codebook))[::-1])[::-1]
-    low, high = first[levels].astype(np.int32), last[levels].astype(np.int32)
-    return _fields(name, bits, levels, low, high, high - low >= _LEAST_RUN - 1)
-
-
-def _fields(
-    name: str, bits: int, levels: npt.NDArray[Any], low: Levels, high: Levels, usable: Flags | None = None
-) -> list[Field]:
-    """A field of each column [N, C]; usable are levels from `low` to `high`, if all residues lie there."""
+def _fields(name: str, levels: npt.NDArray[Any], bits: Levels | int) -> list[Field]:
+    """A field of each column [N, C]."""
     own = levels.astype(np.int32)
-    inside: Flags = (own >= low) & (own <= high) & (high - low >= (1 << bits) - 1)
-    if usable is not None:
-        inside &= usable
-    each_column = zip(own.T, low.T, high.T, inside.T, strict=True)
-    return [Field(name, index, bits, *arrays) for index, arrays in enumerate(each_column)]
+    each_column = zip(own.T, np.broadcast_to(np.int32(bits), own.shape).T, strict=True)
+    return [Field(name, index, *arrays) for index, arrays in enumerate(each_column)]

@@ -1,12 +1,12 @@
-"""Where what lies: bits of the usable levels, in order of fields, Gaussians, columns, lowest bit first.
+"""Where what lies, among the last bits of all levels in order of fields, Gaussians, and the lowest first.
 
-    of the first field: salt (16 bytes), slots (28 bytes each)
-    of the rest of it and of the other fields: data, in an order that follows from the salt
+    in a fixed random order, in blocks of ZONE_RATE bits: salt (16 bytes), slots (28 bytes each)
+    the others, in an order that follows from the salt, in blocks of as many as a header says: data
 
-A *slot* is a header encrypted under what a key becomes with the salt, or noise. The header says where in that
-order the key's data begin, how long they are, and which fields take part. Data are a range that may go on
-at the start of the order where it ends; all that is no data is noise. The number of slots follows from the
-room. So all that a key tells is where its own data lie.
+What blocks hold is in `syndromes`. A *slot* is a header encrypted under what a key becomes with the salt, or
+noise. The header says where the key's data begin, how long they are, and how much blocks hold. Data are a
+range that may go on at the start; all that is no data is noise. The number of slots follows from the room. So
+all that a key tells is where its own data lie.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from keyss.channels.codes.fields import Field
+from keyss.channels.codes.syndromes import BLOCK
 from keyss.core.errors import InputError
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, stream
 
 VERSION = 1
 LEAST_SLOTS, MOST_SLOTS = 4, 256
-_SLOT_SHARE = 1 / 8  # of the first field's room that slots may take
-_HEADER = struct.Struct("<BHIIx")  # version, fields, first bit, bytes of data
+ZONE_RATE = 384  # bits that a block of salt and slots holds: more than half of its bits may have to stay
+_LEAST_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits that the least slots, and more of them, may take
+_HEADER = struct.Struct("<BHIIx")  # version, bits that a block holds, first bit, bytes of data
 SLOT_BYTES = _HEADER.size + 16
 _ASSOCIATED = b"keyss/v1/codes"
 
@@ -38,43 +40,52 @@ Order = npt.NDArray[np.int64]
 class Header:
     """What a slot tells."""
 
-    fields: int  # bit i: field i carries data
-    start: int  # of the data, in their order
+    rate: int  # bits that a block of data holds
+    start: int  # of the data, in bits
     size: int  # bytes
 
     def encrypt(self, key: DerivedKey, slot: int) -> bytes:
         """SLOT_BYTES. Under a salt of its own a key encrypts one header and one content."""
-        packed = _HEADER.pack(VERSION, self.fields, self.start, self.size)
+        packed = _HEADER.pack(VERSION, self.rate, self.start, self.size)
         return _cipher(key).encrypt(_nonce(slot), packed, _ASSOCIATED)
 
 
 @dataclass(frozen=True)
 class Room:
-    """What fits into fields of which the first is the head."""
+    """What fits into a number of bits."""
 
-    counts: tuple[int, ...]  # usable bits of each field
+    bits: int
 
     @staticmethod
     def of(fields: list[Field]) -> Room:
-        return Room(tuple(each.room for each in fields))
+        return Room(sum(each.room for each in fields))
 
     @property
     def slots(self) -> int:
         """A power of two; 0 where there is no room for what is needed at least."""
-        most = int(self.counts[0] * _SLOT_SHARE) // (8 * SLOT_BYTES)
-        if most < LEAST_SLOTS:
+        if _zone_blocks(LEAST_SLOTS) * BLOCK > self.bits * _LEAST_SHARE:
             return 0
-        return min(MOST_SLOTS, 1 << (most.bit_length() - 1))
+        found = LEAST_SLOTS
+        while found < MOST_SLOTS and _zone_blocks(2 * found) * BLOCK <= self.bits * _SHARE:
+            found *= 2
+        return found
 
     @property
     def zone_bits(self) -> int:
-        """Bits of salt and slots: those of 1, 2 or 4 bits a level are whole levels."""
-        return 8 * (SALT_BYTES + self.slots * SLOT_BYTES)
+        """Bits in which salt and slots lie."""
+        return _zone_blocks(self.slots) * BLOCK
 
-    def data_bits(self, fields: int) -> int:
-        """Bits of data if only `fields` carry them."""
-        counts = [self.counts[0] - self.zone_bits, *self.counts[1:]]
-        return sum(count for index, count in enumerate(counts) if fields >> index & 1)
+    @property
+    def data_blocks(self) -> int:
+        return (self.bits - self.zone_bits) // BLOCK
+
+    def zone_order(self) -> Order:
+        """[bits] of which the first `zone_bits` are those of salt and slots, and the others those of data."""
+        return order(bytes(SALT_BYTES), self.bits)
+
+
+def _zone_blocks(slots: int) -> int:
+    return -(-8 * (SALT_BYTES + slots * SLOT_BYTES) // ZONE_RATE)
 
 
 def find_header(zone: bytes, key: DerivedKey, room: Room) -> Header | None:
@@ -89,19 +100,21 @@ def find_header(zone: bytes, key: DerivedKey, room: Room) -> Header | None:
         found = found or packed
     if found is None:
         return None
-    version, fields, first, size = _HEADER.unpack(found)
+    version, rate, first, size = _HEADER.unpack(found)
     if version != VERSION:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
-    data_bits = room.data_bits(fields)
-    if not (fields >> len(room.counts) == 0 and 0 < 8 * size <= data_bits and first < data_bits):
+    data_bits = room.data_blocks * rate
+    if not (rate <= BLOCK and 0 < 8 * size <= data_bits and first < data_bits):
         raise InputError("the hidden parameters are damaged: they name more than there is")
-    return Header(fields, first, size)
+    return Header(rate, first, size)
 
 
 def order(salt: bytes, count: int) -> Order:
-    """[count] the bits of data, in the order in which they are used."""
+    """[count] the bits of data, in the order in which blocks take them."""
     numbers = np.frombuffer(stream(salt + bytes(16), "codes/order", 8 * count), "<u8")
-    return np.argsort(numbers, kind="stable")
+    # Sorted with their numbers in the lower half: this is the same everywhere, and faster than `argsort`.
+    lower = np.uint64(2**32 - 1)
+    return (np.sort(numbers & ~lower | np.arange(count, dtype=np.uint64)) & lower).astype(np.int64)
 
 
 def to_bits(data: bytes) -> Bits:

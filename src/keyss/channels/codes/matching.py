@@ -7,23 +7,20 @@ pairs of them equally frequent and is what the attacks of Westfeld and Pfitzmann
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
-
-from keyss.channels.codes.fields import Levels
-
-Doubles = npt.NDArray[np.float64]
+from keyss.channels.codes.fields import Doubles, Levels
 
 
-def matched(levels: Levels, residues: Levels, bits: int, low: Levels, high: Levels, near: Doubles) -> Levels:
-    """[M] the levels from `low` to `high` with `residues` modulo 2^bits that are nearest to `near`.
+def matched(levels: Levels, residues: Levels, bits: Levels, near: Doubles) -> Levels:
+    """[N] the levels with `residues` modulo 2^bits that are nearest to `near`.
 
     `near`: the numbers that were rounded to `levels`, or the levels with less than half a level added at
     random, so that of two equally near ones either is taken.
     """
     step = 1 << bits
-    target = np.clip(near, levels - 0.5, levels + 0.5)
-    found: Levels = (residues + step * np.rint((target - residues) / step)).astype(np.int32)
-    found += np.where(found < low, step, 0).astype(np.int32)
-    found -= np.where(found > high, step, 0).astype(np.int32)
-    return found
+    target = near.clip(levels - 0.5, levels + 0.5)
+    return (residues + step * ((target - residues) / step).round()).astype("int32")
+
+
+def reach(bits: Levels) -> Levels:
+    """[N] by how many levels `matched` moves one at most."""
+    return (1 << bits >> 1) + 1

@@ -1,32 +1,29 @@
-"""Whether matching would show: levels that many Gaussians share, or that lie on a lattice.
-
-Writers look at this; readers need not agree, for the header says which fields carry.
-"""
+"""Whether matching would show: levels that many Gaussians share, or that lie on a lattice."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.codes.fields import Field
+from keyss.channels.codes.fields import Levels
 
 Integers = npt.NDArray[np.int64]
 
+_NEIGHBOURS = 8  # levels away
 _ROUGH = 0.25  # by how much more often levels may be equal than near each other
 _EQUAL = 0.02  # as a share of the Gaussians
 _DEVIATIONS = 6
 _LEANING = 0.02  # of the last bits to 0 or to 1
 
 
-def is_natural(field: Field) -> bool:
+def is_natural(levels: Levels) -> bool:
     """Whether equal levels are not much more frequent than neighbouring ones, nor even more than odd ones."""
-    levels, bits = field.levels[field.usable], field.bits
     if len(levels) < 2:
         return True
     values, found = np.unique(levels.astype(np.int64), return_counts=True)
     counts = found.astype(np.int64)
     equal = float((counts * (counts - 1)).sum())
-    near = [_pairs(values, counts, distance) for distance in range(1, (1 << bits) + 1)]
+    near = [_pairs(values, counts, distance) for distance in range(1, _NEIGHBOURS + 1)]
     expected = float(np.mean(near))
     if equal - expected > max(_ROUGH * expected, _EQUAL * len(levels), _DEVIATIONS * expected**0.5):
         return False

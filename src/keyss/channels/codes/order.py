@@ -1,6 +1,7 @@
-"""Orders of Gaussians: one in which bits are counted, and the one of the file; and which do not carry.
+"""Orders of Gaussians: one in which bits are counted, and the one of the file.
 
-Formats whose order does not depend on what is written keep it. A .sog is sorted by `in_morton_order`.
+Formats whose order does not depend on what is written keep it. A .sog is sorted by `in_morton_order`; its
+bits are counted in an order of what is not written.
 """
 
 from __future__ import annotations
@@ -11,11 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.codes.fields import Field, Flags, fields_of, position_cells
+from keyss.channels.codes.fields import Field, Flags, format_of, sog_distances
 from keyss.files.formats.common import Codes, Floats, morton_order
-from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes, positions_of
-from keyss.files.formats.spz import SpzCodes
 
 Rows = npt.NDArray[np.intp]
 
@@ -32,19 +31,18 @@ class Counted:
 
     @staticmethod
     def of(codes: Codes) -> Counted:
-        """Clones carry nothing: their codes are equal, and would differ afterwards."""
-        rows = (
-            _sog_order(codes) if isinstance(codes, SogCodes) else np.arange(len(fields_of(codes)[0].levels))
-        )
+        """Of a .sog's Gaussians that are alike in all that is not written, none carries."""
+        if not isinstance(codes, SogCodes):
+            fields = format_of(codes).fields(codes)
+            return Counted(codes, np.arange(len(fields[0].levels)), fields)
+        rows, alike = _sog_order(codes)
         codes = taken(codes, rows)
-        alone = ~_clones(codes)
-        return Counted(codes, rows, [replace(each, usable=each.usable & alone) for each in fields_of(codes)])
+        fields = format_of(codes).fields(codes)
+        return Counted(codes, rows, [replace(each, bits=np.where(alike, 0, each.bits)) for each in fields])
 
 
-def taken(codes: Codes, rows: Rows) -> Any:
-    """The codes of a .sog in another order, and those of other formats as they are."""
-    if not isinstance(codes, SogCodes):
-        return codes
+def taken(codes: SogCodes, rows: Rows) -> SogCodes:
+    """The codes of a .sog in another order."""
     return replace(codes, **{name: getattr(codes, name)[rows] for name in _SOG_ARRAYS})
 
 
@@ -63,23 +61,20 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
     return taken(codes, morton_order(means))
 
 
-def _sog_order(codes: SogCodes) -> Rows:
-    """By the cells that positions stay in; of several in one cell, which are clones, none carries."""
-    x, y, z = (position_cells(codes)).T
-    return np.lexsort((z, y, x))
-
-
-def _clones(codes: Codes) -> Flags:
-    """[N] which Gaussians are like another one in everything that writing leaves as it is."""
-    if isinstance(codes, (SogCodes, SpzCodes)):
-        names = _hashed(position_cells(codes))
-    else:
-        assert isinstance(codes, CompressedPlyCodes)
-        chunks = np.arange(len(codes)) // CHUNK
-        names = _hashed(codes.positions, codes.sh, codes.largest, chunks)
-    _, which, count = np.unique(names, return_inverse=True, return_counts=True)
-    found: Flags = count[which] > 1
-    return found
+def _sog_order(codes: SogCodes) -> tuple[Rows, Flags]:
+    """Gaussians [N] by hashes of what is not written, and which of them, in that order, share one."""
+    names = _hashed(
+        codes.scales,
+        codes.colors,
+        codes.alphas,
+        codes.labels,
+        codes.largest,
+        sog_distances(codes, codes.positions),
+    )
+    rows = np.argsort(names, kind="stable")
+    same = np.diff(names[rows]) == 0
+    alike: Flags = np.append(same, False) | np.append(False, same)
+    return rows, alike
 
 
 def _hashed(*arrays: npt.NDArray[Any]) -> npt.NDArray[np.uint64]:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.files.formats.common import Codes, Floats, arrays_of, opacities, unit
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats.common import Codes, arrays_of, unit
 from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
@@ -28,45 +28,32 @@ def unrounded(model: Gaussians, codes: Codes) -> dict[str, Doubles]:
 
 
 def _spz(model: Gaussians, codes: SpzCodes) -> dict[str, Doubles]:
-    means, quats, _, opacity_logits, f_dc, _ = arrays_of(model)
+    means, quats, *_ = arrays_of(model)
     xyz = _others(np.roll(unit(quats) * np.array([1, 1, -1, -1]), -1, axis=1), codes.largest)
     steps = 511 * np.sqrt(2)
     return {
         "positions": np.ldexp(means.astype(np.float64), codes.fractional_bits) * np.array([1, -1, -1]),
-        "colors": f_dc.astype(np.float64) * 38.25 + 127.5,
         "rotations": (xyz + 1) * 127.5 if codes.version == 2 else xyz * steps,
-        "alphas": _alphas(opacity_logits),
     }
 
 
 def _sog(model: Gaussians, codes: SogCodes) -> dict[str, Doubles]:
-    means, quats, _, opacity_logits, f_dc, _ = arrays_of(model)
+    means, quats, *_ = arrays_of(model)
     logs = np.copysign(np.log1p(np.abs(means.astype(np.float64))), means)
     extent = np.where(codes.maxs > codes.mins, codes.maxs - codes.mins, 1.0)
     return {
         "positions": (logs - codes.mins) / extent * 65535,
         "rotations": (_others(unit(quats), codes.largest) * np.sqrt(2) + 1) / 2 * 255,
-        "colors": _in_codebook(codes.color_codebook, f_dc),
-        "alphas": _alphas(opacity_logits),
     }
 
 
 def _compressed_ply(model: Gaussians, codes: CompressedPlyCodes) -> dict[str, Doubles]:
-    _, quats, log_scales, opacity_logits, f_dc, _ = arrays_of(model)
+    _, quats, log_scales, *_ = arrays_of(model)
     ends = codes.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(codes)].reshape(-1, 3, 2, 3)
-    vector = np.array([2047, 1023, 2047])
-    colors = f_dc * np.float32(SH_C0) + np.float32(0.5)
-    shares = []
-    parts: list[tuple[Floats, npt.NDArray[np.int64]]] = [(log_scales, vector), (colors, np.array([255]))]
-    for index, (values, most) in enumerate(parts, 1):
-        low, high = ends[:, index, 0], ends[:, index, 1]
-        shares.append((values - low) / np.where(high > low, high - low, 1.0) * most)
-    rotations = (_others(unit(quats), codes.largest) * np.sqrt(0.5) + 0.5) * 1023
+    low, high = ends[:, 1, 0], ends[:, 1, 1]
     return {
-        "scales": shares[0],
-        "rotations": rotations,
-        "colors": shares[1],
-        "alphas": _alphas(opacity_logits),
+        "scales": (log_scales - low) / np.where(high > low, high - low, 1.0) * np.array([2047, 1023, 2047]),
+        "rotations": (_others(unit(quats), codes.largest) * np.sqrt(0.5) + 0.5) * 1023,
     }
 
 
@@ -77,20 +64,9 @@ _FORMATS: dict[type[Codes], Callable[[Gaussians, Any], dict[str, Doubles]]] = {
 }
 
 
-def _alphas(opacity_logits: Floats) -> Doubles:
-    """[N, 1] opacities in 255ths."""
-    return opacities(opacity_logits)[:, None] * 255
-
-
 def _others(quats: Doubles, largest: npt.NDArray[np.uint8]) -> Doubles:
     """[N, 3] the parts of quaternions [N, 4] that are not `largest`, which is made positive."""
     index = largest[:, None].astype(np.int64)
     sign = np.where(np.take_along_axis(quats, index, 1) < 0, -1.0, 1.0)
     rest = np.arange(3) + (np.arange(3) >= index)
     return np.take_along_axis(quats * sign, rest, 1)
-
-
-def _in_codebook(codebook: Floats, values: Floats) -> Doubles:
-    """Where `values` lie between the numbers of an ascending codebook, in levels."""
-    numbers, first = np.unique(codebook.astype(np.float64), return_index=True)
-    return np.interp(values.astype(np.float64), numbers, first)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import bdtrc
 
-from keyss.channels.low_bits import reed_solomon
+from keyss.channels import reed_solomon
 from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.layout import Room, shares
 from keyss.core.errors import InputError, UsageError

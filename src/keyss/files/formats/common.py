@@ -12,7 +12,7 @@ import torch
 
 from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.files.ply import OPACITY_LOGIT_BOUND
+from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 from keyss.files.streams import MOST_BYTES, StandardInput
 
 Bytes = npt.NDArray[np.uint8]

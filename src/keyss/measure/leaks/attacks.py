@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from keyss.channels.appended import is_appended
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
 from keyss.fitting.image_metrics import subsample_views
@@ -88,19 +89,6 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
     ]
 
 
-def source_attack(show: Callable[[Gaussians], Mapping[str, Gaussians]]) -> Attack:
-    """The attack of somebody who read the source of the methods: `keyss.methods.base.Method.attacks`.
-
-    `show` gives the same names for every model.
-    """
-    return Attack(
-        "by the source",
-        "What this program's source tells somebody to try.",
-        {},
-        lambda model: iter(show(model).items()),
-    )
-
-
 def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed: int = 0) -> Attack:
     """What somebody sees who got a secret's decoder and all that is encrypted with it, but not the key.
 
@@ -144,11 +132,12 @@ def search_embeddings(
     their mean: what makes some visible and as much of others invisible is a scene in place of a scene, while
     what only adds or only removes is not. With 0 all change counts, which finds a secret that needs more
     Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded: a decoder that
-    divides opacities by their norm over the model sees larger ones then, which are small all the same. Where
-    the decoded opacities have no gradient in the embedding, the random starts come back.
+    divides opacities by their norm over the model sees larger ones then, which are small all the same. What
+    was appended to the model, no decoder changes: it is left out. Where the decoded opacities have no
+    gradient in the embedding, the random starts come back.
     """
     generator = torch.Generator().manual_seed(seed)
-    part = stego.detach()
+    part = stego.detach()[~is_appended(stego)]
     if len(part) > most:
         part = part[torch.randperm(len(part), generator=generator)[:most].to(stego.device)]
 

@@ -8,16 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from keyss.channels.base import Content, RecordRequest
-from keyss.channels.codes import published
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
 from keyss.channels.low_bits.layout import plan_records, record_capacity
+from keyss.channels.rooms import room_in
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import cost, dither, sampled
 from keyss.methods.records import whole
-from keyss.methods.records.embedding import embed_in_codes, embed_models, rooms_in_codes, unpack_records
+from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
 from keyss.methods.records.encoding import (
     CarriedSecret,
     check_degrees,
@@ -25,17 +25,15 @@ from keyss.methods.records.encoding import (
     record_requests,
     subsampled_counts,
 )
+from keyss.methods.records.prospect import outlook_whole
 
-_PRUNE = '`prune_to_fit=True` leaves out the least visible, `method="learned", sidecar=True` has room'
-_LEARNED = '`method="learned"` needs no low bits of the cover'
-_SIDECAR = '`method="learned", sidecar=True` needs no room in the cover\'s low bits'
-_DITHER = f"`dither=True` gives it new low bits, {_LEARNED}"
+_PRUNE = '`prune_to_fit=True` leaves out the least visible, `publish="any"` has room'
+_ANY = '`publish="any"` needs no low bits of the cover'
+_DITHER = f"`dither=True` gives it new low bits, {_ANY}"
 _DITHER_AND_PRUNE = (
-    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_LEARNED}"
+    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_ANY}"
 )
 _PRUNE_OR_PLY = '`prune_to_fit=True` leaves out what is seen least, `publish="ply"` has more room'
-_BITS_IN_CODES = 18  # of a Gaussian of the cover, where it is not known yet, and of the secret's
-_BITS_OF_SECRETS = 110  # of a Gaussian of a secret, of which nothing else is known
 
 NAME = "carry"
 
@@ -57,7 +55,7 @@ class CarryMethod:
         refused after their training.
         """
         if options.publish != "ply":
-            return _prepared_for_codes(inputs, options)
+            return _prepared_for_room(inputs, options)
         cover, *others = (each.model for each in inputs)
         degree, *degrees = _degrees(inputs, options)
         check_degrees(LOW_BITS, degree, degrees)
@@ -82,7 +80,7 @@ class CarryMethod:
     def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
         """The cover as it is, and in it what its carriers have room for."""
         if options.publish != "ply":
-            return _outlook_in_codes(inputs, options)
+            return outlook_whole(inputs, options)
         sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
         degrees = _degrees(inputs, options)
         cover, notes = inputs[0].model, []
@@ -108,53 +106,36 @@ class CarryMethod:
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
         if options.publish != "ply":
-            room = published.prepare(cover.model, options.publish)
+            room = room_in(cover.model, options.publish, options.channel)
             with advising(UsageError, _PRUNE_OR_PLY):
-                written = embed_in_codes(room, keys, models, NAME, prune=options.prune_to_fit)
+                written = embed_whole(room, keys, models, prune=options.prune_to_fit)
             seconds = time.monotonic() - start
-            return Stego(written.stego, None, written.opened, seconds, details=written.details)
+            return Stego(written.stego, written.opened, seconds, details=written.details)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
-        with advising(InputError, _LEARNED if options.dither else _DITHER):
+        with advising(InputError, _ANY if options.dither else _DITHER):
             prepared = _prepared(cover.model, options)
         counts = _counts(prepared, models, options)
         found = embed_models(prepared, keys, models, counts, NAME)
         seconds = time.monotonic() - start
-        return Stego(found.stego, None, found.opened, seconds, details=found.details(cover.model))
+        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model))
 
     def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""
         return unpack_records(content)
 
-    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
-        """None: without a key, low bits that carry something are as random as any."""
-        return {}
 
-
-def _prepared_for_codes(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
+def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
     """Refuses given models that will not fit; those that are fitted first are made to fit."""
     cover, *others = (each.model for each in inputs)
     secrets = [model for model in others if model is not None]
     if cover is None or len(secrets) < len(others):
         return replace(options, prune_to_fit=True)
-    room = published.prepare(cover, options.publish)
+    room = room_in(cover, options.publish, options.channel)
     with advising(UsageError, _PRUNE_OR_PLY):
         if not options.prune_to_fit:
-            for model, size in zip(secrets, rooms_in_codes(room, secrets), strict=True):
-                whole.fitted(model, size, prune=False)
+            for model, share in zip(secrets, shares_of(room, secrets), strict=True):
+                whole.fitted(model, share, prune=False, short=room.grows)
     return options
-
-
-def _outlook_in_codes(inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
-    """The room of the cover; how many Gaussians of the secrets fit is a guess until they are encoded."""
-    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
-    cover, asked = inputs[0].model, sum(sizes[1:])
-    degree = _degrees(inputs, options)[0]
-    if cover is None:
-        room, note = sizes[0] * _BITS_IN_CODES // 8, "about"
-    else:
-        room, note = published.prepare(cover, options.publish).capacity, "exactly"
-    notes = (f"the codes of the {options.publish} file have room for {note} {room:,} bytes",)
-    return Outlook(sizes[0], degree, asked, min(asked, 8 * room // _BITS_OF_SECRETS), notes=notes)
 
 
 def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
@@ -176,11 +157,11 @@ def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
 def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
     """What works for a cover whose low bits are not random."""
     if options.dither:
-        return _LEARNED
+        return _ANY
     try:
         prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))  # all: a sample shows few duplicates
     except InputError:
-        return _LEARNED
+        return _ANY
     fits = not requests or sum(each.count for each in requests) <= prepared.record_capacity(requests)
     return _DITHER if fits else _DITHER_AND_PRUNE
 
@@ -190,7 +171,7 @@ def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryO
 
     Raises UsageError if they do not fit.
     """
-    with advising(UsageError, _SIDECAR):
+    with advising(UsageError, _ANY):
         kept = subsampled_counts(prepared, models)  # refuses where pruning would not help either
     if options.prune_to_fit:
         return kept

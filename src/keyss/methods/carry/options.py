@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from keyss.fitting.config import PRESETS as FIT_PRESETS
 from keyss.methods.base import CommandLineOption, MethodOptions
@@ -19,7 +19,6 @@ class CarryOptions(MethodOptions):
     dither: Annotated[bool, CommandLineOption("Give the cover new low bits where they are not random.")] = (
         False
     )
-    publish: Literal["ply", "spz", "sog", "compressed-ply"] = "ply"  # the format of the published file
 
 
 PRESETS: dict[str, CarryOptions] = {

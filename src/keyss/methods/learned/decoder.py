@@ -1,9 +1,7 @@
 """The decoder: turns the cover's Gaussians into a secret's, one Gaussian at a time, for one key.
 
-KeySS, section 3.2 and appendix: attribute* = attribute + residual, on raw attributes. There are two sources
-of residuals. The *opacity remap* looks at a Gaussian's opacity alone: it knows the band of opacities, too
-small to be drawn, in which a secret's Gaussians lie (`keyss.methods.learned.opacity_band`). The *network* is
-the paper's: a common branch over all attributes of a Gaussian, then a branch of two layers per updated
+KeySS, section 3.2 and appendix: attribute* = attribute + residual, on raw attributes. The residuals come
+from a network: a common branch over all attributes of a Gaussian, then a branch of two layers per updated
 attribute.
 
 Corrections to the published code: residuals are plain sums of either sign; every input comes from the one
@@ -14,7 +12,7 @@ pruning or re-ordering the model changes nothing for the Gaussians that stay.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, get_args
 
@@ -26,7 +24,6 @@ from torch import Tensor, nn
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import EMBEDDING_SIZE
-from keyss.methods.learned.opacity_band import OpacityBand
 
 Attribute = Literal["op", "ro", "sc", "xyz", "sh"]  # opacity, rotation, scale, position, colour
 Mask = tuple[Attribute, ...]  # the paper's theta: which attributes the decoder updates
@@ -40,7 +37,6 @@ KEY_GAIN = 3.0  # lets a unit vector move the first layer as much as the attribu
 # Cosines between an embedding and the decoder's own: the gate is shut below the first, open above the second.
 # Two random unit vectors of 64 numbers come that near once in 10^10 times.
 GATE_SHUT, GATE_OPEN = 0.7, 0.9
-KNOTS = 6
 
 Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
 
@@ -58,12 +54,10 @@ def parse_mask(text: str) -> Mask:
 
 @dataclass(frozen=True, kw_only=True)
 class DecoderShape:
-    """Kind and sizes of a decoder."""
+    """Sizes of a decoder."""
 
     mask: Mask = ("op",)
-    kind: Literal["remap", "network"] = "remap"  # a network adds to the opacity remap
     conditioning: Literal["gate", "bias"] = "gate"  # how the key enters; bias: the paper's
-    # What follows is for networks.
     hidden: tuple[Width, Width] = (64, 64)  # widths of the two layers of the common branch
     branch: Width = 32  # width of each attribute's branch
     frequencies: Annotated[int, Meta(ge=0, le=16)] = 6  # octaves of sines and cosines of the position
@@ -88,64 +82,32 @@ class DecoderShape:
 class Decoder(nn.Module):
     """`decoder(gaussians, embedding)` gives the Gaussians that the key's embedding [64] stands for.
 
-    A new decoder changes nothing, whatever the key.
+    A new decoder of our design changes nothing, whatever the key.
     """
 
     key: Tensor  # [64] the embedding that it belongs to
-    knots: Tensor  # [KNOTS] opacity logits, ascending, of the opacity remap
-    values: Tensor  # [KNOTS] its residuals there
 
     def __init__(self, shape: DecoderShape) -> None:
         super().__init__()
         self.shape = shape
         self.register_buffer("key", torch.zeros(EMBEDDING_SIZE))
-        self.register_buffer("knots", torch.linspace(-40, 40, KNOTS))
-        self.register_buffer("values", torch.zeros(KNOTS))
-        self.network = Network(shape) if shape.kind == "network" else None
+        self.network = Network(shape)
 
     @torch.no_grad()
     def prepare(self, gaussians: Gaussians, embedding: Tensor) -> None:
         """Fix the key and the constants of the inputs, from the model that training starts with."""
         self.key.copy_(embedding)
-        if self.network is not None:
-            self.network.prepare(gaussians)
-
-    def set_remap(self, knots: Sequence[float], values: Sequence[float]) -> None:
-        """Let the opacity remap go through these points, KNOTS of them; outside it goes on as it ends."""
-        self.knots.copy_(torch.tensor(knots))
-        self.values.copy_(torch.tensor(values))
-
-    @property
-    def band(self) -> OpacityBand:
-        """Where the secret's Gaussians lie after a warm start."""
-        return OpacityBand(*self.knots[1:5].tolist())
-
-    @property
-    def nearly_opaque_logit(self) -> float:
-        """A logit that the remap shows nearly opaque: high between the inner ends of the band."""
-        return self.band.inner_low + 0.7 * (self.band.inner_high - self.band.inner_low)
+        self.network.prepare(gaussians)
 
     def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
         gate = self._gate(embedding)
         if gate == 0:
             return gaussians
-        residuals: dict[str, Tensor] = {}
-        extent = gaussians.means.new_ones(())
-        if self.network is not None:
-            extent = self.network.extent
-            residuals = self.network(gaussians, embedding, whole or gaussians)
-        if "op" in self.shape.mask:
-            remap = self._remap(gaussians.opacity_logits)[:, None]
-            residuals["op"] = remap + residuals["op"] if "op" in residuals else remap
+        residuals = self.network(gaussians, embedding, whole or gaussians)
         if gate < 1:
             residuals = {name: gate * residual for name, residual in residuals.items()}
-        return add_residuals(gaussians, residuals, extent)
-
-    def _remap(self, logits: Tensor) -> Tensor:
-        right = torch.searchsorted(self.knots, logits.detach()).clamp(1, KNOTS - 1)
-        start, end = self.knots[right - 1], self.knots[right]
-        return torch.lerp(self.values[right - 1], self.values[right], (logits - start) / (end - start))
+        return add_residuals(gaussians, residuals, self.network.extent)
 
     def _gate(self, embedding: Tensor) -> float:
         """1 for the decoder's own key, 0 for every other, whatever the weights are.

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.gaussians import Gaussians
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.density import CappedStrategy
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
@@ -17,13 +17,10 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.fitting.sampling import Shuffle
 from keyss.keys.derivation import random_embeddings
 from keyss.methods.learned.decoder import Decoder
-from keyss.methods.learned.opacity_band import HIDDEN_SLOPE, logit_limits, opacity_remap
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
 from keyss.methods.learned.start import make_start
 from keyss.methods.learned.targets import CombinedPoses, PlacedScene, possibly_seen
 from keyss.rendering import render_with_meta
-
-LAST_RATE = 0.1  # of the rates after a warm start, reached over the second half of the run
 
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
@@ -61,15 +58,9 @@ class JointRun:
         ]
         self.extent = scenes[0].scene.extent
 
-        self.warm = config.start == "warm"
         self.parameters = to_parameters(make_start(scenes, config, self.generator), device)
         self.optimizers = make_optimizers(self.parameters, config.fit, self.extent)
-        self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
-        if self.warm:
-            self.rates = {name: config.warm_rate * rate for name, rate in self.rates.items()}
-            # Hidden logits lie close together: a step of theirs moves the shown ones 1 / HIDDEN_SLOPE as far.
-            self.rates["opacities"] *= HIDDEN_SLOPE
-            self.logit_limits = logit_limits(self.parameters["opacities"].detach(), len(embeddings))
+        self.rate_of_means = self.optimizers["means"].param_groups[0]["lr"]
         opacities = self._largest_opacity if config.prune_by == "all" else None
         self.strategy = CappedStrategy(config.fit, opacities, freeze=config.at_cap == "freeze")
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
@@ -80,13 +71,9 @@ class JointRun:
             self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
         for decoder, embedding in self._keyed_decoders():
             decoder.prepare(self.gaussians(), embedding)
-        for secret, decoder in enumerate(self.decoders if self.warm else ()):
-            decoder.set_remap(*opacity_remap(secret))
         self._all_decoders = torch.nn.ModuleList(self.decoders)
-        # Opacity remaps have no weights, and an optimizer takes no empty list.
-        weights = list(self._all_decoders.parameters()) or [torch.nn.Parameter(torch.zeros(0))]
         self.decoder_optimizer = torch.optim.AdamW(
-            weights, lr=config.decoder_rate, weight_decay=config.weight_decay
+            self._all_decoders.parameters(), lr=config.decoder_rate, weight_decay=config.weight_decay
         )
 
     def __len__(self) -> int:
@@ -95,7 +82,7 @@ class JointRun:
     def step(self) -> None:
         config = self.config
         self.iteration += 1
-        degree = config.fit.sh_degree if self.warm else config.fit.sh_degree_at(self.iteration)
+        degree = config.fit.sh_degree_at(self.iteration)
         poses = self._draw_poses()
 
         def loss_of(drawn: Gaussians, scene: int) -> tuple[Tensor, dict[str, Any]]:
@@ -116,23 +103,19 @@ class JointRun:
         if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
             total = total + self._incorrect_loss(cover.detach(), poses[0], loss_of)
 
-        if not self.warm:
-            for meta, _, _ in drawn:
-                meta["means2d"].retain_grad()
+        for meta, _, _ in drawn:
+            meta["means2d"].retain_grad()
         total.backward()
+        self.loss = total.detach()
         self._set_rates()
         for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        if self.warm:
-            with torch.no_grad():
-                self.parameters["opacities"].clamp_(*self.logit_limits)
-        else:  # what a warm start chose from whole models, growth would only make worse
-            asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
-            combined = combine_densification(asking, len(self))
-            self.strategy.step_post_backward(
-                self.parameters, self.optimizers, self.density, self.iteration, combined
-            )
+        asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
+        combined = combine_densification(asking, len(self))
+        self.strategy.step_post_backward(
+            self.parameters, self.optimizers, self.density, self.iteration, combined
+        )
 
     def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], loss_of: Any) -> Tensor:
         """The cover is right already: only the decoders are to learn from wrong keys, in turns."""
@@ -157,12 +140,7 @@ class JointRun:
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
-        # At constant rates the Gaussians jitter around their optimum. A warm start, which cannot grow more of
-        # them, lets the rates decay over the second half of the run.
-        late = LAST_RATE ** max(0.0, 2 * progress - 1) if self.warm else 1.0
-        for name, optimizer in self.optimizers.items():
-            decay = 0.01**progress if name == "means" else late
-            optimizer.param_groups[0]["lr"] = self.rates[name] * decay
+        self.optimizers["means"].param_groups[0]["lr"] = self.rate_of_means * 0.01**progress
         warm_up = min(1.0, self.iteration / 100)
         self.decoder_optimizer.param_groups[0]["lr"] = self.config.decoder_rate * warm_up * 0.05**progress
 
@@ -170,10 +148,6 @@ class JointRun:
     def _largest_opacity(self) -> Tensor:
         """[N] the largest opacity over the cover and all secrets."""
         return torch.stack([model.opacities for model in self._models()]).amax(0)
-
-    def drawn(self) -> Tensor:
-        """[N] whether a Gaussian is drawn in any scene: what is not would only give away where it lies."""
-        return self._largest_opacity() >= DRAWN_OPACITY
 
     def gaussians(self) -> Gaussians:
         """The model as it would be published."""

@@ -1,8 +1,9 @@
 """The learned method: secrets trained for the cover that they are hidden in, and published as one model.
 
-*Key-Secured 3D Secrets within 3D Gaussian Splatting* (KeySS), with the corrections in `docs/method.md`: one
-frame for all scenes, joint training, encryption (`keyss.methods.learned.publication`). Where a file keeps
-every bit, there is a better way: `keyss.methods.learned.refit`.
+*Key-Secured 3D Secrets within 3D Gaussian Splatting* (KeySS), with the corrections in `docs/method.md`. By
+default secrets are trained for the room in a cover that stays as it is (`keyss.methods.learned.refit`). From
+points it is the paper's way: one frame for all scenes, joint training, encrypted decoders
+(`keyss.methods.learned.publication`).
 """
 
 from __future__ import annotations
@@ -17,16 +18,15 @@ from typing import Any
 from torch import Tensor
 
 from keyss.channels.base import Content, Records
+from keyss.channels.rooms import room_in
 from keyss.core.alignment import align
-from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.keys.derivation import SALT_BYTES, expand
+from keyss.keys.derivation import SALT_BYTES
 from keyss.methods.base import Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego
 from keyss.methods.dither import cost
-from keyss.methods.learned.attacks import known_remaps
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, sized, training_options
@@ -39,10 +39,10 @@ from keyss.methods.learned.room import (
     divided,
     record_degree,
     secret_sizes,
-    with_low_bits,
 )
 from keyss.methods.learned.targets import PlacedScene
 from keyss.methods.records.embedding import unpack_records
+from keyss.methods.records.prospect import outlook_whole
 
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
@@ -61,7 +61,10 @@ class LearnedMethod:
         """Sized for models where they are all there is; refuses models too small for their low bits."""
         options = sized(options, inputs)
         encoder_of(options)  # says what is missing
-        if not options.sidecar:
+        if options.publish != "ply":
+            if (cover := inputs[0].model) is not None:
+                room_in(cover, options.publish, options.channel)  # says what is missing
+        else:
             check_room(options, [each.model for each in inputs])
         return options
 
@@ -78,14 +81,18 @@ class LearnedMethod:
                     f"{role} of SH degree {each.model.sh_degree} gets degree {degree}: {psnr:.1f} dB PSNR "
                     "against itself"
                 )
-        if options.in_records:
+        if options.publish != "ply":
+            found = outlook_whole(inputs, options)
+            share = found.capacity / max(1, found.asked)
+            drawn = [0, *(int(share * each) for each in sizes[1:])]
+            return replace(found, steps=fit.iterations, drawn=tuple(drawn), notes=(*notes, *found.notes))
+        if options.start == "warm":
             gaussians = fit.max_gaussians if cover is None else len(cover)
             carriers = carriers_of(cover, gaussians, fit.sh_degree)
             drawn = [0, *secret_sizes(sizes[1:], gaussians, carriers, options)]
         else:
             gaussians = min(fit.max_gaussians, sum(sizes))
-            weights = [1.0] + [options.secret_share] * (len(sizes) - 1)
-            drawn = divided(sizes, weights, fit.max_gaussians)
+            drawn = divided(sizes, [1.0] * len(sizes), fit.max_gaussians)
         return Outlook(
             gaussians=gaussians,
             sh_degree=fit.sh_degree,
@@ -99,9 +106,9 @@ class LearnedMethod:
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: LearnedOptions, context: Context
     ) -> Stego:
-        """Train cover and secrets together, or secrets for what the cover can carry, and encrypt them.
+        """Train secrets for what the cover can carry, or cover and secrets together, and encrypt them.
 
-        Raises UsageError for a model too small for what it has to carry, Interrupted on Ctrl-C, and
+        Raises UsageError for a cover too small for what it has to carry, Interrupted on Ctrl-C, and
         InputError for a checkpoint of another run.
         """
         options = training_options(options)
@@ -117,15 +124,9 @@ class LearnedMethod:
         ]
         if fewer:
             details["psnr_of_fewer_harmonics"] = fewer
-        if options.in_records:
+        if options.start == "warm":
             found = hide_refitted(cover, secrets, derived, options, context, NAME)
             return replace(found, details=details | dict(found.details))
-        # What training does not reach keeps its low bits: those of a quantised model would be no good.
-        entropy = hashlib.sha256(b"keyss/v1/dither" + b"".join(key.expand("writer", 32) for key in derived))
-        models = [
-            with_low_bits(source.model, options.fit.sh_degree, expand(entropy.digest(), f"model/{index}", 32))
-            for index, source in enumerate(sources)
-        ]
         encoder = encoder_of(options)
         embeddings = (
             [key.embedding() for key in derived] if encoder is None else [encoder(key) for key in keys]
@@ -134,6 +135,7 @@ class LearnedMethod:
         cover_cameras = [view.camera for view in scenes[0].train]
         frames = [Similarity.identity()]
         frames += [align([view.camera for view in scene.train], cover_cameras) for scene in scenes[1:]]
+        models = [source.model for source in sources]
         placed = [PlacedScene.of(*parts) for parts in zip(scenes, models, frames, strict=True)]
         run = JointRun(placed, embeddings, options, context.device)
         seconds = train(
@@ -159,7 +161,6 @@ class LearnedMethod:
         published = publish(run, keys, frames[1:], options, _discarded(run, derived))
         return Stego(
             published.stego,
-            published.sidecar,
             published.opened,
             seconds,
             options.fit.iterations,
@@ -172,10 +173,6 @@ class LearnedMethod:
             return unpack_records(content)
         return replace(unpack_secret(content.data), chunks=content.chunks)
 
-    def attacks(self, stego: Gaussians, secrets: int) -> Mapping[str, Gaussians]:
-        """The opacity remaps of a warm start are in the source; nothing else is known without a key."""
-        return known_remaps(stego, secrets)
-
 
 def _roles(inputs: Sequence[SceneInput]) -> list[str]:
     return ["the cover", *["a secret"] * (len(inputs) - 1)]
@@ -184,7 +181,9 @@ def _roles(inputs: Sequence[SceneInput]) -> list[str]:
 def _degrees(options: LearnedOptions, scenes: int) -> list[int]:
     """SH degrees with which the cover and the secrets come out."""
     degree = options.fit.sh_degree
-    of_secrets = record_degree(degree) if options.in_records else degree
+    if options.publish != "ply":
+        return [degree, *[3] * (scenes - 1)]  # as they are
+    of_secrets = record_degree(degree) if options.start == "warm" else degree
     return [degree, *[degree if of_secrets is None else of_secrets] * (scenes - 1)]
 
 

@@ -3,14 +3,14 @@
 The payload is safetensors, nothing executable. It holds the decoder (a network's weights in half precision,
 all constants whole) with the embedding that it belongs to, the similarity that leads back to the secret's own
 frame, and *anchors*: positions of some Gaussians of the stego model. They are there in any order and, mostly,
-after pruning, and tell whether a sidecar belongs to a model. A secret's bytes say nothing of other secrets.
-docs/format.md lists them.
+after pruning, and tell whether the model was moved or rounded, which a decoder does not survive although
+appended Gaussians do. A secret's bytes say nothing of other secrets. docs/format.md lists them.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
@@ -22,6 +22,7 @@ from msgspec import Meta
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from keyss.channels.appended import is_appended
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
@@ -29,11 +30,10 @@ from keyss.core.similarity import Similarity
 from keyss.methods.base import Frame, Remains
 from keyss.methods.learned.decoder import Decoder, DecoderShape, parse_mask
 
-FORMAT, VERSION = "keyss-secret", 6
+FORMAT, VERSION = "keyss-secret", 7
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
-_ROUNDED_SHARE = 0.25  # of the opacities of transparent Gaussians may differ where they were rounded
 _DECODED_NUMBERS = 1 << 23  # that a decoder holds at a time: 32 MiB, for its sizes are the file's
 _SLACK = 0.01  # of the Gaussians: rounding takes some over the limit of what is drawn, and others back
 _WEIGHTS = "decoder."
@@ -77,9 +77,6 @@ class HiddenSecret:
     decoder: Decoder
     frame: Similarity  # from the secret's own frame into the cover's
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
-    # [M, 7] position, opacity logit and constant colour of all transparent Gaussians: formats round their
-    # opacities to nothing, and some drop the colours of what is transparent.
-    faint: Tensor | None = None
     count: int = 0  # Gaussians that the secret has when it is revealed from a whole file; 0: not known
     chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
 
@@ -87,13 +84,10 @@ class HiddenSecret:
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """A model that needs no decoder and no cover, without what is never drawn; see `Opened.reveal`.
 
-        Where opacities were rounded to nothing, they are taken from the sidecar. If Gaussians were lost, the
-        others make up for them.
+        If Gaussians were lost, the others make up for them.
         """
         if not force:
-            self.check_belongs_to(stego)
-        if (force or self.faint is not None) and _is_rounded(stego):
-            stego = self.with_faint(stego)
+            self.check_unchanged(stego)
         decoded = self.decode(stego, self.embedding)
         if (drawn := decoded.opacities >= DRAWN_OPACITY).any():
             decoded = compensate_pruning(decoded[drawn], self.count)
@@ -101,9 +95,12 @@ class HiddenSecret:
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
-        """What the decoder makes of `stego` for an embedding [64]; see `Opened.decode`."""
+        """What the decoder makes of `stego` for an embedding [64]; see `Opened.decode`.
+
+        Appended Gaussians are left out: they came after the training.
+        """
         decoder, embedding = self.decoder.to(stego.device), embedding.to(stego.device)
-        stego = stego.with_sh_degree(decoder.shape.sh_degree)
+        stego = stego[~is_appended(stego)].with_sh_degree(decoder.shape.sh_degree)
         if torch.is_grad_enabled():
             return decoder(stego, embedding)  # type: ignore[no-any-return]
         step = max(1, _DECODED_NUMBERS // decoder.shape.numbers)
@@ -118,25 +115,12 @@ class HiddenSecret:
     def fingerprint(self) -> str:
         return hashlib.sha256(pack_secret(self)).hexdigest()[:16]
 
-    def with_faint(self, stego: Gaussians) -> Gaussians:
-        """`stego` with transparent Gaussians as the nearest in `faint` are, or all nearly opaque."""
-        transparent = stego.opacities < DRAWN_OPACITY
-        opacity_logits, sh = stego.opacity_logits.clone(), stego.sh.clone()
-        if self.faint is None:
-            opacity_logits[transparent] = self.decoder.nearly_opaque_logit
-        else:
-            tree = cKDTree(self.faint[:, :3].double().numpy())
-            _, nearest = tree.query(stego.means[transparent].cpu().double().numpy())
-            known = self.faint[torch.from_numpy(nearest)].to(stego.device)
-            opacity_logits[transparent], sh[transparent, 0] = known[:, 3], known[:, 4:]
-        return replace(stego, opacity_logits=opacity_logits, sh=sh)
-
     @property
     def embedding(self) -> Tensor:
         """[64] what its key is to the decoder."""
         return self.decoder.key
 
-    def check_belongs_to(self, stego: Gaussians) -> None:
+    def check_unchanged(self, stego: Gaussians) -> None:
         """Raise InputError unless enough anchors are Gaussians of `stego`."""
         means = stego.means.detach().double().cpu().numpy()
         size = float(np.ptp(means, axis=0).max())
@@ -144,16 +128,10 @@ class HiddenSecret:
         found = float((distances <= ANCHOR_TOLERANCE * size).mean())
         if found < ANCHORS_NEEDED:
             raise InputError(
-                f"this decoder was made for another model: {found:.0%} of its anchors are in this PLY, "
-                f"at least {ANCHORS_NEEDED:.0%} expected "
-                "(quantising the positions does that too: `force=True` tries all the same)"
+                "the model was moved or rounded since its decoder was trained, or it is another one: "
+                f"{found:.0%} of the decoder's anchors are there, at least {ANCHORS_NEEDED:.0%} expected "
+                "(`force=True` tries all the same)"
             )
-
-
-def _is_rounded(stego: Gaussians) -> bool:
-    """Whether the opacities of transparent Gaussians are so few that a format must have rounded them."""
-    logits = stego.opacity_logits[stego.opacities < DRAWN_OPACITY]
-    return len(logits.unique()) < _ROUNDED_SHARE * len(logits)
 
 
 def choose_anchors(stego: Gaussians, generator: torch.Generator) -> Tensor:
@@ -181,8 +159,6 @@ def pack_secret(secret: HiddenSecret) -> bytes:
         for name, value in decoder.state_dict().items()
     }
     tensors["anchors"] = secret.anchors.contiguous()
-    if secret.faint is not None:
-        tensors["faint"] = secret.faint.contiguous()
     return safetensors.torch.save(tensors, {"keyss": msgspec.json.encode(header).decode()})
 
 
@@ -220,16 +196,11 @@ def _from_parts(header: _Header, tensors: dict[str, Tensor]) -> HiddenSecret:
     anchors = tensors.pop("anchors").float()
     if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
         raise InputError(f"anchors: expected up to {ANCHORS} positions, got shape {list(anchors.shape)}")
-    faint = tensors.pop("faint", None)
-    if faint is not None and (faint.dim() != 2 or faint.shape[1] != 7 or len(faint) == 0):
-        raise InputError(f"transparent Gaussians: expected rows of 7 numbers, got shape {list(faint.shape)}")
     decoder = Decoder(header.shape)
     decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
-    if not (decoder.knots.diff() > 0).all():
-        raise InputError("opacity remap: expected ascending knots")
     frame = Similarity(
         header.frame.scale,
         torch.tensor(header.frame.rotation, dtype=torch.float64),
         torch.tensor(header.frame.translation, dtype=torch.float64),
     )
-    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, faint, header.count)
+    return HiddenSecret(decoder.requires_grad_(False), frame, anchors, header.count)

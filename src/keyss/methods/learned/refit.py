@@ -1,25 +1,40 @@
-"""Secrets trained to the size that the cover's low bits have room for; the cover stays as it is.
+"""Secrets trained to the size that the cover has room for; the cover stays as it is.
 
 Where the published file keeps every bit, no Gaussian needs to serve two scenes. The cover is its plain model,
 so that nothing tells the file from a plain one but what low bits tell. Of a secret's plain model the
-Gaussians that contribute most are trained on, for as long as a joint training would, and carried as records.
+Gaussians that contribute most are trained on, for as long as the plain model was, and carried as records.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
+from keyss.channels.low_bits import LowBitsCover
+from keyss.channels.rooms import Room, room_in
 from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import refit_model
 from keyss.keys import DerivedKey
 from keyss.methods.base import Context, KeyedSource, Source, Stego
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.room import of_degree, prepared_cover, record_degree, secret_sizes
-from keyss.methods.learned.start import most_contributing
-from keyss.methods.records.embedding import embed_models
+from keyss.methods.records import whole
+from keyss.methods.records.embedding import (
+    Embedded,
+    EmbeddedWhole,
+    embed_models,
+    embed_whole,
+    shares_of,
+)
 from keyss.methods.records.encoding import subsampled_counts
+from keyss.rendering.contributions import contributions
+
+SELECTION_VIEWS = 64
+_FITTING = 0.97  # of the Gaussians that fit before they are trained on: packed, they get longer or shorter
 
 
 def hide_refitted(
@@ -30,23 +45,22 @@ def hide_refitted(
     context: Context,
     name: str,
 ) -> Stego:
-    """The cover with the secrets in its low bits; `name`: of the method that opens them.
+    """The cover with the secrets in it; `name`: of the method that opens them in low bits.
 
     Raises UsageError and InputError for a cover without room, Interrupted on Ctrl-C, and InputError for a
     checkpoint of another run.
     """
     fit = options.fit
     secret_of_writer = b"".join(key.expand("writer", 32) for key in derived)
-    entropy = _entropy(b"cover", secret_of_writer)
-    whole = of_degree(cover.model, fit.sh_degree, entropy)
-    prepared = prepared_cover(whole, entropy)
-    degree = record_degree(fit.sh_degree)
-    if degree is None:
-        raise ValueError(f"a model of SH degree {fit.sh_degree} has no room for records")
-    wanted = [len(each.source.model) for each in secrets]
-    sizes = secret_sizes(wanted, len(cover.model), prepared.carriers, options)
+    place: _InRecords | _Whole
+    if options.publish == "ply":
+        place = _InRecords.of(cover.model, options, _entropy(b"cover", secret_of_writer), name)
+    else:
+        model = cover.model.with_sh_degree(min(cover.model.sh_degree, fit.sh_degree))
+        place = _Whole(room_in(model, options.publish, options.channel))
+    sizes = place.sizes([each.source.model for each in secrets])
     models, seconds = [], 0.0
-    for index, (secret, size) in enumerate(zip(secrets, sizes, strict=True), start=1):
+    for index, (secret, (size, degree)) in enumerate(zip(secrets, sizes, strict=True), start=1):
         scene, plain = secret.source.scene, secret.source.model.with_sh_degree(degree)
         # As an independent run each: what becomes of one must not depend on the others.
         found = refit_model(
@@ -62,15 +76,70 @@ def hide_refitted(
         )
         models.append(found.gaussians)
         seconds += found.seconds
-    embedded = embed_models(
-        prepared,
-        [each.key for each in secrets],
-        models,
-        subsampled_counts(prepared, models),
-        name,
-        entropy=_entropy(b"embed", secret_of_writer, *map(_bytes, models)),
-    )
-    return Stego(embedded.stego, None, embedded.opened, seconds, fit.iterations, embedded.details(whole))
+    entropy = _entropy(b"embed", secret_of_writer, *map(_bytes, models))
+    embedded, details = place.embed([each.key for each in secrets], models, entropy)
+    return Stego(embedded.stego, embedded.opened, seconds, fit.iterations, details)
+
+
+@dataclass(frozen=True)
+class _InRecords:
+    """Gaussian by Gaussian in the cover's low bits."""
+
+    cover: Gaussians
+    prepared: LowBitsCover
+    options: LearnedOptions
+    degree: int  # of the secrets
+    name: str
+
+    @staticmethod
+    def of(cover: Gaussians, options: LearnedOptions, entropy: bytes, name: str) -> _InRecords:
+        cover = of_degree(cover, options.fit.sh_degree, entropy)
+        degree = record_degree(options.fit.sh_degree)
+        if degree is None:
+            raise ValueError(f"a model of SH degree {options.fit.sh_degree} has no room for records")
+        return _InRecords(cover, prepared_cover(cover, entropy), options, degree, name)
+
+    def sizes(self, plain: Sequence[Gaussians]) -> list[tuple[int, int]]:
+        """Gaussians and SH degree that each secret is trained with."""
+        found = secret_sizes(list(map(len, plain)), len(self.cover), self.prepared.carriers, self.options)
+        return [(size, self.degree) for size in found]
+
+    def embed(
+        self, keys: Sequence[str], models: Sequence[Gaussians], entropy: bytes
+    ) -> tuple[Embedded, dict[str, Any]]:
+        counts = subsampled_counts(self.prepared, models)
+        found = embed_models(self.prepared, keys, models, counts, self.name, entropy=entropy)
+        return found, found.details(self.cover)
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """Each as one string of bytes."""
+
+    room: Room
+
+    def sizes(self, plain: Sequence[Gaussians]) -> list[tuple[int, int]]:
+        """Gaussians and SH degree that each secret is trained with: a few fewer than would fit untrained."""
+        found = []
+        for model, share in zip(plain, shares_of(self.room, plain), strict=True):
+            kept, _ = whole.fitted(model, share, prune=True, short=self.room.grows)
+            count = len(kept) if len(kept) == len(model) else max(1, int(_FITTING * len(kept)))
+            found.append((count, kept.sh_degree))
+        return found
+
+    def embed(
+        self, keys: Sequence[str], models: Sequence[Gaussians], entropy: bytes
+    ) -> tuple[EmbeddedWhole, dict[str, Any]]:
+        found = embed_whole(self.room, keys, models, prune=True, entropy=entropy)
+        return found, found.details
+
+
+def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
+    """The `count` Gaussians that add most to what the training views show, in their order."""
+    if count >= len(plain):
+        return plain
+    cameras = [view.camera for view in subsample_views(scene.train, SELECTION_VIEWS)]
+    return plain[contributions(plain, cameras).topk(count).indices.sort().values]
 
 
 def _bytes(model: Gaussians) -> bytes:

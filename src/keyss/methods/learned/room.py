@@ -29,12 +29,8 @@ _SMALLER = (
     "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
     "keys can notice that there are other secrets"
 )
-_SIDECAR = "`sidecar=True` writes a file beside it instead"
-
-
-def with_low_bits(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` as the joint training starts from it, with low bits that are random before the first step."""
-    return dither(of_degree(model, sh_degree, entropy), expand(entropy, "start/1", 32))
+_ANY = '`publish="any"` has room for all'
+APPENDED = "what the keys open lies in appended Gaussians instead, and everybody can see that they are there"
 
 
 def prepared_cover(cover: Gaussians, entropy: bytes) -> LowBitsCover:
@@ -108,24 +104,26 @@ def divided(available: Sequence[int], weights: Sequence[float], total: int) -> l
 
 
 def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:
-    """Raise UsageError or InputError if what is to be hidden will not fit into the model that is trained.
+    """Raise UsageError or InputError if secrets will not fit into the low bits of their cover.
 
-    `models`: of the cover and of the secrets, those that are known.
+    `models`: of the cover and of the secrets, those that are known. Warns (KeyssWarning) where decoders will
+    not, and where the holder of one key can notice that there are other secrets.
     """
     options = training_options(options)
     degree, cap, cover = options.fit.sh_degree, options.fit.max_gaussians, models[0]
-    if not options.in_records:
-        payload, advice = _largest_payload(options), f"a larger `max_gaussians` makes room, {_SIDECAR}"
-        with advising(UsageError, advice if degree else f"`sh_degree=1` makes room, {_SIDECAR}"):
-            check_payload_fits(payload, cap, len(models) - 1, degree)
+    if options.start == "points":
+        try:
+            check_payload_fits(_largest_payload(options), cap, len(models) - 1, degree)
+        except UsageError as error:
+            warnings.warn(f"{error}; {APPENDED}", KeyssWarning, stacklevel=2)
         return
     if record_degree(degree) is None:
         raise UsageError(
             f"a model of SH degree {degree} has no room for anything in its low bits; `sh_degree=1` makes "
-            f"room{_growth(cover)}, {_SIDECAR}"
+            f"room{_growth(cover)}, {_ANY}"
         )
     gaussians = cap if cover is None else len(cover)
-    with advising(InputError, _SIDECAR):
+    with advising(InputError, _ANY):
         carriers = carriers_of(cover, gaussians, degree)
     sizes = [cap if each is None else len(each) for each in models[1:]]
     counts = secret_sizes(sizes, gaussians, carriers, options)
@@ -135,7 +133,7 @@ def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> N
     if min(counts) < min(LEAST_SECRET, *sizes):
         raise UsageError(
             f"a cover of {gaussians:,} Gaussians is too small to hide {len(sizes)} secret"
-            f"{'s' if len(sizes) > 1 else ''} in its low bits; a larger one has room, {_SIDECAR}"
+            f"{'s' if len(sizes) > 1 else ''} in its low bits; a larger one has room, {_ANY}"
         )
 
 

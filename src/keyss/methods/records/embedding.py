@@ -7,18 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from keyss.channels.base import Content, Payload, Records
-from keyss.channels.codes import CodesCover, CodesReader
-from keyss.channels.codes.published import coded
 from keyss.channels.low_bits import LOW_BITS, LowBitsCover
+from keyss.channels.opening import open_content
+from keyss.channels.rooms import Room
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.files.formats.common import CodedGaussians
 from keyss.methods.dither import cost
 from keyss.methods.records import whole
 from keyss.methods.records.encoding import CarriedSecret, decode, encode_all, most_visible, record_requests
 from keyss.methods.records.quantise import out_of_range
 
-ENCRYPTION_BYTES = 128  # that a payload takes at most beside its data
+OPENED_BY = "carry"  # the method that opens what is embedded whole, whoever trained it
 
 
 @dataclass(frozen=True)
@@ -75,56 +74,66 @@ def embed_models(
 
 
 @dataclass(frozen=True)
-class EmbeddedInCodes:
-    """What embedding in the codes of a final file gives."""
+class EmbeddedWhole:
+    """What embedding models whole gives."""
 
-    stego: CodedGaussians
+    stego: Gaussians
     opened: tuple[CarriedSecret, ...]
     details: dict[str, Any]  # numbers for metrics.json
 
 
-def embed_in_codes(
-    cover: CodesCover, keys: Sequence[str], models: Sequence[Gaussians], method: str, *, prune: bool
-) -> EmbeddedInCodes:
-    """All of each model, or with `prune` what fits, under its key, opened again; see `rooms_in_codes`.
+def embed_whole(
+    room: Room,
+    keys: Sequence[str],
+    models: Sequence[Gaussians],
+    *,
+    prune: bool,
+    entropy: bytes | None = None,
+) -> EmbeddedWhole:
+    """All of each model, or with `prune` what fits, under its key, opened again; see `shares_of`.
 
     Raises UsageError if they do not fit.
     """
-    rooms = rooms_in_codes(cover, models)
-    fitted = [whole.fitted(model, room, prune=prune) for model, room in zip(models, rooms, strict=True)]
-    payloads = [Payload(method, data) for _, data in fitted]
-    stego = coded(cover.embed(list(zip(keys, payloads, strict=True))))
-    reader = CodesReader.of(stego.codes)
-    opened = tuple(unpack_records(reader.open(key)) for key in keys)
+    shares = shares_of(room, models)
+    fitted = [
+        whole.fitted(model, share, prune=prune, short=room.grows)
+        for model, share in zip(models, shares, strict=True)
+    ]
+    payloads = [Payload(OPENED_BY, data) for _, data in fitted]
+    stego = room.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
+    opened = tuple(unpack_records(open_content(stego, key)) for key in keys)
     if [len(each.gaussians) for each in opened] != [len(kept) for kept, _ in fitted]:
         raise RuntimeError("what was written does not open again as it should")
-    details = {
-        "capacity_bytes": cover.capacity,
-        "capacity_bits_per_gaussian": round(8 * cover.capacity / len(stego), 2),
+    details: dict[str, Any] = {
         "secret_bytes": [len(data) for _, data in fitted],
         "gaussians_before_pruning": [len(model) for model in models],
         "sh_degrees": [each.gaussians.sh_degree for each in opened],
         "bits_per_gaussian": [each.bits for each in opened],
     }
-    return EmbeddedInCodes(stego, opened, details)
+    if not room.grows:
+        details["capacity_bytes"] = room.capacity
+        details["capacity_bits_per_gaussian"] = round(8 * room.capacity / len(stego), 2)
+    return EmbeddedWhole(stego, opened, details)
 
 
-def rooms_in_codes(cover: CodesCover, models: Sequence[Gaussians]) -> list[int]:
+def shares_of(room: Room, models: Sequence[Gaussians]) -> list[int]:
     """Bytes that the encoding of each model may take.
 
     A quarter of the room, half of it or all, whichever is enough: then a secret is as precise as it would be
     alone, and its key tells nothing of others. Where that is too much for all of them, equal shares.
     """
-    room = int(cover.capacity * (1 - 2**-10))  # what is packed already gets longer by less
-    parts = [_parts_alone(whole.least_bytes(model), room) for model in models]
+    capacity, overhead = room.capacity, room.overhead
+    if len(models) == 1 and room.grows:
+        return [capacity - overhead]
+    parts = [_parts_alone(whole.least_bytes(model), capacity, overhead) for model in models]
     if sum(1 / each for each in parts) > 1:
         parts = [len(models)] * len(models)
-    return [room // each - ENCRYPTION_BYTES for each in parts]
+    return [max(0, capacity // each - overhead) for each in parts]
 
 
-def _parts_alone(size: int, room: int) -> int:
-    """Of how many parts of the room one is enough for `size` bytes."""
-    return next((parts for parts in (4, 2) if size <= room // parts - ENCRYPTION_BYTES), 1)
+def _parts_alone(size: int, capacity: int, overhead: int) -> int:
+    """Of how many parts of the capacity one is enough for `size` bytes."""
+    return next((parts for parts in (4, 2) if size <= capacity // parts - overhead), 1)
 
 
 def unpack_records(content: Content) -> CarriedSecret:

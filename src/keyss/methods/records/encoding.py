@@ -47,9 +47,6 @@ class CarriedSecret:
     def remains(self, revealed: Gaussians) -> Remains:
         return Remains(len(revealed), self.count)
 
-    def check_belongs_to(self, stego: Gaussians) -> None:
-        """It does: every record is bound to the Gaussian that it came out of."""
-
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
@@ -73,7 +70,7 @@ def check_degrees(channel: Channel, cover: int, secrets: Sequence[int]) -> None:
         how = (
             '`method="learned"` can hide it'
             if cover > 0
-            else '`method="learned", sh_degree=1` or `method="learned", sidecar=True` can hide it'
+            else '`method="learned", sh_degree=1` or `publish="any"` can hide it'
         )
         raise UsageError(
             f"a cover of SH degree {cover} cannot carry a secret of SH degree {degree}: one of its "

@@ -1,0 +1,79 @@
+"""What a hiding is worth after other people's programs converted it: the table of docs/appended.md.
+
+    python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10]
+
+RUN: a folder of `keyss hide --publish any` with one secret. For each program and format the published model
+is converted, and so is the cover's plain model; the secret is revealed from the converted file alone. PSNR in
+dB against the test photos.
+
+pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from pathlib import Path
+
+import torch
+
+from keyss import reveal
+from keyss.core import Gaussians, Scene
+from keyss.core.errors import BackendError, KeyssError
+from keyss.measure.images import psnr
+from keyss.measure.robustness.conversions import Converter, converters
+from keyss.rendering import render
+from keyss.runs.opening import HidingRun, open_run
+
+
+@torch.no_grad()
+def against_photos(model: Gaussians, scene: Scene) -> float:
+    """Mean PSNR over the test views."""
+    found = []
+    for view in scene.test:
+        image = (render(model, view.camera, scene.background).clamp(0, 1) * 255).round() / 255
+        found.append(float(psnr(image, view.image.float() / 255)))
+    return statistics.mean(found)
+
+
+def row(run: HidingRun, name: str, converter: Converter | None) -> str:
+    """What one program's conversion leaves of cover and secret; None: as it was published."""
+    cover, secret = run.scenes(train_pictures=False)
+    plain = run.plain_models()[0]
+    if plain is None:
+        raise SystemExit(f"{run.folder} has no plain model of its cover")
+    stego, size, untouched = run.stego, 0, 0
+    if converter is not None:
+        changed, before = converter(stego), converter(plain)
+        stego, size, plain, untouched = changed.gaussians, changed.bytes, before.gaussians, before.bytes
+    try:
+        revealed = f"{against_photos(reveal(stego, run.keys[0]), secret):.2f}"
+    except KeyssError as error:
+        revealed = f"lost ({type(error).__name__})"
+    covers = [against_photos(each, cover) for each in (plain, stego)]
+    sizes = f"{untouched / 1e6:.2f} / {size / 1e6:.2f}" if size else ""
+    return f"| {name} | {sizes} | {covers[0]:.2f} / {covers[1]:.2f} | {revealed} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--key-file", type=Path, required=True)
+    parser.add_argument("--sog-iterations", type=int, default=1)
+    asked = parser.parse_args()
+    run = open_run(asked.run, [asked.key_file.read_text().strip()])
+    plain = [len(each) for each in run.plain_models() if each is not None]
+    own = [len(each.reveal(run.stego)) for each in run.opened]
+    print(f"{asked.run.name}: {len(run.stego):,} Gaussians, cover {plain[0]:,}, secret {own[0]:,}\n")
+    print("| what | MB, plain / published | cover, plain / published (dB) | secret (dB) |")
+    print("| --- | --- | --- | --- |")
+    print(row(run, "`.ply`, as published", None), flush=True)
+    for converter in converters(asked.sog_iterations):
+        try:
+            print(row(run, f"{converter.format} by {converter.tool}", converter), flush=True)
+        except BackendError as error:
+            print(f"| {converter.format} by {converter.tool} | not measured: {error} | | |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

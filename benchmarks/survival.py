@@ -1,0 +1,94 @@
+"""What survives what, for each channel: the table of docs/formats.md.
+
+    python benchmarks/survival.py MODEL.ply [--bytes N] [--gaussians N] [--photos FOLDER] [--width PIXELS]
+
+A file of random bytes is hidden in the model for `--publish ply` (low bits), `spz` (codes) and `any` (colours
+and appended Gaussians). After each change it is looked for with its key. With `--photos` the model, of that
+scene, is trained on as well.
+
+pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from keyss.api import SecretFile, convert, hide_files, reveal_file
+from keyss.core import Gaussians, InputError, WrongKeyError
+from keyss.core.errors import BackendError
+from keyss.files.models import read_model
+from keyss.files.scenes import load_scene
+from keyss.measure.robustness.changes import fine_tuning
+from robust import FORMATS, OTHERS, Change
+
+KEY = "a key of the benchmark 4711"
+CHANNELS: dict[str, dict[str, Any]] = {
+    "low bits (`ply`)": {"publish": "ply"},
+    "codes (`spz`)": {"publish": "spz"},
+    "colours (`any`)": {"publish": "any", "channel": "colours"},
+    "appended (`any`)": {"publish": "any", "channel": "appended"},
+}
+OWN = (".ply", ".spz", ".sog", ".compressed.ply", ".glb", ".splat")
+
+
+def _by_keyss(suffix: str) -> Change:
+    def change(model: Gaussians) -> Gaussians:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"converted{suffix}"
+            convert(model, path)
+            return read_model(path)
+
+    return change
+
+
+def survives(model: Gaussians, data: bytes, change: Change) -> str:
+    """A word for what the key opens after a change."""
+    try:
+        changed = change(model)
+    except BackendError as error:
+        return f"not measured: {error}"
+    try:
+        return "opens" if reveal_file(changed, KEY).data == data else "damaged"
+    except (WrongKeyError, InputError):
+        return "lost"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("--bytes", type=int, default=300)
+    parser.add_argument("--gaussians", type=int)
+    parser.add_argument("--photos", type=Path)
+    parser.add_argument("--width", type=int, default=200)
+    asked = parser.parse_args()
+    model = read_model(asked.model)
+    if asked.gaussians is not None:
+        order = torch.randperm(len(model), generator=torch.Generator().manual_seed(0))
+        model = model[order[: asked.gaussians]]
+    data = np.random.default_rng(0).bytes(asked.bytes)
+    secret = SecretFile(data, KEY, "file")
+    made = {name: hide_files(model, [secret], **options) for name, options in CHANNELS.items()}
+    print(f"{asked.model.stem}, {len(model):,} Gaussians, a file of {asked.bytes} bytes\n")
+    print(f"| what becomes of the model | {' | '.join(made)} |")
+    print("| --- |" + " --- |" * len(made))
+    print("| cost (dB) | " + " | ".join(f"{each.psnr:.0f}" for each in made.values()) + " |")
+    more = " | ".join(f"{len(each.stego) - len(model):,}" for each in made.values())
+    print(f"| Gaussians added | {more} |", flush=True)
+    own = {f"`{suffix}` by keyss": _by_keyss(suffix) for suffix in OWN}
+    every = {"passed on as it is": lambda model: model, **own, **FORMATS, **OTHERS}
+    if asked.photos:
+        photos = load_scene(asked.photos, width=asked.width)
+        every |= {f"{steps} steps of training on": fine_tuning(photos, steps) for steps in (10, 100)}
+    for name, change in every.items():
+        found = [survives(each.stego, data, change) for each in made.values()]
+        print(f"| {name} | {' | '.join(found)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""Words of 84 bits as Gaussians, and back after a format has rounded them.
+
+Every number of such a Gaussian is a point of a lattice that is coarser than what formats do to it
+(docs/appended.md):
+
+    39 bits  that stay when a model is moved, turned or scaled: three colours of 7 bits, three log scales of 6
+    45 bits  in the *own frame*, a cube around the model: three positions of 10 bits, and of the quaternion,
+             whose w is the largest part and positive, x, y and z, 5 bits each
+
+Opacity is just above 1/255, below which rasterizers draw nothing; 8 bits keep it as 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.similarity import Similarity
+
+Bits = npt.NDArray[np.uint8]
+Doubles = npt.NDArray[np.float64]
+Words = npt.NDArray[np.uint64]
+Points = npt.NDArray[np.int64]  # of lattices
+
+COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS = 7, 6, 10, 5
+INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
+WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + TURN_BITS)
+
+_OPACITY = 1.1 * DRAWN_OPACITY
+_LOGIT = math.log(_OPACITY / (1 - _OPACITY))
+_FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # after rounding
+_COLOUR_STEP = 0.0275  # twice what formats move constant colours by, and a little
+_SCALE_STEP = 0.08  # the same for log scales
+_LEAST_LOG_SCALE = -9.9  # of `.spz`, whose least is -10
+_SMALL = -9.0  # log scales of the smallest, beside that of the cube
+_TURNS_REACH = 0.5  # x, y and z are below it, so that w is never smaller
+_FARTHEST, _MOST_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
+
+
+def is_candidate(model: Gaussians) -> npt.NDArray[np.bool_]:
+    """[N] which Gaussians are as faint as appended ones."""
+    opacities = model.opacities.detach().cpu().numpy()
+    found: npt.NDArray[np.bool_] = (opacities > _FAINTEST) & (opacities < _STRONGEST)
+    for values in (model.means, model.quats, model.log_scales, model.sh):
+        found &= np.isfinite(values.detach().cpu().numpy()).reshape(len(found), -1).all(axis=1)
+    return found
+
+
+def is_appended(model: Gaussians) -> Tensor:
+    """[N] which Gaussians were appended to a model that no format has rounded since.
+
+    They have one opacity, which others have to the last bit by chance only: once in millions.
+    """
+    return model.opacity_logits == float(np.float32(_LOGIT))
+
+
+@dataclass(frozen=True)
+class Cube:
+    """Where appended Gaussians lie: the own frame's unit cube in the world."""
+
+    centre: npt.NDArray[np.float64]  # [3]
+    size: float
+
+    @staticmethod
+    def around(model: Gaussians) -> Cube:
+        """As large as most of the model."""
+        means = model.means.detach().cpu().double().numpy()
+        means = means[np.isfinite(means).all(axis=1)]
+        if not len(means):
+            return Cube(np.zeros(3), 1.0)
+        low, high = np.quantile(means, [0.05, 0.95], axis=0)
+        size = float((high - low).max())
+        return Cube((low + high) / 2, size if 0 < size < math.inf else 1.0)
+
+    def to_world(self) -> Similarity:
+        """From the own frame, in which the cube reaches from 0 to 1."""
+        corner = torch.from_numpy(self.centre - self.size / 2)
+        return Similarity(self.size, torch.eye(3, dtype=torch.float64), corner)
+
+    @property
+    def least_log_scale(self) -> float:
+        """Log scale of the smallest Gaussians in the own frame."""
+        return max(_SMALL, _LEAST_LOG_SCALE - math.log(self.size))
+
+
+def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
+    """N Gaussians of words [N, WORD_BITS]."""
+    fields = _split(words)
+    colours = (fields[0] + 0.5) * _COLOUR_STEP - _COLOUR_STEP * 2 ** (COLOUR_BITS - 1)
+    scales = fields[1] * _SCALE_STEP + cube.least_log_scale
+    positions = (fields[2] + 0.5) / 2**POSITION_BITS
+    parts = (fields[3] + 0.5) / 2**TURN_BITS * 2 * _TURNS_REACH - _TURNS_REACH
+    w = np.sqrt(1 - np.square(parts).sum(axis=1, keepdims=True))
+    sh = np.zeros((len(words), (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = colours
+    logits = np.full(len(words), _LOGIT)
+    numbers = (positions, np.concatenate([w, parts], axis=1), scales, logits, sh)
+    own = Gaussians(*(torch.from_numpy(each).float() for each in numbers))
+    return cube.to_world().apply_gaussians(own)
+
+
+def colours_of(model: Gaussians) -> Points:
+    """[N, 3] the nearest lattice points of colours."""
+    colours = model.sh[:, 0].detach().cpu().double().numpy()
+    return _nearest(colours / _COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS)
+
+
+def scale_steps(model: Gaussians) -> Doubles:
+    """[N, 3] log scales in steps of their lattice, which lies anywhere: see `likely_shifts`."""
+    return model.log_scales.detach().cpu().double().numpy() / _SCALE_STEP
+
+
+def scales_at(steps: Doubles, shift: float) -> Points:
+    """[N, 3] the nearest lattice points of log scales, of a lattice that begins at `shift`."""
+    return _nearest(steps - shift, SCALE_BITS)
+
+
+def likely_shifts(steps: Doubles) -> list[float]:
+    """Where the lattice may begin if most of the log scales lie on it, the likeliest first.
+
+    A model that was scaled has all log scales shifted by one number: the lattice is where they lie.
+    """
+    phase = float(np.angle(np.exp(2j * np.pi * steps).mean())) / (2 * np.pi)
+    whole = np.rint(steps - phase).clip(-_FARTHEST, _FARTHEST).astype(np.int64)
+    found = np.bincount((whole + _FARTHEST).ravel(), minlength=2 * _FARTHEST)
+    inside = np.convolve(found, np.ones(2**SCALE_BITS, np.int64))  # at i: those in the levels up to i
+    best = int(inside.argmax()) - 2**SCALE_BITS + 1 - _FARTHEST
+    return [best + phase + each for each in (0, 1, -1, 2, -2)]
+
+
+def all_shifts(steps: Doubles) -> Doubles:
+    """[S] where the lattice may begin if only some of the log scales lie on it."""
+    low, high = np.quantile(steps.clip(-_FARTHEST, _FARTHEST), [0.01, 0.99])
+    most = min(high - 2 ** (SCALE_BITS - 2), low + _MOST_SHIFTS)
+    return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
+
+
+def in_own_frame(model: Gaussians, to_own: Similarity) -> Points:
+    """[N, 6] the nearest lattice points of positions and turns; `to_own`: from the world."""
+    own = to_own.apply_gaussians(model.with_sh_degree(0))
+    positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
+    parts = _with_largest_w(own.quats.double().numpy())[:, 1:]
+    turns = (parts + _TURNS_REACH) / (2 * _TURNS_REACH) * 2**TURN_BITS - 0.5
+    return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(turns, TURN_BITS)], axis=1)
+
+
+def joined(colours: Points, scales: Points, others: Points) -> Bits:
+    """[N, WORD_BITS] words of colours and scales [N, 3] and of positions and turns [N, 6]."""
+    parts = [
+        (colours, COLOUR_BITS),
+        (scales, SCALE_BITS),
+        (others[:, :3], POSITION_BITS),
+        (others[:, 3:], TURN_BITS),
+    ]
+    bits = [bits_of(each[:, axis].astype(np.uint64), width) for each, width in parts for axis in range(3)]
+    return np.concatenate(bits, axis=1)
+
+
+def invariants_of(colours: Points, scales: Points) -> Words:
+    """[N] the first INVARIANT_BITS of words of colours and scales [N, 3]."""
+    of_colours = colours @ (1 << COLOUR_BITS * np.arange(3)[::-1])
+    of_scales = scales @ (1 << SCALE_BITS * np.arange(3)[::-1])
+    found: Words = (of_colours << 3 * SCALE_BITS | of_scales).astype(np.uint64)
+    return found
+
+
+def number(bits: Bits) -> Words:
+    """[N] the numbers of bits [N, B], B at most 64, the highest bit first."""
+    powers = np.uint64(1) << np.arange(bits.shape[1], dtype=np.uint64)[::-1]
+    found: Words = bits.astype(np.uint64) @ powers
+    return found
+
+
+def bits_of(numbers: Words, count: int) -> Bits:
+    """[N, count] the inverse of `number`."""
+    shifts = np.arange(count, dtype=np.uint64)[::-1]
+    return (numbers[:, None] >> shifts & np.uint64(1)).astype(np.uint8)
+
+
+def _with_largest_w(quats: Doubles) -> Doubles:
+    """[N, 4] unit quaternions of the same ellipsoids, wxyz, of which w is the largest part.
+
+    Half a turn about one of its axes leaves an ellipsoid as it is, and some programs add one.
+    """
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-30)
+    largest = np.abs(quats).argmax(axis=1)
+    order = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])  # of q, q i, q j, q k
+    signs = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
+    turned = np.take_along_axis(quats, order[largest], 1) * signs[largest]
+    found: Doubles = turned * np.where(turned[:, :1] < 0, -1.0, 1.0)
+    return found
+
+
+def _split(words: Bits) -> list[Doubles]:
+    """Colours, scales, positions and turns [N, 3] each."""
+    fields, at = [], 0
+    for width in (COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS):
+        own = words[:, at : at + 3 * width].reshape(-1, 3, width)
+        fields.append(own.astype(np.float64) @ 2.0 ** np.arange(width)[::-1])
+        at += 3 * width
+    return fields
+
+
+def _nearest(steps: Doubles, bits: int) -> Points:
+    return np.rint(steps).clip(0, 2**bits - 1).astype(np.int64)

@@ -1,0 +1,166 @@
+"""Pilots: appended Gaussians that everybody can read. They tell the salt, and where the own frame is.
+
+By a public hash of their 39 bits that nothing moves, one word in 64 is a pilot, and of those that are
+written more. The hash gives a pilot's position and turn in the own frame as well; so, however a model was
+moved, turned and scaled, the similarity that most pilots agree on leads back to it (RANSAC, Fischler and
+Bolles 1981; least squares by Umeyama 1991).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from keyss.channels.appended.lattice import (
+    COLOUR_BITS,
+    INVARIANT_BITS,
+    POSITION_BITS,
+    SCALE_BITS,
+    TURN_BITS,
+    Bits,
+    Doubles,
+    Words,
+    bits_of,
+)
+from keyss.channels.robust.fountain import mixed
+from keyss.core.similarity import Similarity
+from keyss.keys.derivation import SALT_BYTES
+
+LEAST = 128  # pilots of a model
+SHARE = 1 / 16  # of the other appended Gaussians
+_PUBLIC = np.uint64(0x6B65797373_617070)  # what tells this hash from others
+ONE_IN = 64  # words is a pilot by chance
+_PART_BITS, _PARTS = 16, SALT_BYTES // 2
+_RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # beside the part of the salt and its number
+_TRIES, _AGREE = 300, 12  # of three pilots; that have to agree
+_NEAR = 1.5 / 2**POSITION_BITS  # in the own frame
+
+
+@dataclass(frozen=True)
+class Found:
+    """What pilots tell."""
+
+    to_own: Similarity  # from the world to the own frame
+    agreeing: int  # pilots
+    salt: bytes
+
+
+def count_for(others: int) -> int:
+    """How many pilots belong to so many other appended Gaussians."""
+    return max(LEAST, round(others * SHARE))
+
+
+def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
+    """[count, WORD_BITS] words of pilots."""
+    parts = np.frombuffer(salt, ">u2").astype(np.uint64)
+    which = np.arange(count) % _PARTS
+    found = np.zeros(count, np.uint64)
+    missing = np.arange(count)
+    while len(missing):
+        scales = random.integers(0, 1 << 3 * SCALE_BITS, len(missing), np.uint64)
+        filling = random.integers(0, 1 << _RANDOM_BITS, len(missing), np.uint64)
+        own = which[missing].astype(np.uint64) << np.uint64(_PART_BITS) | parts[which[missing]]
+        colours = (own << np.uint64(_RANDOM_BITS) | filling) ^ _whitening(scales)
+        invariants = colours << np.uint64(3 * SCALE_BITS) | scales
+        good = _is_pilot(invariants)
+        found[missing[good]] = invariants[good]
+        missing = missing[~good]
+    places = mixed(mixed(found ^ _PUBLIC))
+    width = 3 * (POSITION_BITS + TURN_BITS)
+    others = bits_of(places >> np.uint64(64 - width), width)
+    return np.concatenate([bits_of(found, INVARIANT_BITS), others], axis=1)
+
+
+def count(invariants: Words) -> int:
+    """How many of `invariants` [N] are those of pilots."""
+    return int(_is_pilot(invariants).sum())
+
+
+def read(invariants: Words, means: Doubles) -> Found | None:
+    """What the pilots among candidates tell: `invariants` [N] as they were read, `means` [N, 3] in the world.
+
+    None where too few agree.
+    """
+    random = np.random.default_rng(0)
+    own = np.flatnonzero(_is_pilot(invariants))
+    if len(own) < _AGREE:
+        return None
+    places = mixed(mixed(invariants[own] ^ _PUBLIC))
+    shifts = np.uint64(64) - np.arange(1, 4, dtype=np.uint64) * np.uint64(POSITION_BITS)
+    points = places[:, None] >> shifts & np.uint64(2**POSITION_BITS - 1)
+    expected = (points.astype(np.float64) + 0.5) / 2**POSITION_BITS
+    there = means[own]
+    best = np.zeros(len(own), bool)
+    for _ in range(_TRIES):
+        three = random.choice(len(own), 3, replace=False)
+        agreeing = _agreeing(there, expected, three)
+        if agreeing.sum() > best.sum():
+            best = agreeing
+        if best.sum() > max(_AGREE, 0.5 * len(own)):
+            break
+    for _ in range(3):
+        if best.sum() < _AGREE:
+            return None
+        best = _agreeing(there, expected, np.flatnonzero(best))
+    if best.sum() < _AGREE:
+        return None
+    moved = _similarity(there[best], expected[best])
+    salt = _salt(invariants[own[best]])
+    return None if moved is None or salt is None else Found(moved, int(best.sum()), salt)
+
+
+def _agreeing(there: Doubles, expected: Doubles, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """[P] which pilots come to lie where they should by the similarity of the chosen ones."""
+    moved = _similarity(there[chosen], expected[chosen])
+    if moved is None:
+        return np.zeros(len(there), bool)
+    off = moved.apply_points(torch.from_numpy(there)).numpy() - expected
+    near: npt.NDArray[np.bool_] = (np.abs(off) < _NEAR).all(axis=1)
+    return near
+
+
+def _similarity(source: Doubles, target: Doubles) -> Similarity | None:
+    """From `source` [P, 3] to `target` with the least squares (Umeyama 1991); None where there is none."""
+    centre, goal = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - centre, target - goal
+    spread = float(np.square(a).sum())
+    if not (np.isfinite(spread) and spread > 0):
+        return None
+    u, values, v = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    rotation = u @ np.diag(signs) @ v
+    scale = float((values * signs).sum()) / spread
+    if not (np.isfinite(scale) and scale > 0):
+        return None
+    translation = goal - scale * rotation @ centre
+    try:
+        return Similarity(scale, torch.from_numpy(rotation), torch.from_numpy(translation))
+    except ValueError:
+        return None
+
+
+def _salt(invariants: Words) -> bytes | None:
+    """What most pilots say of each part; None where one has nobody left."""
+    scales = invariants & np.uint64((1 << 3 * SCALE_BITS) - 1)
+    said = (invariants >> np.uint64(3 * SCALE_BITS) ^ _whitening(scales)) >> np.uint64(_RANDOM_BITS)
+    votes = [Counter[int]() for _ in range(_PARTS)]
+    for each in said.tolist():
+        votes[each >> _PART_BITS][each & (1 << _PART_BITS) - 1] += 1
+    if not all(votes):
+        return None
+    return b"".join(each.most_common(1)[0][0].to_bytes(2, "big") for each in votes)
+
+
+def _is_pilot(invariants: Words) -> npt.NDArray[np.bool_]:
+    pilot: npt.NDArray[np.bool_] = mixed(invariants ^ _PUBLIC) & np.uint64(ONE_IN - 1) == 0
+    return pilot
+
+
+def _whitening(scales: Words) -> Words:
+    """[N] 21 bits that make the colours of pilots look random."""
+    bits: Words = mixed(scales ^ _PUBLIC) >> np.uint64(64 - 3 * COLOUR_BITS)
+    return bits

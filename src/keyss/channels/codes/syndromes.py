@@ -1,0 +1,137 @@
+"""Wet paper codes (Fridrich, Goljan, Lisonek and Soukal 2005): some bits must stay, no reader knows which.
+
+What is written is not the bits but, of each block of BLOCK of them, their product with a random matrix modulo
+2. Whoever writes solves for the bits that may change ("dry"); whoever reads multiplies. A block holds as many
+bits as it has dry ones, less the few that random matrices lack in rank.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from keyss.keys.derivation import stream
+from keyss.rendering.cpu.jit import kernel
+
+BLOCK = 1024
+_WORDS = BLOCK // 64
+_DEVIATIONS = 4.5  # of the number of dry bits of a block below its mean: one block in 300,000 has fewer
+_SPARE = 10  # dry bits beyond the rate: one matrix in 1000 lacks as much in rank
+_AT_ONCE = 1024  # blocks
+
+Bits = npt.NDArray[np.uint8]  # each 0 or 1
+Words = npt.NDArray[np.uint64]
+
+
+def rate_of(dry: float) -> int:
+    """How many bits blocks hold, of which on average the share `dry` may change; 0: none."""
+    deviation = (BLOCK * dry * (1 - dry)) ** 0.5
+    return max(0, int(BLOCK * dry - _DEVIATIONS * deviation - _SPARE))
+
+
+def matrix(seed: bytes, rate: int) -> Words:
+    """[rate, BLOCK / 64] random bits, 64 to a word."""
+    return np.frombuffer(stream(seed, "codes/matrix", rate * BLOCK // 8), "<u8").reshape(rate, _WORDS)
+
+
+def read(bits: Bits, rows: Words) -> Bits:
+    """[B rate] what blocks [B BLOCK] hold."""
+    return _product(bits.reshape(-1, BLOCK), _unpacked(rows).T).reshape(-1)
+
+
+def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
+    """[B BLOCK] `bits`, of which `dry` ones are changed until `read` gives the `message` [B rate].
+
+    All solutions are alike, if dry bits are random before. None where a block has too few of them.
+
+    One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
+    changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
+    """
+    reduced, inverse, pivots = _eliminated(rows)
+    if (pivots < 0).any():
+        return None
+    others = np.setdiff1d(np.arange(BLOCK), pivots)
+    wanted = (message ^ read(bits, rows)).reshape(-1, len(rows))
+    changed = _product(wanted, _unpacked(inverse)[:, : len(rows)].T)
+    blocks, may = bits.reshape(-1, BLOCK).copy(), dry.reshape(-1, BLOCK) == 1
+    free = np.ascontiguousarray(_unpacked(reduced)[:, others])  # P^-1 F
+    rest = np.zeros((len(blocks), len(others)), np.uint8)
+    if not _solve(free, np.ascontiguousarray(free.T), may[:, pivots], may[:, others], changed, rest):
+        return None
+    blocks[:, pivots] ^= changed
+    blocks[:, others] ^= rest
+    return blocks.reshape(-1)
+
+
+def _product(left: Bits, right: Bits) -> Bits:
+    """[A, C] of [A, B] and [B, C], modulo 2."""
+    columns = right.astype(np.float32)  # exact: sums of at most BLOCK ones
+    parts = [left[at : at + _AT_ONCE].astype(np.float32) @ columns for at in range(0, len(left), _AT_ONCE)]
+    every = np.concatenate([np.empty((0, right.shape[1]), np.float32), *parts])
+    return (every.astype(np.int32) & 1).astype(np.uint8)
+
+
+def _unpacked(rows: Words) -> Bits:
+    return np.unpackbits(rows.view(np.uint8).reshape(len(rows), -1), axis=1, bitorder="little")
+
+
+@kernel
+def _eliminated(rows):  # type: ignore[no-untyped-def]
+    """`rows` reduced, so that in column pivots[i] only row i is 1; what made them so; the pivots, or -1."""
+    rate, words = rows.shape
+    own, made = rows.copy(), np.zeros((rate, -(-rate // 64)), np.uint64)
+    pivots = np.full(rate, -1)
+    one = np.uint64(1)
+    for row in range(rate):
+        made[row, row // 64] |= one << np.uint64(row % 64)
+    for row in range(rate):
+        word = 0
+        while word < words and own[row, word] == 0:
+            word += 1
+        if word == words:
+            break
+        place = np.uint64(0)
+        while (own[row, word] >> place) & one == 0:
+            place += one
+        pivots[row] = 64 * word + np.int64(place)
+        for other in range(rate):
+            if other != row and (own[other, word] >> place) & one:
+                own[other] ^= own[row]
+                made[other] ^= made[row]
+    return own, made, pivots
+
+
+@kernel
+def _solve(free, columns, may, rest_may, changed, rest):  # type: ignore[no-untyped-def]
+    """Find `rest` [B, F], 0 except where `rest_may`: `changed` [B, R] + free rest is 0 except where `may`.
+
+    `free` [R, F], `columns` its transpose. `changed` becomes the sum. False where there is none.
+    """
+    count = len(columns)
+    own, goal = np.empty((len(free), count), np.uint8), np.empty(len(free), np.uint8)
+    pivots = np.empty(len(free), np.int64)
+    for block in range(len(changed)):
+        number = 0
+        for row in range(len(free)):
+            if not may[block, row]:
+                own[number], goal[number] = free[row] * rest_may[block], changed[block, row]
+                number += 1
+        for row in range(number):
+            pivots[row] = -1
+            for column in range(count):
+                if own[row, column]:
+                    pivots[row] = column
+                    break
+            if pivots[row] < 0:
+                if goal[row]:
+                    return False
+                continue
+            for other in range(number):
+                if other != row and own[other, pivots[row]]:
+                    own[other] ^= own[row]
+                    goal[other] ^= goal[row]
+        for row in range(number):
+            if pivots[row] >= 0 and goal[row]:
+                rest[block, pivots[row]] = 1
+                changed[block] ^= columns[pivots[row]]
+    return True

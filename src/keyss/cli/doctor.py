@@ -1,0 +1,192 @@
+"""The command that looks whether everything is there that the others need.
+
+Everything heavy is imported inside the command, so that `keyss --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import arg
+
+from keyss.cli.arguments import Device
+
+if TYPE_CHECKING:
+    import torch
+
+# What each extra of pyproject.toml installs, and what that is for.
+EXTRAS = {
+    "clip": ("transformers", "the paper's key encoder"),
+    "metrics": ("flip-evaluator", "FLIP in audits"),
+    "tensorboard": ("tensorboard", "losses of a training, as it runs"),
+    "video": ("av", "films by keyss render --video"),
+    "steganalysis": ("sealwatch", "detectors in audits"),
+}
+_LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
+_TOLERANCE = 1e-4  # of a pixel's value from 0 to 1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that was looked at. "missing" is what can be done without, "broken" what cannot."""
+
+    name: str
+    state: Literal["ok", "missing", "broken"]
+    says: str
+
+
+def doctor(
+    *,
+    json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
+    device: Device = "auto",
+) -> None:
+    """Check the installation: versions, cores, GPU, optional parts, cache; draw a picture, derive a key.
+
+    Exit status 0 says that all is there that is needed, 6 that something is not. The first call compiles the
+    CPU rasterizer, 10 to 20 s; on a machine with a GPU gsplat may compile for minutes.
+
+    example: keyss doctor
+    """
+    from keyss.core.errors import BackendError
+
+    found = list(findings(device))
+    if json_:
+        from keyss.runs.records import record_bytes
+
+        facts = {each.name: {"state": each.state, "says": each.says} for each in found}
+        print(record_bytes(facts).decode(), end="")
+    else:
+        width = max(len(each.name) for each in found)
+        for each in found:
+            print(f"{each.state:<7}  {each.name:<{width}}  {each.says}")
+    if broken := [each.name for each in found if each.state == "broken"]:
+        raise BackendError(f"not everything works that is needed: {', '.join(broken)} (see above)")
+
+
+def findings(device: Literal["auto", "cpu", "cuda"]) -> Iterator[Finding]:
+    """All that `keyss doctor` prints, in its order."""
+    from keyss import __version__
+
+    python, system = platform.python_version(), platform.platform()
+    yield Finding("keyss", "ok", f"{__version__}, Python {python}, {system}")
+    yield from map(_library, _LIBRARIES)
+    yield from _checks(
+        ("cores", _cores), ("GPU", _gpu), ("kernel cache", _cache), ("key derivation", _derivation)
+    )
+    yield from _checks(("test frame", lambda: _frame(device)))
+    for extra, (package, use) in EXTRAS.items():
+        version = _version(package)
+        hint = f"for {use}: pip install 'keyss[{extra}]'"
+        says = f"{package} {version}, for {use}" if version else hint
+        yield Finding(f"[{extra}]", "ok" if version else "missing", says)
+    yield from _checks(("splat-transform", _program))
+
+
+def _checks(*checks: tuple[str, Callable[[], tuple[bool, str]]]) -> Iterator[Finding]:
+    """Of each whether it is there, and what to say of it; one that fails is broken, with its error."""
+    for name, check in checks:
+        try:
+            there, says = check()
+            yield Finding(name, "ok" if there else "missing", says)
+        except Exception as error:
+            yield Finding(name, "broken", f"{type(error).__name__}: {error}")
+
+
+def _version(package: str) -> str | None:
+    with suppress(metadata.PackageNotFoundError):
+        return metadata.version(package)
+    return None
+
+
+def _library(package: str) -> Finding:
+    version = _version(package)
+    return Finding(package, "ok" if version else "broken", version or f"pip install {package}")
+
+
+def _cores() -> tuple[bool, str]:
+    import torch
+
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return True, f"{usable} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
+
+
+def _gpu() -> tuple[bool, str]:
+    import torch
+
+    if not torch.cuda.is_available():
+        return False, "torch sees no CUDA GPU; the CPU does it all"
+    properties = torch.cuda.get_device_properties(0)
+    return True, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB, CUDA {torch.version.cuda}"
+
+
+def _cache() -> tuple[bool, str]:
+    from keyss.rendering.cpu.jit import cache_folder
+
+    folder = cache_folder()
+    if folder is None:
+        return False, "no folder can be written: kernels are compiled anew by every command, 10 to 20 s"
+    return True, str(folder)
+
+
+def _derivation() -> tuple[bool, str]:
+    from keyss.keys import DerivedKey, KeyDerivation
+
+    start = time.perf_counter()
+    derivation = KeyDerivation(salt=bytes(16))
+    DerivedKey("doctor", derivation)
+    return True, f"Argon2id with {derivation.memory_kib >> 10} MiB in {time.perf_counter() - start:.2f} s"
+
+
+def _frame(device: Literal["auto", "cpu", "cuda"]) -> tuple[bool, str]:
+    """One Gaussian in the middle of a picture, whose pixels there and in a corner are known."""
+    import torch
+
+    from keyss.core import BackendError, Camera, Gaussians
+    from keyss.core.gaussians import SH_C0
+    from keyss.rendering import render, resolve_device
+
+    size, color = 65, torch.tensor([0.9, 0.5, 0.1])
+    chosen = resolve_device(device)
+    logit = 2.0
+    model = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 4.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        log_scales=torch.full((1, 3), -1.5),
+        opacity_logits=torch.tensor([logit]),
+        sh=((color - 0.5) / SH_C0)[None, None],
+    )
+    K = torch.tensor([[80.0, 0, size / 2], [0, 80.0, size / 2], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, size, size, "doctor.png")
+    moved = model.to(chosen)
+    with torch.no_grad():
+        render(moved, camera)  # compiles, where nothing is compiled yet
+        start = time.perf_counter()
+        image = render(moved, camera).cpu()
+        seconds = time.perf_counter() - start
+    meant = color * torch.sigmoid(torch.tensor(logit))
+    if not _near(image[size // 2, size // 2], meant) or not _near(image[0, 0], torch.zeros(3)):
+        raise BackendError(f"the picture that {chosen} drew is wrong")
+    who = "gsplat" if chosen.type == "cuda" else "our rasterizer"
+    return True, f"drawn by {who} on {chosen} in {1e3 * seconds:.1f} ms"
+
+
+def _near(found: torch.Tensor, meant: torch.Tensor) -> bool:
+    return bool(((found - meant).abs() <= _TOLERANCE).all())
+
+
+def _program() -> tuple[bool, str]:
+    """The converter of other people's, which audits try when it is there."""
+    from keyss.core.errors import BackendError
+    from keyss.measure.robustness.conversions import find_splat_transform
+
+    try:
+        return True, find_splat_transform()
+    except BackendError as error:
+        return False, f"for conversions in audits: {error}"

@@ -1,0 +1,108 @@
+"""Paths of a camera for films: around a model, or around what a scene's cameras look at, or through them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
+
+from keyss.core.alignment import focus_point, up_direction
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera, camera_positions
+from keyss.rendering.orbit import FIELD_OF_VIEW, look_at, looking, middle_and_radius
+
+ELEVATION = 20.0  # degrees
+_GAP = math.pi / 2  # without a camera, from which on a path turns back
+_DISTANCE = 0.8  # of that from which the whole model is seen
+
+
+def circle(model: Gaussians, size: int, frames: int) -> list[Camera]:
+    """Cameras on a level circle around what can be seen of a model, from a little above; up is -y.
+
+    Pictures of size x size pixels; the last frame is a step before the first, so that the film can repeat.
+    """
+    middle, radius = middle_and_radius(model)
+    focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    reach = _DISTANCE * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+    height, flat = math.sin(math.radians(ELEVATION)), math.cos(math.radians(ELEVATION))
+    cameras = []
+    for index in range(frames):
+        azimuth = 2 * math.pi * index / frames
+        outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
+        cameras.append(looking(middle + outward * reach, -outward, K, size, f"circle_{index:04d}.png"))
+    return cameras
+
+
+def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A level circle around what `cameras` look at, at their usual distance and height; up is as for them.
+
+    Where they leave a quarter or more out, as those in front of a wall do, the path sways between their ends
+    instead: what nobody has photographed is not shown. Lens and size are those of the first by name. Raises
+    UsageError where there is none.
+    """
+    first = _in_order(cameras)[0]
+    middle, up = focus_point(cameras), up_direction(cameras)
+    if up is None:
+        up = -first.viewmat[1, :3].double()
+    offsets = camera_positions(cameras).double() - middle
+    heights = offsets @ up
+    flat = offsets - heights[:, None] * up
+    forward = torch.nn.functional.normalize(flat[flat.norm(dim=1).argmax()], dim=0)
+    sideways = torch.linalg.cross(up, forward)
+    reach, height = float(flat.norm(dim=1).median()), float(heights.median())
+    found = []
+    for index, angle in enumerate(_angles(torch.atan2(flat @ sideways, flat @ forward), frames)):
+        outward = reach * (math.cos(angle) * forward + math.sin(angle) * sideways) + height * up
+        pose = look_at(middle + outward, torch.nn.functional.normalize(-outward, dim=0), up).float()
+        found.append(replace(first, viewmat=pose, name=f"around_{index:04d}.png"))
+    return found
+
+
+def _angles(seen: Tensor, frames: int) -> list[float]:
+    """Around all of a circle, or to and fro on the arc where cameras stand at the angles `seen`."""
+    ordered = seen.sort().values
+    gaps = torch.cat([ordered[1:] - ordered[:-1], ordered[:1] + 2 * math.pi - ordered[-1:]])
+    widest = int(gaps.argmax())
+    start = float(ordered[(widest + 1) % len(ordered)])
+    if float(gaps[widest]) < _GAP:
+        return [start + 2 * math.pi * index / frames for index in range(frames)]
+    arc = 2 * math.pi - float(gaps[widest])
+    return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * index / frames)) for index in range(frames)]
+
+
+def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """The way through `cameras` by their names, from the first to the last at an even pace.
+
+    Positions are interpolated linearly, rotations on the shortest way; lens and size are those of the first.
+    Raises UsageError where there is none.
+    """
+    ordered = _in_order(cameras)
+    first = ordered[0]
+    if len(ordered) == 1:
+        return [first] * frames
+    poses = np.stack([camera.viewmat.double().numpy() for camera in ordered])
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    places = np.stack([camera.position.double().numpy() for camera in ordered])
+    stops, times = np.arange(len(ordered)), np.linspace(0, len(ordered) - 1, frames)
+    rotations = Slerp(stops, turns)(times).as_matrix()
+    positions = np.stack([np.interp(times, stops, places[:, axis]) for axis in range(3)], axis=1)
+    found = []
+    for index, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+        pose = torch.from_numpy(viewmat).float()
+        found.append(replace(first, viewmat=pose, name=f"path_{index:04d}.png"))
+    return found
+
+
+def _in_order(cameras: Sequence[Camera]) -> list[Camera]:
+    if not cameras:
+        raise UsageError("expected a scene with cameras to film from, found none of them")
+    return sorted(cameras, key=lambda camera: camera.name)

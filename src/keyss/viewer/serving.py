@@ -1,0 +1,123 @@
+"""The page and one model over HTTP, for this machine unless told otherwise."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote, unquote, urlsplit
+
+from keyss.core.errors import InputError, OutputError
+from keyss.files.reading import read_file
+from keyss.viewer.page import SCRIPT, STYLE, asset, check_shown, page_beside, served_policy
+
+LOCALHOST = "127.0.0.1"
+_LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}
+_START_BYTES = 16
+
+
+class ModelServer:
+    """A server of the viewer and one model. Nothing else is given out, whatever is asked."""
+
+    def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0, up: str = "-y") -> None:
+        """`port` 0: any that is free. Raises InputError, UsageError, and OutputError where it is in use."""
+        self.model = Path(model)
+        read_file_start(self.model)
+        try:
+            self._server = ThreadingHTTPServer((host, port), _handler(self.model, up, host in _LOCAL_NAMES))
+        except (OSError, OverflowError) as error:
+            raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
+        self._server.daemon_threads = True
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        host, port = self._server.server_address[:2]
+        return f"http://{host!s}:{port}/"
+
+    def run(self) -> None:
+        """Serve until `close` is called by another thread, or a signal ends it."""
+        try:
+            self._server.serve_forever(poll_interval=0.2)
+        finally:
+            self._server.server_close()
+
+    def close(self) -> None:
+        self._server.shutdown()
+
+
+def read_file_start(model: Path) -> None:
+    """Raise InputError or UsageError for what is no file that the page can show."""
+    if not model.is_file():
+        read_file(model)  # says what it is
+    try:
+        with model.open("rb") as file:
+            check_shown(model, file.read(_START_BYTES))
+    except OSError as error:
+        raise InputError(f"{model}: cannot be read: {error.strerror}") from error
+
+
+def _handler(model: Path, up: str, local: bool) -> type[BaseHTTPRequestHandler]:
+    own = f"/model/{model.name}"
+    contents: dict[str, tuple[str, Callable[[], BinaryIO]]] = {
+        "/": ("text/html; charset=utf-8", lambda: BytesIO(page_beside(f"model/{quote(model.name)}", up))),
+        f"/{SCRIPT}": ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
+        f"/{STYLE}": ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
+        own: ("application/octet-stream", lambda: model.open("rb")),
+        "/favicon.ico": ("image/x-icon", lambda: BytesIO()),
+    }
+
+    class Handler(BaseHTTPRequestHandler):
+        server_version, sys_version = "keyss", ""
+        timeout = 30
+
+        def do_GET(self) -> None:
+            self._answer(with_content=True)
+
+        def do_HEAD(self) -> None:
+            self._answer(with_content=False)
+
+        def _answer(self, *, with_content: bool) -> None:
+            # Another site whose name leads here must not read the model through a visitor's browser.
+            asked = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+            found = contents.get(unquote(urlsplit(self.path).path))
+            if local and asked not in _LOCAL_NAMES:
+                self.send_error(HTTPStatus.FORBIDDEN)
+                return
+            if found is None:
+                self.send_error(HTTPStatus.NOT_FOUND)
+                return
+            kind, opened = found
+            try:
+                with opened() as file:
+                    size = file.seek(0, 2)
+                    file.seek(0)
+                    self.send_response(HTTPStatus.OK)
+                    for name, value in _headers(kind, size).items():
+                        self.send_header(name, value)
+                    self.end_headers()
+                    if with_content:
+                        shutil.copyfileobj(file, self.wfile)
+            except OSError:  # whoever asked has left, or the model is gone
+                self.close_connection = True
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Nobody reads it."""
+
+    return Handler
+
+
+def _headers(kind: str, size: int) -> dict[str, str]:
+    return {
+        "Content-Type": kind,
+        "Content-Length": str(size),
+        "Content-Security-Policy": f"{served_policy()}; frame-ancestors 'none'",
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Cache-Control": "no-store",
+    }

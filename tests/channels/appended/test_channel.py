@@ -1,0 +1,232 @@
+"""Secrets in appended Gaussians and out again, after what becomes of published models."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from files.formats.conftest import splat_transform as splat_transform  # a fixture
+from keyss.channels.appended import AppendedReader, appended_for, embed
+from keyss.channels.base import Payload
+from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.gaussians import DRAWN_OPACITY
+from keyss.core.similarity import Similarity
+from keyss.files import read_model, write_model
+from keyss.measure.robustness.changes import cropping, fewer_harmonics, half_floats, random_pruning
+from keyss.rendering.difference import cost
+from measure.lifelike import lifelike
+
+KEY, ENTROPY = "Rosebud, 1941", bytes(range(32))
+DATA = np.random.default_rng(0).bytes(9000)
+Change = Callable[[Gaussians], Gaussians]
+
+
+@pytest.fixture(scope="module")
+def cover() -> Gaussians:
+    return lifelike(3000, 0)
+
+
+@pytest.fixture(scope="module")
+def stego(cover: Gaussians) -> Gaussians:
+    return embed(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY)
+
+
+def opened(model: Gaussians, key: str = KEY) -> bytes:
+    reader = AppendedReader.of(model)
+    if reader is None:
+        raise WrongKeyError("nothing is appended")
+    return reader.open(key).data
+
+
+@settings(max_examples=12, deadline=None)
+@given(size=st.integers(0, 4000), seed=st.integers(0, 2**32))
+def test_every_size_comes_back(cover: Gaussians, size: int, seed: int) -> None:
+    data = np.random.default_rng(seed).bytes(size)
+    stego = embed(cover, [(KEY, Payload("carry", data))], entropy=seed.to_bytes(32, "little"))
+    reader = AppendedReader.of(stego)
+    assert reader is not None
+    assert reader.open(KEY) == Payload("carry", data)
+    assert abs(len(stego) - len(cover) - appended_for(size)) < 100
+
+
+def test_the_cover_stays_and_looks_the_same(cover: Gaussians, stego: Gaussians) -> None:
+    assert stego[: len(cover)].digest() == cover.digest()
+    appended = stego[len(cover) :]
+    assert bool((torch.round(appended.opacities * 255) == 1).all())
+    assert bool((appended.sh[:, 1:] == 0).all())
+    assert cost(cover, stego) > 60
+
+
+def test_a_model_without_anything_opens_nothing(cover: Gaussians) -> None:
+    assert AppendedReader.of(cover) is None
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.37])
+def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
+    """Few appended ones, whose lattices have to be found among as many others."""
+    cover = lifelike(6000, 3)
+    faint = torch.arange(len(cover)) % 4 == 0
+    cover = replace(cover, opacity_logits=torch.where(faint, -5.5, cover.opacity_logits))
+    for seed in range(4):
+        stego = embed(cover, [(KEY, Payload("file", b"a note"))], entropy=bytes([seed] * 32))
+        assert opened(_turned(scale)(stego)) == b"a note"
+
+
+@pytest.mark.alone
+@pytest.mark.argon2
+def test_a_wrong_key_opens_nothing_in_about_the_same_time(cover: Gaussians) -> None:
+    reader = AppendedReader.of(embed(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
+    assert reader is not None
+
+    def seconds(key: str) -> float:
+        start = time.perf_counter()
+        try:
+            reader.open(key)
+        except WrongKeyError:
+            assert key != KEY
+        return time.perf_counter() - start
+
+    least = [min(seconds(key) for _ in range(3)) for key in (KEY, "Rosebud, 1942")]
+    assert least[0] < 2 * least[1]
+
+
+def test_two_secrets_each_with_its_key(cover: Gaussians) -> None:
+    payloads = [Payload("file", bytes(100)), Payload("carry", DATA)]
+    with pytest.warns(KeyssWarning, match="other secrets"):
+        stego = embed(cover, list(zip(("one key", "another"), payloads, strict=True)))
+    reader = AppendedReader.of(stego)
+    assert reader is not None
+    assert [reader.open("one key"), reader.open("another")] == payloads
+    with pytest.raises(UsageError, match="same key"):
+        embed(cover, [("one key", payloads[0]), ("one key", payloads[1])])
+    with pytest.raises(UsageError, match="at least one"):
+        embed(cover, [])
+
+
+def test_no_two_files_share_anything(cover: Gaussians) -> None:
+    """From equal entropy too: what is hidden is mixed in."""
+    two = [embed(cover, [(KEY, Payload("file", data))], entropy=ENTROPY) for data in (b"a", b"b")]
+    readers = [AppendedReader.of(each[len(cover) :]) for each in two]
+    assert readers[0] is not None
+    assert readers[1] is not None
+    assert readers[0].salt != readers[1].salt
+    assert not {*map(bytes, readers[0].words)} & {*map(bytes, readers[1].words)}
+
+
+def test_words_look_random(stego: Gaussians, cover: Gaussians) -> None:
+    """Every bit of what is appended is as often set as not, whatever lies there; no two bits go together."""
+    reader = AppendedReader.of(stego[len(cover) :])
+    assert reader is not None
+    bits = reader.words.astype(np.float64) * 2 - 1
+    deviation = 1 / len(bits) ** 0.5
+    assert np.abs(bits.mean(axis=0)).max() < 4.5 * deviation
+    together = bits.T @ bits / len(bits) - np.eye(bits.shape[1])
+    assert np.abs(together).max() < 6 * deviation
+
+
+def _turned(scale: float) -> Change:
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    move = torch.tensor([30.0, -2.0, 5.0], dtype=torch.float64)
+    return Similarity(scale, rotation, move).apply_gaussians
+
+
+def _half_turns(model: Gaussians) -> Gaussians:
+    """Half a turn of each ellipsoid about one of its own axes, which leaves it as it is."""
+    w, x, y, z = model.quats.unbind(1)
+    about_x, about_z = torch.stack([-x, w, z, -y], 1), torch.stack([-z, y, -x, w], 1)
+    third = (torch.arange(len(w)) % 3)[:, None]
+    return replace(
+        model, quats=torch.where(third == 0, about_x, torch.where(third == 1, about_z, -model.quats))
+    )
+
+
+def _shuffled(model: Gaussians) -> Gaussians:
+    return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(1))]
+
+
+CHANGES: dict[str, Change] = {
+    "reordered": _shuffled,
+    "rotated and moved": _turned(1.0),
+    "scaled": _turned(0.37),
+    "scaled up": _turned(41.0),
+    "half turns": _half_turns,
+    "without harmonics": fewer_harmonics(0),
+    "half floats": half_floats(),
+    "a quarter removed": random_pruning(0.25, 3),
+    "another scene beside it": lambda model: Gaussians.cat([lifelike(3000, 5), model]),
+    "all of it together": lambda model: random_pruning(0.2, 3)(_shuffled(_turned(2.2)(_half_turns(model)))),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_it_opens_after(name: str, stego: Gaussians) -> None:
+    assert opened(CHANGES[name](stego)) == DATA
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".splat", ".glb"])
+def test_it_opens_from_every_format(suffix: str, stego: Gaussians, tmp_path: Path) -> None:
+    write_model(tmp_path / f"a{suffix}", _turned(1.3)(stego))
+    assert opened(read_model(tmp_path / f"a{suffix}")) == DATA
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
+def test_it_opens_from_what_splat_transform_writes(
+    splat_transform: Callable[..., Path],
+    suffix: str,
+    stego: Gaussians,
+    tmp_path: Path,
+) -> None:
+    write_model(tmp_path / "a.ply", stego)
+    options = ["-i", "1"] if suffix == ".sog" else []
+    converted = splat_transform(tmp_path / "a.ply", tmp_path / f"b{suffix}", *options)
+    assert opened(read_model(converted)) == DATA
+
+
+def test_it_opens_from_what_gsply_writes(stego: Gaussians, tmp_path: Path) -> None:
+    gsply = pytest.importorskip("gsply")
+    write_model(tmp_path / "a.ply", stego)
+    gsply.write_spz(tmp_path / "b.spz", gsply.plyread(tmp_path / "a.ply"), version=3)
+    assert opened(read_model(tmp_path / "b.spz")) == DATA
+    gsply.plywrite(tmp_path / "c.ply", gsply.plyread(tmp_path / "a.ply"), compressed=True)
+    compressed = next(each for each in tmp_path.glob("c*") if each.suffix == ".ply")
+    assert opened(read_model(compressed)) == DATA
+
+
+def test_too_great_a_loss_is_told_from_a_wrong_key(stego: Gaussians) -> None:
+    with pytest.raises(InputError, match=r"the key is right, but too much .* packets are left"):
+        opened(cropping(1)(stego))
+    with pytest.raises(WrongKeyError):
+        opened(stego[stego.opacities > 2 * DRAWN_OPACITY])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_faint_gaussians_end_in_an_error(seed: int, stego: Gaussians) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    junk = Gaussians(
+        means=torch.randn(2000, 3, generator=generator) * 10.0 ** (20 * seed),
+        quats=torch.randn(2000, 4, generator=generator) * (seed < 2),
+        log_scales=torch.randn(2000, 3, generator=generator) * 10.0 ** (3 * seed),
+        opacity_logits=torch.full((2000,), -5.5),
+        sh=torch.randn(2000, 1, 3, generator=generator) * 10.0 ** (5 * seed),
+    )
+    with pytest.raises(KeyssError):
+        opened(junk)
+    # Among as many of its own it is not noticed.
+    assert opened(Gaussians.cat([stego.with_sh_degree(0), junk])) == DATA
+
+
+def test_changed_packets_are_not_read_as_they_are_not(stego: Gaussians, cover: Gaussians) -> None:
+    """One in ten appended Gaussians gets the colour of another: they count as lost."""
+    swapped = stego.sh.clone()
+    rows = torch.arange(len(cover), len(stego), 10)
+    swapped[rows] = swapped[rows.roll(1)]
+    assert opened(replace(stego, sh=swapped)) == DATA

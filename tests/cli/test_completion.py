@@ -1,0 +1,49 @@
+"""What shells complete, asked of bash itself."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import COMMANDS, Said
+from keyss.fitting.config import PRESETS
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("completion") / "keyss.bash"
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (["keyss", ""], {*COMMANDS, "-h", "--help"}),
+        (["keyss", "re"], {"reveal", "render", "report"}),
+        (["keyss", "hide", "--secret"], {"--secret", "--secret-file", "--secret-model"}),
+        (["keyss", "hide", "--start"], {"--start"}),
+        (["keyss", "fit", "x", "--preset", ""], set(PRESETS)),
+    ],
+)
+def test_of_bash(keyss: Run, script: Path, words: list[str], completed: set[str]) -> None:
+    if not script.exists():
+        said = keyss("completion", "bash")
+        assert (said.status, said.err) == (0, "")
+        script.write_text(said.out)
+    line = (
+        'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _tyro_keyss; echo "${COMPREPLY[@]}"'
+    )
+    command = ["bash", "-c", line, "bash", str(script), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert set(done.stdout.split()) == completed
+
+
+def test_of_other_shells(keyss: Run) -> None:
+    assert keyss("completion", "zsh").out.startswith("#compdef keyss")
+    assert keyss("completion", "fish").status == 2

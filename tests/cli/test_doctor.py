@@ -1,0 +1,97 @@
+"""What `keyss doctor` finds, and that it notices what does not work."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from cli.said import Said
+from keyss import __version__, rendering
+from keyss.cli import doctor
+from keyss.core import Camera, Gaussians
+
+Run = Callable[..., Said]
+
+
+def states(said: Said) -> dict[str, str]:
+    return {name: each["state"] for name, each in json.loads(said.out).items()}
+
+
+def test_a_sound_installation(keyss: Run) -> None:
+    said = keyss("doctor", "--device", "cpu")
+    assert (said.status, said.err) == (0, "")
+    lines = {line.split()[1]: line for line in said.out.splitlines()}
+    assert __version__ in lines["keyss"]
+    assert torch.__version__ in lines["torch"]
+    assert lines["test"].startswith("ok ")
+    assert "64 MiB" in said.out
+    found = states(keyss("doctor", "--device", "cpu", "--json"))
+    assert list(found.values()) == [line.split()[0] for line in said.out.splitlines()]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA GPU")
+def test_a_device_that_is_not_there(keyss: Run) -> None:
+    said = keyss("doctor", "--device", "cuda", "--json")
+    assert said.status == 6
+    assert states(said)["test frame"] == "broken"
+    assert "keyss: error: not everything works that is needed: test frame" in said.err
+
+
+@pytest.mark.parametrize(("where", "factor"), [("middle", 0.999), ("corner", 0.0)])
+def test_a_picture_that_is_wrong(
+    keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, factor: float
+) -> None:
+    real = rendering.render
+
+    def wrong(model: Gaussians, camera: Camera, **options: Any) -> Tensor:
+        image = real(model, camera, **options)
+        if where == "corner":
+            image[0, 0] = 0.01
+        return image * (factor or 1)
+
+    monkeypatch.setattr("keyss.rendering.render", wrong)
+    said = keyss("doctor", "--device", "cpu", "--json")
+    assert said.status == 6
+    assert [name for name, state in states(said).items() if state == "broken"] == ["test frame"]
+
+
+def test_what_is_missing_and_how_to_get_it(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = {"flip-evaluator", "numba"}
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name in gone else version(name))
+    said = keyss("doctor", "--device", "cpu")
+    assert said.status == 6
+    assert re.search(r"^missing +\[metrics\] .*pip install 'keyss\[metrics\]'$", said.out, re.MULTILINE)
+    assert re.search(r"^broken +numba +pip install numba$", said.out, re.MULTILINE)
+    assert said.err.count("\n") == 1
+
+
+def test_torch_that_does_not_load(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every check goes on beside one that fails, whatever with."""
+
+    def failing() -> tuple[bool, str]:
+        raise OSError("libtorch.so: cannot open")
+
+    monkeypatch.setattr(doctor, "_cores", failing)
+    said = keyss("doctor", "--device", "cpu")
+    assert said.status == 6
+    assert re.search(r"^broken +cores +OSError: libtorch.so: cannot open$", said.out, re.MULTILINE)
+    assert re.search(r"^ok +test frame ", said.out, re.MULTILINE)
+
+
+def test_it_knows_the_extras_that_there_are() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    declared = project["optional-dependencies"]
+    users = {name for name in declared if name not in ("test", "docs", "dev")}
+    assert doctor.EXTRAS.keys() == users
+    for name, (package, _) in doctor.EXTRAS.items():
+        assert declared[name][0].startswith(package)
+    assert all(any(each.startswith(name) for each in project["dependencies"]) for name in doctor._LIBRARIES)

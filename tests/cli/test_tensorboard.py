@@ -1,0 +1,53 @@
+"""Event files of TensorBoard, read by TensorBoard."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cli.said import SMALL, Said, assert_refused
+from files.scene_files import write_nerfstudio
+from keyss.files import read_model
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    write_nerfstudio(tmp_path / "b", count=4)
+    return tmp_path / "b"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own
+def test_losses_come_back(keyss: Run, scene: Path) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    out = scene.parent / "out"
+    said = keyss("fit", scene, "-o", out, *SMALL[2:], "--seed", 0, "--tensorboard")
+    assert said.status == 0, said.err
+    (folder,) = (out / "private" / "tensorboard").iterdir()
+    assert folder.name == "fit_b"
+    assert stat.S_IMODE((out / "private").stat().st_mode) == 0o700
+    found = events.EventAccumulator(str(folder))
+    found.Reload()
+    losses = found.Scalars("loss")
+    assert [each.step for each in losses] == [10, 20]
+    assert all(0 < each.value < 1 for each in losses)
+    assert found.Scalars("Gaussians")[-1].value >= len(read_model(out / "model.ply"))
+    assert "loss" not in said.err
+    # What trains is the same, watched or not.
+    keyss("fit", scene, "-o", scene.parent / "plain", *SMALL[2:], "--seed", 0)
+    assert (out / "model.ply").read_bytes() == (scene.parent / "plain" / "model.ply").read_bytes()
+
+
+def test_without_it_nothing_is_begun(keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in list(sys.modules):
+        if name.split(".")[0] == "tensorboard" or name.startswith("torch.utils.tensorboard"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    said = keyss("fit", scene, "-o", scene.parent / "out", *SMALL[2:], "--tensorboard")
+    assert_refused(said, 6, "pip install 'keyss[tensorboard]'")
+    assert not (scene.parent / "out").exists()

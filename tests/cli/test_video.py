@@ -1,0 +1,216 @@
+"""Films, read again by OpenCV's own FFmpeg."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from cli.said import Said, assert_refused
+from files.scene_files import write_nerfstudio
+from keyss import api, load_scene, write_model
+from keyss._verbs.filming import shown, wiped
+from keyss.core import Camera, Gaussians, UsageError
+from keyss.rendering import render
+from keyss.rendering.orbit import look_at, middle_and_radius
+from keyss.rendering.paths import around, circle, through
+from tiny_scenes import random_gaussians
+
+Run = Callable[..., Said]
+Frames = list[npt.NDArray[np.uint8]]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Models `a.ply` and `b.ply`, and a scene `scene`."""
+    folder = tmp_path_factory.mktemp("films")
+    for seed, name in enumerate("ab"):
+        write_model(folder / f"{name}.ply", random_gaussians(400, seed))
+    write_nerfstudio(folder / "scene", count=4)
+    return folder
+
+
+def frames_of(path: Path) -> Frames:
+    film = cv2.VideoCapture(str(path))
+    found = []
+    while (read := film.read())[0]:
+        found.append(np.ascontiguousarray(read[1][:, :, ::-1]))
+    assert film.get(cv2.CAP_PROP_FPS) == 25
+    return found
+
+
+def picture(model: Gaussians, camera: Camera) -> npt.NDArray[np.uint8]:
+    with torch.no_grad():
+        return (render(model, camera).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def psnr(a: npt.NDArray[np.uint8], b: npt.NDArray[np.uint8]) -> float:
+    return float(-10 * np.log10(((a / 255.0 - b / 255.0) ** 2).mean() + 1e-12))
+
+
+def test_once_around_a_model(keyss: Run, files: Path, tmp_path: Path) -> None:
+    said = keyss("render", files / "a.ply", "--video", tmp_path / "a.mp4", "--seconds", 0.4, "--width", 97)
+    assert (said.status, said.out) == (0, f"{tmp_path / 'a.mp4'}: 10 frames\n")
+    frames = frames_of(tmp_path / "a.mp4")
+    assert [frame.shape for frame in frames] == [(96, 96, 3)] * 10
+    meant = [picture(random_gaussians(400, 0), each) for each in circle(random_gaussians(400, 0), 96, 10)]
+    assert min(map(psnr, frames, meant)) > 30
+    assert psnr(frames[0], meant[5]) < 25  # it moved
+
+
+def test_a_wipe_from_one_model_to_the_other_and_back(keyss: Run, files: Path, tmp_path: Path) -> None:
+    models = ("render", files / "a.ply", "--wipe", files / "b.ply")
+    said = keyss(*models, "--video", tmp_path / "w.mp4", "--seconds", 0.32, "--width", 96)
+    assert said.status == 0, said.err
+    frames = frames_of(tmp_path / "w.mp4")
+    a, b = (
+        [picture(model, camera) for camera in circle(model, 96, 8)]
+        for model in (random_gaussians(400, seed) for seed in (0, 1))
+    )
+    assert psnr(frames[0], a[0]) > 30
+    assert psnr(frames[4], b[4]) > 30
+    for index in (2, 6):  # half of each
+        assert psnr(frames[index][:, :44], b[index][:, :44]) > 28
+        assert psnr(frames[index][:, 52:], a[index][:, 52:]) > 28
+        assert frames[index][:, 47:49].mean() > 200
+
+
+@pytest.mark.parametrize("path", ["around", "through"])
+def test_with_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path, path: str) -> None:
+    scene = ("--cameras", files / "scene", "--path", path)
+    said = keyss("render", files / "a.ply", *scene, "--video", tmp_path / "s.mp4", "--seconds", 0.2)
+    assert said.status == 0, said.err
+    cameras = sorted((view.camera for view in load_scene(files / "scene").views), key=lambda each: each.name)
+    frames = frames_of(tmp_path / "s.mp4")
+    height, width = cameras[0].height, cameras[0].width
+    assert [frame.shape for frame in frames] == [(height - height % 2, width - width % 2, 3)] * 5
+
+
+def test_a_path_goes_through_its_cameras() -> None:
+    cameras = circle(random_gaussians(50), 32, 5)
+    path = through(cameras[::-1], 9)  # by their names, whatever the order
+    for index, camera in enumerate(cameras):
+        torch.testing.assert_close(path[2 * index].viewmat, camera.viewmat, atol=1e-5, rtol=0)
+    for camera in path:
+        rotation = camera.viewmat[:3, :3]
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+    middle = (path[2].position + path[4].position) / 2
+    torch.testing.assert_close(path[3].position, middle, atol=1e-5, rtol=0)
+    assert through(cameras[:1], 3) == [cameras[0]] * 3
+    with pytest.raises(UsageError):
+        through([], 3)
+
+
+def test_a_circle_looks_at_the_middle_from_above() -> None:
+    model = random_gaussians(50)
+    middle, _ = middle_and_radius(model)
+    for camera in circle(model, 32, 7):
+        at = camera.viewmat[:3, :3] @ middle + camera.viewmat[:3, 3]
+        torch.testing.assert_close(at[:2], torch.zeros(2), atol=1e-5, rtol=0)
+        assert at[2] > 0
+        assert camera.position[1] < middle[1]  # up is -y
+
+
+def ring(degrees: range, up: str) -> list[Camera]:
+    """Cameras on a ring of radius 3 around (1, 2, 3), at a height of 1, that look at its middle."""
+    found = []
+    for index, angle in enumerate(degrees):
+        flat = 3 * math.cos(math.radians(angle)), 3 * math.sin(math.radians(angle))
+        outward = torch.tensor([flat[0], -1.0, flat[1]] if up == "-y" else [*flat, 1.0])
+        axis = torch.tensor([0.0, -1.0, 0.0] if up == "-y" else [0.0, 0.0, 1.0])
+        viewmat = look_at(MIDDLE + outward, -outward / outward.norm(), axis)
+        found.append(Camera(viewmat, torch.eye(3), 8, 8, f"{index:03}"))
+    return found
+
+
+MIDDLE = torch.tensor([1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("up", ["-y", "z"])
+def test_around_what_cameras_look_at(up: str) -> None:
+    """The same ring again, from wherever it begins."""
+    cameras = ring(range(0, 360, 30), up)
+    path = around(cameras, 12)
+    places = torch.stack([camera.position for camera in cameras])
+    found = torch.stack([camera.position for camera in path])
+    assert float(torch.cdist(found, places).min(dim=1).values.max()) < 1e-2
+    assert float(torch.cdist(places, found).min(dim=1).values.max()) < 1e-2
+    for camera in path:
+        nearest = cameras[int((places - camera.position).norm(dim=1).argmin())]
+        torch.testing.assert_close(camera.viewmat, nearest.viewmat, atol=1e-2, rtol=0)
+
+
+def test_around_stays_where_cameras_were() -> None:
+    """Those of a half ring: the path sways between its ends."""
+    path = around(ring(range(0, 181, 20), "-y"), 24)
+    offsets = torch.stack([camera.position for camera in path]) - MIDDLE
+    assert float(offsets[:, 2].min()) > -0.1
+    assert float(offsets[:, 0].min()) == pytest.approx(-3, abs=0.1)
+    assert float(offsets[:, 0].max()) == pytest.approx(3, abs=0.1)
+
+
+def test_wipes() -> None:
+    black, grey = np.zeros((4, 10, 3), np.uint8), np.full((4, 10, 3), 99, np.uint8)
+    assert (wiped(black, grey, 0) == 0).all()
+    assert (wiped(black, grey, 1) == 99).all()
+    assert wiped(black, grey, 0.5)[0, :, 0].tolist() == [99] * 4 + [255] * 2 + [0] * 4
+    assert [shown(time) for time in (0, 0.5, 1)] == [0, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (("--video", "film.avi"), 2, "ends in .mp4"),
+        (("--video", "film.mp4", "-o", "x"), 2, "leave out -o"),
+        (("--video", "film.mp4", "--seconds", "0"), 2, "--seconds: expected more than 0"),
+        (("--video", "film.mp4", "--seconds", "nan"), 2, "--seconds"),
+        (("--video", "film.mp4", "--seconds", "1e9"), 2, "at most 600"),
+        (("--video", "film.mp4", "--width", "1"), 2, "--width: expected 2"),
+        (("--video", "film.mp4", "--wipe", "none.ply"), 4, "none.ply"),
+        (("--video", "there.mp4"), 5, "--overwrite"),
+        (("--wipe", "b.ply", "--cameras", "scene", "-o", "x"), 2, "give --video"),
+        (("--path", "through", "--cameras", "scene", "-o", "x"), 2, "give --video"),
+        (("-o", "x"), 2, "--cameras SCENE"),
+        ((), 2, "--video FILE"),
+    ],
+)
+def test_what_is_refused(
+    keyss: Run,
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+    status: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(files)
+    (files / "there.mp4").write_bytes(b"mine")
+    assert_refused(keyss("render", "a.ply", *arguments), status, words)
+    assert (files / "there.mp4").read_bytes() == b"mine"
+    assert not (files / "film.mp4").exists()
+
+
+def test_without_the_package(
+    keyss: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    said = keyss("render", files / "a.ply", "--video", tmp_path / "a.mp4")
+    assert_refused(said, 6, "pip install 'keyss[video]'")
+
+
+def test_an_interrupted_film_leaves_nothing(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("keyss._verbs.filming.render", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        api.render_video(files / "a.ply", tmp_path / "a.mp4", width=32)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,133 @@
+"""The page in headless Chromium, and what our own renderer says the picture should be."""
+
+from __future__ import annotations
+
+import io
+import math
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+import numpy as np
+import torch
+from PIL import Image
+
+from channels.low_bits.trained_like import trained_like
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.rendering import render
+
+ROOT = Path(__file__).parents[2]
+WEB = ROOT / "web"
+NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "chromium-browser")
+PROGRAM = next((path for name in NAMES if (path := shutil.which(name))), None)
+SWITCHES = [
+    *("--no-sandbox", "--disable-dev-shm-usage", "--disable-background-networking"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+]
+PATIENCE = 120_000  # milliseconds for any one answer: other work may share the machine
+WIDTH, HEIGHT = 400, 300
+POSE = "#eye=1.5,-1.2,-6&target=0.2,0.1,0"
+Picture = np.ndarray[Any, np.dtype[np.float64]]
+
+
+def made(count: int, seed: int) -> Gaussians:
+    """A model that carries, of Gaussians that are seen and whose colours change much with direction."""
+    model = trained_like(count, seed)
+    sh = model.sh * torch.tensor([8.0, *[4.0] * 15])[None, :, None]
+    return replace(model, log_scales=0.5 * model.log_scales, sh=sh)
+
+
+def camera_of(address: str) -> Camera:
+    """The camera that the page has at the pose in its address."""
+    found = parse_qs(address.partition("#")[2])
+    eye, target = (torch.tensor([float(n) for n in found[name][0].split(",")]) for name in ("eye", "target"))
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    focal = 0.5 * HEIGHT / math.tan(math.radians(25))
+    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+def drawn(model: Gaussians, address: str) -> Picture:
+    """[H, W, 3] 0 to 255: our own render of the pose in an address."""
+    return (render(model, camera_of(address)).clamp(0, 1) * 255).numpy().astype(np.float64)
+
+
+def psnr(a: Picture, b: Picture) -> float:
+    return float(10 * np.log10(255**2 / max(float(((a - b) ** 2).mean()), 1e-9)))
+
+
+@dataclass
+class Visit:
+    """One tab, and what went on in it."""
+
+    page: Any
+    complaints: list[str] = field(default_factory=list)  # errors on the console, and uncaught ones
+    requests: list[str] = field(default_factory=list)
+
+    def goto(self, address: str) -> None:
+        self.page.goto(address)
+        self.settle()
+
+    def settle(self) -> None:
+        self.page.wait_for_selector("main[data-picture=settled]")
+
+    def at(self, pose: str) -> None:
+        """Move the camera there."""
+        self.page.evaluate("pose => { location.hash = pose }", pose)
+
+    def picture(self) -> Picture:
+        """[H, W, 3] 0 to 255 what is on the canvas once it does not change any more."""
+        self.page.evaluate("document.querySelector('.panel').style.visibility = 'hidden'")
+        try:
+            before, deadline = b"", time.monotonic() + PATIENCE / 1000
+            while time.monotonic() < deadline:
+                now = self.page.locator("#picture").screenshot()
+                if now == before:
+                    break
+                before = now
+                self.page.wait_for_timeout(700)
+        finally:
+            self.page.evaluate("document.querySelector('.panel').style.visibility = ''")
+        return np.asarray(Image.open(io.BytesIO(before)).convert("RGB")).astype(np.float64)
+
+    def try_key(self, key: str) -> float:
+        """Milliseconds that it took."""
+        self.page.fill("#key", key)
+        return float(
+            self.page.evaluate(
+                """() => new Promise((resolve) => {
+                    const main = document.getElementById('main');
+                    const start = performance.now();
+                    new MutationObserver((_, observer) => {
+                        if (main.getAttribute('aria-busy') === 'true') return;
+                        observer.disconnect();
+                        resolve(performance.now() - start);
+                    }).observe(main, { attributeFilter: ['aria-busy'] });
+                    document.getElementById('key-form').requestSubmit();
+                })"""
+            )
+        )
+
+
+@contextmanager
+def visit(browser: Any) -> Iterator[Visit]:
+    """A new tab, which must not complain."""
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page.set_default_timeout(PATIENCE)
+    found = Visit(page)
+    page.on("console", lambda each: found.complaints.append(each.text) if each.type == "error" else None)
+    page.on("pageerror", lambda error: found.complaints.append(str(error)))
+    page.on("request", lambda request: found.requests.append(request.url))
+    yield found
+    page.close()
+    assert found.complaints == []

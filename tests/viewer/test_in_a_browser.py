@@ -1,0 +1,205 @@
+"""The viewer end to end: headless Chromium, from disk and from `keyss view`, against our own renders."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cli.said import PROGRAM as KEYSS
+from keyss.core.gaussians import Gaussians
+from keyss.files.models import read_model, write_model
+from keyss.files.ply import write_ply
+from keyss.viewer import export_html
+from methods.carry.carried import embed, extract
+from viewer.browser import PATIENCE, POSE, PROGRAM, SWITCHES, WEB, Visit, drawn, made, psnr, visit
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
+
+KEYS = ("the first key", "ein zweiter Schlüssel")
+CLOSE = 25.0  # dB on the canvas
+AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
+
+
+@pytest.fixture(scope="module")
+def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model of 4,000 Gaussians with two secrets."""
+    path = tmp_path_factory.mktemp("published") / "stego.ply"
+    secrets = [(key, made(200, seed)) for seed, key in enumerate(KEYS, start=1)]
+    write_ply(path, embed(made(4000, 0), secrets, entropy=bytes(32)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def page_file(stego: Path) -> Path:
+    return export_html(stego, stego.parent / "page.html")[0]
+
+
+@pytest.fixture(scope="module")
+def secrets(stego: Path) -> list[Gaussians]:
+    return [extract(read_model(stego), key).gaussians for key in KEYS]
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def tab(chromium: Any) -> Iterator[Visit]:
+    with visit(chromium) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def served(stego: Path) -> Iterator[str]:
+    """The address of `keyss view`."""
+    with subprocess.Popen([*KEYSS, "view", str(stego)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.match(r"(http://127\.0\.0\.1:[0-9]+/) shows .*, to only this machine", line)
+        assert found, line
+        yield found[1]
+        process.terminate()
+
+
+def test_from_disk_two_keys_open_two_secrets_and_a_wrong_one_nothing(
+    tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians]
+) -> None:
+    tab.goto(page_file.as_uri() + POSE)
+    cover = tab.picture()
+    assert psnr(cover, drawn(read_model(stego), POSE)) > CLOSE
+    tab.try_key("another key")
+    after = tab.picture()
+    assert np.abs(after - cover).mean() < 0.01 * 255
+    assert tab.page.locator("#revealed").is_hidden()
+    assert tab.page.locator("[role=status]").inner_text() == tab.page.locator("#problem").inner_text() == ""
+    for key, secret in zip(KEYS, secrets, strict=True):
+        tab.try_key(key)
+        tab.at(POSE)
+        shown = tab.picture()
+        assert psnr(shown, drawn(secret, POSE)) > CLOSE > psnr(shown, cover)
+    tab.page.reload()  # nothing was stored
+    tab.settle()
+    assert tab.page.locator("#revealed").is_hidden()
+    assert tab.page.evaluate("localStorage.length + sessionStorage.length + document.cookie.length") == 0
+    assert all(url.startswith(("file:", "blob:null/")) for url in tab.requests), tab.requests
+
+
+def test_served_it_is_the_same(tab: Visit, served: str, secrets: list[Gaussians]) -> None:
+    tab.goto(served + POSE)
+    tab.try_key(KEYS[0])
+    tab.at(POSE)
+    assert psnr(tab.picture(), drawn(secrets[0], POSE)) > CLOSE
+    tab.page.reload()
+    tab.settle()
+    assert tab.page.locator("#revealed").is_hidden()
+    assert all(url.startswith((served, f"blob:{served}")) for url in tab.requests), tab.requests
+
+
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply"])
+def test_published_formats_are_shown(tab: Visit, page_file: Path, tmp_path: Path, suffix: str) -> None:
+    converted = tmp_path / f"model.{suffix}"
+    model = made(600, 5)
+    write_model(converted, model)
+    tab.goto(page_file.as_uri() + POSE)
+    tab.page.set_input_files("#file", converted)
+    tab.page.wait_for_function("() => document.getElementById('facts').textContent.includes('600')")
+    tab.settle()
+    assert psnr(tab.picture(), drawn(read_model(converted), POSE)) > CLOSE
+
+
+@pytest.mark.alone
+def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, page_file: Path) -> None:
+    tab.goto(page_file.as_uri())
+    # Each as long as those before it or longer; other work on the machine makes single ones longer.
+    times = [tab.try_key(key) for key in ("wrong", KEYS[0], "wrong again", KEYS[1], "and again", KEYS[0])]
+    assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
+
+
+def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path: Path) -> None:
+    tab.goto(page_file.as_uri())
+    data = (page_file.parent / "stego.ply").read_bytes()
+    for name, content in {
+        "cut.ply": data[:5000],
+        "noise.ply": b"ply" + bytes(range(256)),
+        "none": b"",
+    }.items():
+        (tmp_path / name).write_bytes(content)
+        tab.page.set_input_files("#file", tmp_path / name)
+        tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
+        said = tab.page.locator("#problem").inner_text()
+        assert re.fullmatch(r"This [^.]*\.?[^.]*\.", said), said
+    tab.page.set_input_files("#file", page_file.parent / "stego.ply")
+    tab.page.wait_for_function("() => document.getElementById('problem').textContent === ''")
+
+
+def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:
+    tab.goto(page_file.as_uri())
+    reached: list[str] = []
+    for _ in range(14):
+        tab.page.keyboard.press("Tab")
+        reached.append(tab.page.evaluate("document.activeElement.id || document.activeElement.tagName"))
+    assert {"picture", "key", "open", "file", "fly", "home", "snapshot", "SUMMARY"} <= set(reached)
+    tab.page.focus("#key")
+    tab.page.keyboard.type(KEYS[0])
+    tab.page.keyboard.press("Enter")
+    tab.page.wait_for_selector("#revealed:not([hidden])")
+    tab.page.focus("#picture")
+    before = tab.page.url
+    for key in ("ArrowLeft", "w", "-"):
+        tab.page.keyboard.press(key)
+    tab.page.wait_for_function("before => location.href !== before", arg=before)
+
+
+@pytest.mark.skipif(not AXE.exists(), reason="no axe-core: `make test-web` installs it")
+def test_axe_finds_nothing_serious(tab: Visit, page_file: Path) -> None:
+    tab.goto(page_file.as_uri())
+    tab.try_key(KEYS[0])
+    tab.page.click("summary")
+    tab.page.evaluate(AXE.read_text())
+    found = tab.page.evaluate("axe.run()")
+    assert [each["id"] for each in found["violations"] if each["impact"] in ("serious", "critical")] == []
+    assert len(found["passes"]) > 10
+
+
+def test_looking_saving_and_wiping(
+    tab: Visit, page_file: Path, secrets: list[Gaussians], tmp_path: Path
+) -> None:
+    tab.goto(page_file.as_uri() + POSE)
+    plain = tab.picture()
+    tab.page.click("summary")
+    tab.page.fill("#threshold", "0.5")
+    tab.page.wait_for_function("() => !document.getElementById('count').textContent.startsWith('4,000 of')")
+    assert psnr(tab.picture(), plain) < 40
+    tab.page.fill("#threshold", "0")
+    tab.page.select_option("#colouring", "low bits")
+    assert psnr(tab.picture(), plain) < CLOSE
+    tab.page.select_option("#colouring", "as it is")
+    tab.try_key(KEYS[0])
+    with tab.page.expect_download() as download:
+        tab.page.click("#download")
+    download.value.save_as(tmp_path / "secret.ply")
+    saved = read_model(tmp_path / "secret.ply")
+    assert saved.digest() == secrets[0].digest()
+    tab.at(POSE)
+    whole = tab.picture()
+    tab.page.fill("#wipe", "50")
+    half = tab.picture()
+    border = half.shape[1] // 2
+    assert psnr(half[:, border + 2 :], whole[:, border + 2 :]) > 40
+    assert psnr(half[:, : border - 2], whole[:, : border - 2]) < CLOSE
+    with tab.page.expect_download() as download:
+        tab.page.click("#snapshot")
+    download.value.save_as(tmp_path / "view.png")
+    assert (tmp_path / "view.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,116 @@
+"""What `keyss export-html` writes and `keyss view` gives out, and that it is what `web/` builds."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import re
+import shutil
+import subprocess
+import threading
+from base64 import b64decode, b64encode
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from keyss.core.errors import OutputError
+from keyss.files.ply import write_ply
+from keyss.viewer import ModelServer, export_html
+from keyss.viewer.page import asset
+from tiny_scenes import random_gaussians
+from viewer.browser import ROOT, WEB
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "a model & <more>.ply"
+    write_ply(path, random_gaussians(5))
+    return path
+
+
+@pytest.fixture
+def server(model: Path) -> Iterator[ModelServer]:
+    found = ModelServer(model)
+    thread = threading.Thread(target=found.run)
+    thread.start()
+    yield found
+    found.close()
+    thread.join()
+
+
+def test_one_file_has_everything_in_it_and_may_ask_nobody(model: Path, tmp_path: Path) -> None:
+    (out,) = export_html(model, tmp_path / "page.html")
+    page = out.read_text()
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None
+    script = re.search(r"<script>(.*?)</script>", page, re.DOTALL)
+    assert script is not None
+    assert script[1] == asset("viewer.js").decode()  # no end of a script within it
+    digest = b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
+    assert f"script-src &#x27;sha256-{digest}&#x27;" in policy[1]
+    assert policy[1].startswith("default-src &#x27;none&#x27;;")
+    assert "unsafe-inline" not in policy[1]
+    assert "unsafe-eval" not in policy[1].replace("wasm-unsafe-eval", "")
+    data = re.search(r'data-name="a model &amp; &lt;more&gt;.ply">([^<]*)</script>', page)
+    assert data is not None
+    assert b64decode(data[1]) == model.read_bytes()
+    assert "PlayCanvas" in page
+    assert not re.search(r'(src|href)="', page)
+
+
+def test_a_folder_for_a_web_server(model: Path, tmp_path: Path) -> None:
+    written = export_html(model, tmp_path / "site")
+    names = {path.name for path in written}
+    assert names == {"index.html", "viewer.js", "viewer.css", "licences.txt", model.name}
+    assert (tmp_path / "site" / model.name).read_bytes() == model.read_bytes()
+    assert 'name="keyss-model" content="a%20model%20%26%20%3Cmore%3E.ply"' in written[0].read_text()
+    with pytest.raises(OutputError, match="exists"):
+        export_html(model, tmp_path / "site")
+    export_html(model, tmp_path / "site", overwrite=True)
+
+
+def test_the_server_gives_out_the_page_and_the_model_and_nothing_else(
+    server: ModelServer, model: Path
+) -> None:
+    port = int(server.address.rstrip("/").rpartition(":")[2])
+    assert server.address == f"http://127.0.0.1:{port}/"
+
+    def get(path: str, host: str = "127.0.0.1") -> tuple[int, bytes, dict[str, str]]:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("GET", path, headers={"Host": f"{host}:{port}"})
+        answer = connection.getresponse()
+        return answer.status, answer.read(), dict(answer.getheaders())
+
+    status, page, headers = get("/")
+    assert status == 200
+    assert headers["Content-Security-Policy"].startswith("default-src 'self';")
+    name = re.search(rb'name="keyss-model" content="([^"]*)"', page)
+    assert name is not None
+    assert get(f"/{name[1].decode()}")[1] == model.read_bytes()
+    assert get("/viewer.js")[1] == asset("viewer.js")
+    for path in ("/model/", "/model/..%2f..%2fetc/passwd", "/../../etc/passwd", "/page.html", "/a/b"):
+        assert get(path)[0] == 404, path
+    assert get("/", host="elsewhere.example")[0] == 403
+    with pytest.raises(OutputError, match="cannot serve"):
+        ModelServer(model, port=port)
+
+
+def test_the_page_is_small_and_has_its_licences() -> None:
+    script = asset("viewer.js")
+    assert len(script) < 3 << 20
+    used = subprocess.run(["gzip", "-c"], input=script, capture_output=True, check=True).stdout
+    assert len(used) < 1.5e6
+    licences = asset("licences.txt").decode()
+    for name in ("playcanvas", "hash-wasm", "@noble/ciphers", "@noble/hashes", "fflate", "fzstd"):
+        assert re.search(rf"^{name} [0-9.]+ \(MIT\)$", licences, re.MULTILINE), name
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node on PATH")
+@pytest.mark.skipif(not (WEB / "node_modules").exists(), reason="no web/node_modules: `make web` installs it")
+def test_a_fresh_build_is_what_is_shipped(tmp_path: Path) -> None:
+    subprocess.run(["node", "build.mjs", str(tmp_path)], cwd=WEB, check=True)
+    shipped = ROOT / "src" / "keyss" / "viewer" / "assets"
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in shipped.iterdir()}
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (shipped / path.name).read_bytes(), f"`make web` was not run: {path.name}"

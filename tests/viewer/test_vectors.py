@@ -1,0 +1,32 @@
+"""The frozen vectors that the page's reader is tested against are what this program reads."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from typing import Any
+
+import pytest
+
+from keyss.core.errors import KeyssWarning
+from keyss.files import read_model
+from vectors.make_vectors import FOLDER, digests, revealed
+
+REVEALED = json.loads((FOLDER / "revealed.json").read_text())
+PUBLISHED = json.loads((FOLDER / "published.json").read_text())
+
+
+@pytest.mark.argon2
+@pytest.mark.parametrize("expected", REVEALED, ids=lambda each: f"{each['file']} {each['key']}")
+def test_what_keys_open(expected: dict[str, Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KeyssWarning)
+        found = revealed(expected["file"], expected["key"])
+    if "opacity_logits" in expected:
+        assert found.pop("opacity_logits") == pytest.approx(expected.pop("opacity_logits"), abs=1e-4)
+    assert found == expected
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_what_published_files_hold(name: str) -> None:
+    assert digests(read_model(FOLDER / name)) == PUBLISHED[name]

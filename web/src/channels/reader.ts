@@ -1,0 +1,157 @@
+/**
+ * What a key opens in the low bits of a model.
+ *
+ * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
+ * tried, so that how long it takes tells next to nothing.
+ */
+import { bytesKey } from '../core/bytes.ts';
+import { type Gaussians, selected } from '../core/gaussians.ts';
+import { expand, master } from '../keys/derivation.ts';
+import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
+import { CellCipher } from './cells.ts';
+import {
+  damaged, mostFrequent, type Parameters, type PayloadParameters, type RecordParameters, tooMuchRemoved,
+  unpackParameters,
+} from './parameters.ts';
+import { decodePayload } from './payload.ts';
+import { salts } from './salts.ts';
+
+const DATA_KEY_BYTES = 16;
+const TAG_BYTES = 4;
+const CHUNK_TAG_BYTES = 6;
+const NUMBER_BYTES = 3;
+const SALTS_TRIED = 4;
+const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
+
+export interface Records {
+  readonly service: 'records';
+  readonly method: string;
+  readonly header: Uint8Array;
+  readonly records: Uint8Array[]; // in the order of their carriers
+}
+
+export interface Payload {
+  readonly service: 'payload';
+  readonly method: string;
+  readonly data: Uint8Array;
+}
+
+export type Content = Records | Payload;
+type Derive = (key: string, salt: Uint8Array) => Promise<Uint8Array>;
+
+/** The low bits of a model, prepared for any number of keys. */
+export class LowBitsReader {
+  private constructor(
+    private readonly names: Uint8Array, // [N, 16] identities
+    private readonly low: Uint8Array, // [N, width]
+    private readonly width: number,
+    readonly salts: Uint8Array[], // the likeliest first
+  ) {}
+
+  static of(model: Gaussians): LowBitsReader {
+    let fields = fieldsOf(model);
+    let [names, low] = [identities(model, fields), lowBits(fields)];
+    const width = lowWidth(fields);
+    const rows = firstOfEach(names, low, width);
+    if (rows.length < model.count) {
+      fields = fieldsOf(selected(model, rows));
+      [names, low] = [rowsOf(names, rows, IDENTITY_BYTES), rowsOf(low, rows, width)];
+    }
+    return new LowBitsReader(names, low, width, salts(fields, names, low, width));
+  }
+
+  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  async open(key: string, derive: Derive = master): Promise<Content | null> {
+    const room = this.width >= TAG_BYTES + DATA_KEY_BYTES;
+    const tried = this.salts.slice(0, SALTS_TRIED);
+    const dataKeys: Uint8Array[] = [];
+    let [secret, next] = [new Uint8Array(32), derive(key, tried[0])];
+    for (let index = 0; index < tried.length; index++) {
+      secret = new Uint8Array(expand(await next, 'low-bits/key', 32));
+      // The next one is derived by another worker while this one looks through the cells.
+      if (index + 1 < tried.length) next = derive(key, tried[index + 1]);
+      if (!room) continue;
+      const found = mostFrequent(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
+      if (found !== null) dataKeys.push(found);
+    }
+    for (const dataKey of dataKeys) {
+      const parts = this.decrypted(this.parameterCipher(dataKey));
+      if (parts.length) return this.content(dataKey, unpackParameters(parts, this.chunkBytes));
+    }
+    if (room && dataKeys.length === 0) this.passesForNothing(secret);
+    return null;
+  }
+
+  private passesForNothing(secret: Uint8Array): void {
+    const dataKey = expand(secret, 'low-bits/none', DATA_KEY_BYTES);
+    this.decrypted(this.parameterCipher(dataKey));
+    const size = Math.floor(this.width / DUMMY_CELLS) - TAG_BYTES;
+    for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), DUMMY_CELLS);
+  }
+
+  private content(dataKey: Uint8Array, parameters: Parameters): Content {
+    return parameters.service === 'records'
+      ? this.records(dataKey, parameters)
+      : this.payload(dataKey, parameters);
+  }
+
+  private records(dataKey: Uint8Array, parameters: RecordParameters): Records {
+    const { cells, recordBytes, method, header } = parameters;
+    if (recordBytes < 1 || recordBytes > Math.floor(this.width / cells) - TAG_BYTES) throw damaged();
+    const [records, copies] = ['record', 'copy'].map((label) =>
+      this.decrypted(new CellCipher(dataKey, label, recordBytes), cells),
+    );
+    const known = new Set(records.map(bytesKey));
+    const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
+    if (!all.length) throw tooMuchRemoved();
+    return { service: 'records', method, header, records: all };
+  }
+
+  private payload(dataKey: Uint8Array, parameters: PayloadParameters): Payload {
+    const cipher = new CellCipher(dataKey, 'chunk', NUMBER_BYTES + this.chunkBytes, CHUNK_TAG_BYTES);
+    const data = decodePayload(dataKey, parameters, this.decrypted(cipher), this.chunkBytes);
+    return { service: 'payload', method: parameters.method, data };
+  }
+
+  private parameterCipher(dataKey: Uint8Array): CellCipher {
+    return new CellCipher(dataKey, 'parameters', this.width - TAG_BYTES);
+  }
+
+  private get chunkBytes(): number {
+    return Math.max(0, this.width - CHUNK_TAG_BYTES - NUMBER_BYTES);
+  }
+
+  /** What the cipher decrypts in any of the cells of each Gaussian, in the order of these. */
+  private decrypted(cipher: CellCipher, cells = 1): Uint8Array[] {
+    const size = Math.floor(this.width / cells);
+    const found: { row: number; data: Uint8Array }[] = [];
+    for (let slot = 0; slot < cells; slot++) {
+      const { rows, data } = cipher.decrypt(this.names, this.low, this.width, slot * size, slot);
+      rows.forEach((row, index) => found.push({ row, data: data[index] }));
+    }
+    return found.sort((a, b) => a.row - b.row).map((each) => each.data);
+  }
+}
+
+/** Rows of Gaussians, those that agree in identity and low bits only once. */
+function firstOfEach(names: Uint8Array, low: Uint8Array, width: number): number[] {
+  const seen = new Map<string, Set<string>>();
+  const rows: number[] = [];
+  for (let row = 0; row < names.length / IDENTITY_BYTES; row++) {
+    const name = bytesKey(names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES));
+    const bits = bytesKey(low.subarray(row * width, (row + 1) * width));
+    const others = seen.get(name);
+    if (others === undefined) seen.set(name, new Set([bits]));
+    else if (others.has(bits)) continue;
+    else others.add(bits);
+    rows.push(row);
+  }
+  return rows;
+}
+
+function rowsOf(table: Uint8Array, rows: number[], width: number): Uint8Array {
+  const found = new Uint8Array(rows.length * width);
+  rows.forEach((row, index) => found.set(table.subarray(row * width, (row + 1) * width), index * width));
+  return found;
+}
+

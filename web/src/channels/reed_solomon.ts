@@ -1,0 +1,77 @@
+/** Reed-Solomon over GF(256) for erasures; see docs/format.md, "A payload". */
+
+const POWERS = new Uint8Array(510);
+const LOGARITHMS = new Uint8Array(256);
+for (let exponent = 0, value = 1; exponent < 255; exponent++) {
+  POWERS[exponent] = POWERS[exponent + 255] = value;
+  LOGARITHMS[value] = exponent;
+  value = (value << 1) ^ (value & 128 ? 0x11d : 0);
+}
+
+function product(a: number, b: number): number {
+  return a && b ? POWERS[LOGARITHMS[a] + LOGARITHMS[b]] : 0;
+}
+
+/** `to` += factor x `from`, over the field. */
+function addMultiple(to: Uint8Array, factor: number, from: Uint8Array): void {
+  if (!factor) return;
+  const logarithm = LOGARITHMS[factor];
+  for (let at = 0; at < to.length; at++) {
+    if (from[at]) to[at] ^= POWERS[logarithm + LOGARITHMS[from[at]]];
+  }
+}
+
+/** The k data rows from any k rows of a codeword of n, by their number; null if there are fewer. */
+export function decodeCodeword(rows: Map<number, Uint8Array>, k: number, n: number): Uint8Array[] | null {
+  if (rows.size < k) return null;
+  const data: Uint8Array[] = Array.from({ length: k }, (_, index) => rows.get(index)!);
+  const lost = [...data.keys()].filter((index) => data[index] === undefined);
+  if (!lost.length) return data;
+  const matrix = parityMatrix(k, n);
+  const parity = [...rows.keys()].filter((index) => index >= k).sort((a, b) => a - b).slice(0, lost.length);
+  const work = parity.map((index) => {
+    const coefficients = matrix[index - k];
+    const right = rows.get(index)!.slice();
+    for (let column = 0; column < k; column++) {
+      if (data[column] !== undefined) addMultiple(right, coefficients[column], data[column]);
+    }
+    return { left: Uint8Array.from(lost, (column) => coefficients[column]), right };
+  });
+  for (let column = 0; column < lost.length; column++) {
+    const pivot = work.findIndex((row, index) => index >= column && row.left[column]);
+    [work[column], work[pivot]] = [work[pivot], work[column]];
+    const inverse = POWERS[255 - LOGARITHMS[work[column].left[column]]];
+    work[column].left = work[column].left.map((value) => product(value, inverse));
+    work[column].right = work[column].right.map((value) => product(value, inverse));
+    for (const row of work) {
+      const factor = row.left[column];
+      if (row === work[column] || !factor) continue;
+      addMultiple(row.left, factor, work[column].left);
+      addMultiple(row.right, factor, work[column].right);
+    }
+  }
+  lost.forEach((index, row) => (data[index] = work[row].right));
+  return data;
+}
+
+/** [n - k][k]: column i is x^(n-1-i) modulo the generator polynomial. */
+function parityMatrix(k: number, n: number): Uint8Array[] {
+  const size = n - k;
+  let generator = new Uint8Array(size + 1); // of the highest power first
+  generator[0] = 1;
+  for (let exponent = 0; exponent < size; exponent++) {
+    const next = generator.slice();
+    for (let at = 1; at <= size; at++) next[at] ^= product(POWERS[exponent], generator[at - 1]);
+    generator = next;
+  }
+  const matrix = Array.from({ length: size }, () => new Uint8Array(k));
+  let remainder = generator.slice(1);
+  for (let column = k - 1; column >= 0; column--) {
+    matrix.forEach((row, index) => (row[column] = remainder[index]));
+    const lead = remainder[0];
+    const next = new Uint8Array(size);
+    for (let at = 0; at < size; at++) next[at] = (remainder[at + 1] ?? 0) ^ product(lead, generator[at + 1]);
+    remainder = next;
+  }
+  return matrix;
+}

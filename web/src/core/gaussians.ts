@@ -1,0 +1,63 @@
+/** N Gaussians in the raw parameterisation of the 3DGS .ply, all float32. */
+export interface Gaussians {
+  readonly count: number;
+  readonly shDegree: number; // 0 to 3
+  readonly means: Float32Array; // [N, 3]
+  readonly quats: Float32Array; // [N, 4] wxyz, of any length
+  readonly logScales: Float32Array; // [N, 3] natural logarithms
+  readonly opacityLogits: Float32Array; // [N]
+  readonly sh: Float32Array; // [N, K, 3], K = (shDegree + 1)^2
+}
+
+export function coefficients(shDegree: number): number {
+  return (shDegree + 1) ** 2;
+}
+
+/** Room for `count` Gaussians, all numbers zero. */
+export function emptyGaussians(count: number, shDegree: number): Gaussians {
+  return {
+    count,
+    shDegree,
+    means: new Float32Array(3 * count),
+    quats: new Float32Array(4 * count),
+    logScales: new Float32Array(3 * count),
+    opacityLogits: new Float32Array(count),
+    sh: new Float32Array(3 * coefficients(shDegree) * count),
+  };
+}
+
+/** The buffers, to be moved between threads instead of copied. */
+export function buffersOf(gaussians: Gaussians): ArrayBuffer[] {
+  const { means, quats, logScales, opacityLogits, sh } = gaussians;
+  return [means, quats, logScales, opacityLogits, sh].map((each) => each.buffer as ArrayBuffer);
+}
+
+/** The Gaussians of these rows, in this order. */
+export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussians {
+  const found = emptyGaussians(rows.length, gaussians.shDegree);
+  const columns = ['means', 'quats', 'logScales', 'opacityLogits', 'sh'] as const;
+  for (const column of columns) {
+    const width = gaussians[column].length / Math.max(1, gaussians.count);
+    for (let to = 0; to < rows.length; to++) {
+      const from = rows[to] * width;
+      found[column].set(gaussians[column].subarray(from, from + width), to * width);
+    }
+  }
+  return found;
+}
+
+export function opacity(logit: number): number {
+  return 1 / (1 + Math.exp(-logit));
+}
+
+/** About the `count` Gaussians that are seen most, by opacity and cross-section, in their order. */
+export function mostVisible(gaussians: Gaussians, count: number): Gaussians {
+  const visibility = Float32Array.from({ length: gaussians.count }, (_, row) => {
+    const [a, b, c] = gaussians.logScales.subarray(3 * row, 3 * row + 3);
+    return opacity(gaussians.opacityLogits[row]) * Math.exp(a + b + c - Math.min(a, b, c));
+  });
+  const least = Float32Array.from(visibility).sort()[Math.max(0, gaussians.count - count)];
+  const rows: number[] = [];
+  for (let row = 0; row < gaussians.count && rows.length < count; row++) if (visibility[row] >= least) rows.push(row);
+  return selected(gaussians, rows);
+}

@@ -1,0 +1,62 @@
+/** Reader of PlayCanvas's compressed .ply; `keyss.files.formats.compressed_ply` on the other side. */
+import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+import { damagedFile, fromSmallestThree, logit, SH_C0 } from './coded.ts';
+import { checkedFinite, column, type PlyHeader } from './ply.ts';
+
+const CHUNK = 256; // Gaussians
+const ENDS = ['min', 'max'];
+const AXES = ['x', 'y', 'z'].map((axis) => ENDS.map((end) => `${end}_${axis}`));
+const SCALES = ['x', 'y', 'z'].map((axis) => ENDS.map((end) => `${end}_scale_${axis}`));
+const COLOURS = ['r', 'g', 'b'].map((colour) => ENDS.map((end) => `${end}_${colour}`));
+
+export function isCompressed(header: PlyHeader): boolean {
+  return header.elements.some((each) => each.properties.some(({ name }) => name === 'packed_position'));
+}
+
+export function readCompressedPly(bytes: Uint8Array, header: PlyHeader): Gaussians {
+  const element = (name: string) => header.elements.find((each) => each.name === name);
+  const [vertex, chunk, sh] = [element('vertex'), element('chunk'), element('sh')];
+  if (!vertex?.count || !chunk || chunk.count !== Math.ceil(vertex.count / CHUNK)) throw damagedFile();
+  const shDegree = [0, 9, 24, 45].indexOf(sh?.properties.length ?? 0);
+  if (shDegree < 0 || (sh && sh.count !== vertex.count)) throw damagedFile();
+  const ends = (names: string[][], missing?: number[]): Float64Array[][] =>
+    names.map((pair) => pair.map((name, end) => {
+      const values = column(bytes, header, chunk, name);
+      if (values === null && !missing) throw damagedFile();
+      return values ?? new Float64Array(chunk.count).fill(missing![end]);
+    }));
+  const hasColours = chunk.properties.some(({ name }) => name === 'min_r');
+  const [places, sizes, colours] = [ends(AXES), ends(SCALES), ends(COLOURS, hasColours ? undefined : [0, 1])];
+  const [position, rotation, scale, colour] = ['position', 'rotation', 'scale', 'color'].map((name) => {
+    const values = column(bytes, header, vertex, `packed_${name}`);
+    if (values === null) throw damagedFile();
+    return values;
+  });
+  const model = emptyGaussians(vertex.count, shDegree);
+  const k = coefficients(shDegree);
+  for (let row = 0; row < vertex.count; row++) {
+    const own = Math.floor(row / CHUNK);
+    const between = ([low, high]: Float64Array[], share: number): number =>
+      low[own] * (1 - share) + high[own] * share;
+    const vector = (packed: number): number[] => [(packed >>> 21) / 2047, ((packed >>> 11) & 1023) / 1023, (packed & 2047) / 2047];
+    vector(position[row]).forEach((share, axis) => (model.means[3 * row + axis] = between(places[axis], share)));
+    vector(scale[row]).forEach((share, axis) => (model.logScales[3 * row + axis] = between(sizes[axis], share)));
+    const others = [20, 10, 0].map((shift) => (((rotation[row] >>> shift) & 1023) / 1023 - 0.5) * Math.sqrt(2));
+    model.quats.set(fromSmallestThree(rotation[row] >>> 30, others), 4 * row);
+    [24, 16, 8].forEach((shift, channel) => {
+      const value = between(colours[channel], ((colour[row] >>> shift) & 255) / 255);
+      model.sh[3 * k * row + channel] = (value - 0.5) / SH_C0;
+    });
+    model.opacityLogits[row] = logit(colour[row] & 255);
+  }
+  for (let index = 0; sh && index < 3 * (k - 1); index++) {
+    const values = column(bytes, header, sh, `f_rest_${index}`);
+    if (values === null) throw damagedFile();
+    const [channel, each] = [Math.floor(index / (k - 1)), (index % (k - 1)) + 1];
+    values.forEach((code, row) => {
+      const level = code === 0 ? 0 : code === 255 ? 256 : code + 0.5;
+      model.sh[3 * (k * row + each) + channel] = level / 32 - 4;
+    });
+  }
+  return checkedFinite(model);
+}

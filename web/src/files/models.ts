@@ -1,0 +1,19 @@
+/** Models of any format that can be read, told by their first bytes. */
+import { InputError } from '../core/errors.ts';
+import type { Gaussians } from '../core/gaussians.ts';
+import { isCompressed, readCompressedPly } from './compressed_ply.ts';
+import { plyHeader, readPly } from './ply.ts';
+import { readSog } from './sog.ts';
+import { readSpz } from './spz.ts';
+
+/** Raises InputError for a file that is none of them, or damaged. */
+export async function readModel(bytes: Uint8Array): Promise<Gaussians> {
+  const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
+  if (start.startsWith('ply')) {
+    const header = plyHeader(bytes);
+    return isCompressed(header) ? readCompressedPly(bytes, header) : readPly(bytes);
+  }
+  if (start === 'NGSP' || start.startsWith('\x1f\x8b')) return readSpz(bytes);
+  if (start === 'PK\x03\x04') return readSog(bytes);
+  throw new InputError('This is not a file of a 3D Gaussian Splatting model that this page can read.');
+}

@@ -1,0 +1,60 @@
+/**
+ * From what a person types to derived keys, as docs/format.md has it: Argon2id (RFC 9106) of the key in NFKC, then
+ * HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
+ */
+import { hmac } from '@noble/hashes/hmac.js';
+import { sha256 } from '@noble/hashes/sha2.js';
+import { argon2id } from 'hash-wasm';
+import { ascii, joined } from '../core/bytes.ts';
+import { InputError } from '../core/errors.ts';
+
+export const SALT_BYTES = 16;
+export const MAX_KEY_BYTES = 4096;
+
+export interface Costs {
+  readonly passes: number;
+  readonly memoryKib: number;
+  readonly lanes: number;
+}
+
+export const COSTS: Costs = { passes: 3, memoryKib: 65536, lanes: 4 };
+
+/** The bytes of a key. Raises InputError for an empty one and one of more than 4,096 bytes. */
+export function keyBytes(key: string): Uint8Array {
+  const bytes = new TextEncoder().encode(key.normalize('NFKC'));
+  if (bytes.length === 0 || bytes.length > MAX_KEY_BYTES) {
+    throw new InputError('A key has 1 to 4,096 bytes.');
+  }
+  return bytes;
+}
+
+/** 32 bytes. Takes some tenths of a second and 64 MiB. */
+export async function master(key: string, salt: Uint8Array, costs: Costs = COSTS): Promise<Uint8Array> {
+  const inRange =
+    salt.length === SALT_BYTES &&
+    costs.passes >= 1 && costs.passes <= 4 &&
+    costs.memoryKib >= 8192 && costs.memoryKib <= 262144 &&
+    costs.lanes >= 1 && costs.lanes <= 16 &&
+    costs.passes * costs.memoryKib <= 786432;
+  if (!inRange) throw new InputError('The parameters of key derivation are out of range.');
+  return argon2id({
+    password: keyBytes(key),
+    salt,
+    iterations: costs.passes,
+    memorySize: costs.memoryKib,
+    parallelism: costs.lanes,
+    hashLength: 32,
+    outputType: 'binary',
+  });
+}
+
+/** `length` bytes for one use of a uniformly random `secret`. */
+export function expand(secret: Uint8Array, label: string, length: number): Uint8Array {
+  // By hand, because the library's refuses secrets of less than 32 bytes, and data keys have 16.
+  let [block, found] = [new Uint8Array(0), new Uint8Array(0)] as Uint8Array[];
+  for (let counter = 1; found.length < length; counter++) {
+    block = hmac(sha256, secret, joined(block, ascii(`keyss/v1/${label}`), Uint8Array.of(counter)));
+    found = joined(found, block);
+  }
+  return found.slice(0, length);
+}

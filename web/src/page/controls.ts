@@ -1,0 +1,124 @@
+/** Moving the camera by mouse, touch and keyboard: around what it looks at, or flying. */
+import { add, axes, difference, length, type Pose, turned, type Vector } from './pose.ts';
+
+const TURN = 0.005; // radians for each pixel
+const KEY_TURN = 0.08; // radians for each press of an arrow key
+const KEY_STEP = 0.06; // of the distance for each press
+const KEY_ZOOM = 1.1;
+const [NEAREST, FURTHEST] = [1e-4, 1e5];
+
+interface Pointer {
+  x: number;
+  y: number;
+}
+
+export class Controls {
+  flying = false;
+  private readonly pointers = new Map<number, Pointer>();
+
+  /** `moved` is told of every new pose; `home` gives the first one again. */
+  constructor(
+    canvas: HTMLCanvasElement, private pose: Pose, private readonly moved: (pose: Pose) => void,
+    private readonly home: () => Pose,
+  ) {
+    canvas.style.touchAction = 'none';
+    canvas.addEventListener('pointerdown', (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    });
+    canvas.addEventListener('pointermove', (event) => this.dragged(event, canvas.clientHeight));
+    for (const name of ['pointerup', 'pointercancel'] as const) {
+      canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+    }
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
+    canvas.addEventListener('wheel', (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(event.deltaY * 0.001));
+    }, { passive: false });
+    canvas.addEventListener('keydown', (event) => this.pressed(event));
+  }
+
+  setPose(pose: Pose): void {
+    this.pose = pose;
+    this.moved(pose);
+  }
+
+  private dragged(event: PointerEvent, height: number): void {
+    const before = this.pointers.get(event.pointerId);
+    if (before === undefined) return;
+    const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
+    if (this.pointers.size === 2) this.pinched(event, dx, dy, height);
+    else if (event.shiftKey || event.buttons & 6) this.slide(-dx / height, -dy / height);
+    else if (this.flying) this.look(-dx * TURN, -dy * TURN);
+    else this.orbit(dx * TURN, dy * TURN);
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  }
+
+  private pinched(event: PointerEvent, dx: number, dy: number, height: number): void {
+    const other = [...this.pointers].find(([id]) => id !== event.pointerId)![1];
+    const own = this.pointers.get(event.pointerId)!;
+    const span = (x: number, y: number): number => Math.max(1, Math.hypot(x - other.x, y - other.y));
+    this.zoom(span(own.x, own.y) / span(event.clientX, event.clientY));
+    this.slide(-dx / (2 * height), -dy / (2 * height));
+  }
+
+  private pressed(event: KeyboardEvent): void {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    // Around a thing, an arrow moves the camera; in flight it turns the head.
+    const turn = (azimuth: number, elevation: number): void =>
+      this.flying ? this.look(-azimuth, elevation) : this.orbit(azimuth, elevation);
+    const actions: Record<string, () => void> = {
+      ArrowLeft: () => turn(KEY_TURN, 0),
+      ArrowRight: () => turn(-KEY_TURN, 0),
+      ArrowUp: () => turn(0, KEY_TURN),
+      ArrowDown: () => turn(0, -KEY_TURN),
+      w: () => this.fly(0, 0, KEY_STEP),
+      s: () => this.fly(0, 0, -KEY_STEP),
+      a: () => this.fly(-KEY_STEP, 0, 0),
+      d: () => this.fly(KEY_STEP, 0, 0),
+      q: () => this.fly(0, KEY_STEP, 0),
+      e: () => this.fly(0, -KEY_STEP, 0),
+      '+': () => this.zoom(1 / KEY_ZOOM),
+      '=': () => this.zoom(1 / KEY_ZOOM),
+      '-': () => this.zoom(KEY_ZOOM),
+      Home: () => this.setPose(this.home()),
+    };
+    const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+    if (action === undefined) return;
+    event.preventDefault();
+    action();
+  }
+
+  private orbit(azimuth: number, elevation: number): void {
+    const { eye, target, up } = this.pose;
+    this.setPose({ eye: add(target, turned(difference(eye, target), up, azimuth, elevation)), target, up });
+  }
+
+  private look(azimuth: number, elevation: number): void {
+    const { eye, target, up } = this.pose;
+    this.setPose({ eye, target: add(eye, turned(difference(target, eye), up, -azimuth, elevation)), up });
+  }
+
+  private zoom(factor: number): void {
+    const { eye, target } = this.pose;
+    const offset = difference(eye, target);
+    const distance = length(offset);
+    const bounded = Math.min(Math.max(distance * factor, NEAREST), FURTHEST);
+    if (this.flying) this.fly(0, 0, 1 - factor);
+    else this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
+  }
+
+  private slide(right: number, down: number): void {
+    this.fly(right, down, 0);
+  }
+
+  /** By shares of the distance of what the camera looks at. */
+  private fly(right: number, down: number, forward: number): void {
+    const { eye, target } = this.pose;
+    const directions = axes(this.pose);
+    const distance = length(difference(target, eye));
+    let step: Vector = add([0, 0, 0], directions.right, right * distance);
+    step = add(add(step, directions.down, down * distance), directions.forward, forward * distance);
+    this.setPose({ ...this.pose, eye: add(eye, step), target: add(target, step) });
+  }
+}

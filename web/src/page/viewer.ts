@@ -1,0 +1,249 @@
+/** The picture: PlayCanvas draws one model, or two of them side by side. */
+import {
+  AppBase, AppOptions, CameraComponentSystem, Color, createGraphicsDevice, Entity, GAMMA_SRGB, GSplatComponentSystem,
+  GSplatData, GSplatResource, Layer, Mat4, Quat, RESOLUTION_FIXED, TONEMAP_NONE, Vec4,
+} from 'playcanvas';
+import { coefficients, type Gaussians, mostVisible } from '../core/gaussians.ts';
+import { axes, FIELD_OF_VIEW, type Pose } from './pose.ts';
+
+const NEAREST = 1e-3; // of the distance of what the camera looks at
+const FURTHEST = 1e4;
+const SLOW = 120; // milliseconds of a frame beyond which pictures in motion are coarser
+const COARSE = 0.5; // of the resolution, then
+const COARSE_COUNT = 30_000; // and so many Gaussians at most, those that are seen most
+const POLL = 4; // milliseconds
+const AT_REST = 250; // milliseconds without a change after which pictures are fine
+export type Side = 'left' | 'right';
+
+interface Half {
+  readonly layer: Layer;
+  readonly camera: Entity;
+  model: Gaussians | null;
+  splats: Entity | null;
+  coarse: Entity | null; // few of its Gaussians, made when they are needed
+}
+
+export class Viewer {
+  private readonly halves: Record<Side, Half>;
+  private scale = 1;
+  private moving = false;
+  private lastChange = 0;
+  private inFlight = false; // a frame that is being drawn
+  private wanted = false; // another one after it
+  private started = 0;
+  private slowFrames = 0;
+  private split = 1; // share of the width that the left model has
+  private whenReady: (() => void)[] = [];
+  private ready = false;
+
+  private constructor(private readonly app: AppBase, readonly canvas: HTMLCanvasElement) {
+    this.halves = { left: this.half('left', 0), right: this.half('right', 1) };
+    app.autoRender = false;
+    const system = app.systems.gsplat as GSplatComponentSystem;
+    system.on('frame:request', () => this.draw());
+    system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
+    app.on('frameend', () => this.afterFrame());
+    app.start();
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    this.resize();
+  }
+
+  /** Raises an error where there is no WebGL 2. */
+  static async on(canvas: HTMLCanvasElement): Promise<Viewer> {
+    const device = await createGraphicsDevice(canvas, {
+      deviceTypes: ['webgl2'], antialias: false, depth: true, alpha: false,
+    } as object);
+    const options = new AppOptions();
+    options.graphicsDevice = device;
+    options.componentSystems = [CameraComponentSystem, GSplatComponentSystem];
+    const app = new AppBase(canvas);
+    app.init(options);
+    const splats = app.scene.gsplat;
+    splats.dataFormat = 'large';
+    splats.minPixelSize = 0;
+    splats.minContribution = 0;
+    return new Viewer(app, canvas);
+  }
+
+  /** Shows a model, or nothing, on one side; the right side is hidden while it has none. */
+  show(model: Gaussians | null, side: Side = 'left'): void {
+    const half = this.halves[side];
+    const before = [half.splats, half.coarse];
+    half.model = model;
+    half.coarse = null;
+    half.splats = model && this.splats(model, half.layer);
+    for (const entity of before) {
+      if (!entity) continue;
+      const old = (entity.gsplat as unknown as { resource: GSplatResource }).resource;
+      entity.destroy();
+      old.destroy();
+    }
+    this.layOut();
+    this.touch();
+  }
+
+  private splats(model: Gaussians, layer: Layer): Entity {
+    const entity = new Entity();
+    entity.addComponent('gsplat', { layers: [layer.id] });
+    (entity.gsplat as unknown as { resource: unknown }).resource = new GSplatResource(
+      this.app.graphicsDevice, elements(model),
+    );
+    this.app.root.addChild(entity);
+    return entity;
+  }
+
+  /** Where the border between the two models lies, 0 to 1 of the width from the left. */
+  setSplit(share: number): void {
+    this.split = share;
+    this.layOut();
+    this.touch();
+  }
+
+  setPose(pose: Pose, side: Side = 'left'): void {
+    const { right, down, forward } = axes(pose);
+    const matrix = new Mat4();
+    matrix.set([
+      ...right, 0, -down[0], -down[1], -down[2], 0, -forward[0], -forward[1], -forward[2], 0, ...pose.eye, 1,
+    ]);
+    const distance = Math.hypot(...pose.eye.map((each, axis) => each - pose.target[axis]));
+    const { camera } = this.halves[side];
+    camera.setPosition(...pose.eye);
+    camera.setRotation(new Quat().setFromMat4(matrix));
+    camera.camera!.nearClip = NEAREST * distance;
+    camera.camera!.farClip = FURTHEST * distance;
+    this.touch();
+  }
+
+  /** When a fine picture of the model and the pose of now is on the canvas. */
+  settled(): Promise<void> {
+    return new Promise((resolve) => {
+      this.whenReady.push(resolve);
+      this.draw();
+    });
+  }
+
+  /** The picture of now in full resolution, as PNG. */
+  async snapshot(): Promise<Blob> {
+    await this.settled();
+    return new Promise((resolve, reject) => {
+      this.app.once('frameend', () =>
+        this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('no picture'))), 'image/png'),
+      );
+      this.draw(); // into the buffer, which is empty between frames
+    });
+  }
+
+  private half(name: Side, order: number): Half {
+    const layer = new Layer({ name });
+    this.app.scene.layers.push(layer);
+    const camera = new Entity(`camera ${name}`);
+    camera.addComponent('camera', {
+      clearColor: new Color(0, 0, 0, 1), fov: FIELD_OF_VIEW, layers: [layer.id], priority: order,
+      gammaCorrection: GAMMA_SRGB, toneMapping: TONEMAP_NONE,
+    });
+    // Without this internal switch the engine leaves the scissor rectangle aside.
+    (camera.camera as unknown as { camera: { _scissorRectClear: boolean } }).camera._scissorRectClear = true;
+    this.app.root.addChild(camera);
+    return { layer, camera, model: null, splats: null, coarse: null };
+  }
+
+  private layOut(): void {
+    const { left, right } = this.halves;
+    const share = right.splats ? this.split : 1;
+    left.camera.camera!.scissorRect = new Vec4(0, 0, share, 1);
+    right.camera.camera!.scissorRect = new Vec4(share, 0, 1 - share, 1);
+    left.camera.enabled = share > 0;
+    right.camera.enabled = share < 1;
+  }
+
+  private touch(): void {
+    this.lastChange = performance.now();
+    this.moving = true;
+    this.ready = false;
+    this.draw();
+  }
+
+  private draw(): void {
+    this.wanted = this.inFlight;
+    if (this.inFlight) return;
+    this.inFlight = true;
+    this.started = performance.now();
+    this.app.renderNextFrame = true;
+  }
+
+  private resize(): void {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2) * this.scale;
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
+    if (!width || !height) return;
+    this.app.setCanvasResolution(RESOLUTION_FIXED, Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
+    this.draw();
+  }
+
+  private setScale(scale: number): void {
+    if (scale === this.scale) return;
+    this.scale = scale;
+    for (const half of Object.values(this.halves)) {
+      if (half.model === null || half.model.count <= COARSE_COUNT) continue;
+      half.coarse ??= this.splats(mostVisible(half.model, COARSE_COUNT), half.layer);
+      half.coarse.enabled = scale < 1;
+      half.splats!.enabled = scale === 1;
+    }
+    this.resize();
+  }
+
+  /** The next frame is drawn when this one is: else a slow GPU would have a queue of them, and lag behind. */
+  private afterFrame(): void {
+    const gl = (this.app.graphicsDevice as unknown as { gl: WebGL2RenderingContext }).gl;
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const poll = (): void => {
+      if (fence !== null && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
+        setTimeout(poll, POLL);
+        return;
+      }
+      gl.deleteSync(fence);
+      this.drawn();
+    };
+    setTimeout(poll, 0);
+  }
+
+  private drawn(): void {
+    const now = performance.now();
+    this.inFlight = false;
+    this.canvas.dataset.frames = String(Number(this.canvas.dataset.frames ?? 0) + 1);
+    if (this.moving) {
+      this.slowFrames = now - this.started > SLOW ? this.slowFrames + 1 : 0;
+      if (this.slowFrames > 1 && now - this.lastChange < AT_REST) this.setScale(COARSE);
+      if (now - this.lastChange > AT_REST) {
+        this.moving = false;
+        this.slowFrames = 0;
+        this.setScale(1);
+      }
+      this.draw();
+    } else if (this.whenReady.length) {
+      if (this.ready) for (const resolve of this.whenReady.splice(0)) resolve();
+      else this.draw();
+    } else if (this.wanted) this.draw();
+  }
+}
+
+/** A model as PlayCanvas has it: columns by the names of the .ply. */
+function elements(model: Gaussians): GSplatData {
+  const { count, shDegree } = model;
+  const k = coefficients(shDegree);
+  const properties: { name: string; type: string; storage: Float32Array; byteSize: number }[] = [];
+  const put = (name: string, from: Float32Array, width: number, offset: number): void => {
+    const storage = new Float32Array(count);
+    for (let row = 0; row < count; row++) storage[row] = from[row * width + offset];
+    properties.push({ name, type: 'float', storage, byteSize: 4 });
+  };
+  ['x', 'y', 'z'].forEach((name, axis) => put(name, model.means, 3, axis));
+  for (let axis = 0; axis < 3; axis++) put(`scale_${axis}`, model.logScales, 3, axis);
+  for (let part = 0; part < 4; part++) put(`rot_${part}`, model.quats, 4, part);
+  put('opacity', model.opacityLogits, 1, 0);
+  for (let colour = 0; colour < 3; colour++) {
+    put(`f_dc_${colour}`, model.sh, 3 * k, colour);
+    for (let each = 1; each < k; each++) put(`f_rest_${colour * (k - 1) + each - 1}`, model.sh, 3 * k, 3 * each + colour);
+  }
+  return new GSplatData([{ name: 'vertex', count, properties }] as never);
+}

@@ -1,0 +1,17 @@
+/** What the page and its worker tell each other. */
+import type { Gaussians } from './core/gaussians.ts';
+
+/** The port of the worker that derives keys; bytes of a file to be read; or a key to be tried on the one before. */
+export interface Question {
+  readonly id: number;
+  readonly port?: MessagePort;
+  readonly bytes?: Uint8Array;
+  readonly key?: string;
+}
+
+export interface Answer {
+  readonly id: number;
+  readonly model?: Gaussians;
+  readonly file?: { readonly name: string; readonly data: Uint8Array };
+  readonly error?: string; // one sentence
+}

@@ -1,0 +1,145 @@
+/** From records to Gaussians; see docs/format.md, "Records of Gaussians". */
+import { halfFloat, viewOf } from '../core/bytes.ts';
+import { InputError } from '../core/errors.ts';
+import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+
+const BANDS = [1, 3, 5, 7]; // coefficients of each degree
+const CHROMA_FEWER = 2; // bits of the differences of colours
+const MOST_BITS = 24;
+const TABLE_BYTES = 8;
+const LINE_BYTES = 12;
+const FURTHEST = 1e30; // no number that a line may give is larger
+const [BRIGHTNESS, RED_GREEN, BLUE] = [1 / Math.sqrt(3), 1 / Math.sqrt(2), 1 / Math.sqrt(6)];
+
+/** Codes 0 to 2^bits - 1 for numbers around a centre, evenly or by sinh. */
+export class Line {
+  constructor(readonly centre: number, readonly spread: number, readonly reach: number) {
+    const bounded =
+      Math.abs(centre) < FURTHEST && spread >= 0 && spread < FURTHEST && reach > 0 && reach < FURTHEST;
+    const steep = spread > 0 && (reach > 60 || spread * Math.sinh(reach) > FURTHEST);
+    if (!bounded || steep) throw damagedHeader();
+  }
+
+  value(code: number, bits: number): number {
+    const position = (code * (2 / (2 ** bits - 1)) - 1) * this.reach;
+    return (this.spread > 0 ? Math.sinh(position) * this.spread : position) + this.centre;
+  }
+}
+
+const QUAT_LINE = new Line(0, 0, Math.sqrt(0.5));
+
+/** (columns, bits) in the order of a record. */
+export type Layout = readonly (readonly [number, number])[];
+
+/** How the Gaussians of one secret are written. */
+export class Codec {
+  private constructor(
+    readonly bits: readonly number[], // of positions, log scales, quaternions, opacity, then of each degree
+    private readonly lines: readonly Line[],
+    private readonly far: readonly Line[], // with the reach that outliers have
+  ) {}
+
+  /** From a header, of which what follows is ignored. Raises InputError. */
+  static unpack(data: Uint8Array): Codec {
+    if (data.length < TABLE_BYTES) throw damagedHeader();
+    let count = TABLE_BYTES;
+    while (count > 0 && data[count - 1] === 0) count--;
+    const bits = [...data.subarray(0, count)];
+    const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MOST_BITS);
+    if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damagedHeader();
+    const size = Codec.packedSize(bits.length - 5);
+    if (data.length < size) throw damagedHeader();
+    const view = viewOf(data);
+    const [lines, far]: Line[][] = [[], []];
+    for (let at = TABLE_BYTES; at < size; at += LINE_BYTES) {
+      const [centre, spread] = [view.getFloat32(at, true), view.getFloat32(at + 4, true)];
+      lines.push(new Line(centre, spread, halfFloat(view.getUint16(at + 8, true))));
+      far.push(new Line(centre, spread, halfFloat(view.getUint16(at + 10, true))));
+    }
+    return new Codec(bits, lines, far);
+  }
+
+  static packedSize(shDegree: number): number {
+    return TABLE_BYTES + LINE_BYTES * (7 + 2 * shDegree);
+  }
+
+  get shDegree(): number {
+    return this.bits.length - 5;
+  }
+
+  get layout(): Layout {
+    const [means, logScales, quats, opacity, ...colours] = this.bits;
+    const shape: [number, number][] = [
+      [1, 1], [1, 2], [3, quats], [1, means], [1, means], [1, means], [3, logScales], [1, opacity],
+    ];
+    colours.forEach((bits, band) => shape.push([BANDS[band], bits], [2 * BANDS[band], bits - CHROMA_FEWER]));
+    return shape;
+  }
+
+  get recordBytes(): number {
+    return Math.ceil(this.layout.reduce((sum, [columns, bits]) => sum + columns * bits, 0) / 8);
+  }
+
+  /** The Gaussians of records, whatever bytes they are. */
+  decode(records: readonly Uint8Array[]): Gaussians {
+    const { layout } = this;
+    const columns = layout.reduce((sum, [count]) => sum + count, 0);
+    const codes = new Uint32Array(columns);
+    const found = emptyGaussians(records.length, this.shDegree);
+    records.forEach((record, row) => {
+      unpackCodes(record, layout, codes);
+      this.put(found, row, codes);
+    });
+    return found;
+  }
+
+  /** Writes the Gaussian of these codes, one for each column of the layout, into a row. */
+  put(to: Gaussians, row: number, codes: ArrayLike<number>): void {
+    const [means, logScales, quatBits, opacity, ...colours] = this.bits;
+    const lines = codes[0] ? this.far : this.lines;
+    const quat = wholeQuat(codes[1], [2, 3, 4].map((at) => QUAT_LINE.value(codes[at], quatBits)));
+    to.quats.set(quat, 4 * row);
+    for (let axis = 0; axis < 3; axis++) {
+      to.means[3 * row + axis] = lines[axis].value(codes[5 + axis], means);
+      to.logScales[3 * row + axis] = lines[3].value(codes[8 + axis], logScales);
+    }
+    to.opacityLogits[row] = lines[4].value(codes[11], opacity);
+    let [at, coefficient] = [12, row * coefficients(this.shDegree)];
+    colours.forEach((bits, band) => {
+      const [bright, different] = [lines[5 + 2 * band], lines[6 + 2 * band]];
+      for (let index = 0; index < BANDS[band]; index++, coefficient++) {
+        const a = bright.value(codes[at + index], bits);
+        const first = at + BANDS[band] + 2 * index;
+        const b = different.value(codes[first], bits - CHROMA_FEWER);
+        const c = different.value(codes[first + 1], bits - CHROMA_FEWER);
+        to.sh[3 * coefficient] = a * BRIGHTNESS + b * RED_GREEN + c * BLUE;
+        to.sh[3 * coefficient + 1] = a * BRIGHTNESS - b * RED_GREEN + c * BLUE;
+        to.sh[3 * coefficient + 2] = a * BRIGHTNESS - 2 * c * BLUE;
+      }
+      at += 3 * BANDS[band];
+    });
+  }
+}
+
+function unpackCodes(record: Uint8Array, layout: Layout, codes: Uint32Array): void {
+  let [bit, column] = [0, 0];
+  for (const [count, bits] of layout) {
+    for (let index = 0; index < count; index++) {
+      let code = 0;
+      for (let left = bits; left > 0; left--, bit++) code = code * 2 + ((record[bit >> 3] >> (7 - (bit & 7))) & 1);
+      codes[column++] = code;
+    }
+  }
+}
+
+function wholeQuat(leftOut: number, three: number[]): number[] {
+  const squares = three[0] * three[0] + three[1] * three[1] + three[2] * three[2];
+  const quat = three.slice();
+  quat.splice(leftOut, 0, Math.sqrt(Math.max(0, 1 - squares)));
+  const length = Math.max(0.5, Math.sqrt(quat.reduce((sum, each) => sum + each * each, 0)));
+  return quat.map((each) => each / length);
+}
+
+export function damagedHeader(): InputError {
+  return new InputError('What this key opens is damaged.');
+}
