@@ -187,8 +187,7 @@ def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: Ro
     both = (written[0] != 0) & (written[1] != 0)
     small = [each[both].clip(-0.03, 0.03) for each in written]  # salts move by more
     assert abs(np.corrcoef(small[0], small[1])[0, 1]) < 0.1
-    # Ten bits of each number stay, so that a noise of 0.055 has few hundred values.
-    assert float((written[0] == written[1])[both].float().mean()) < 0.03
+    assert float((written[0] == written[1])[both].float().mean()) < 0.01
 
 
 def test_entropy_decides_everything(prepared: RobustCover) -> None:
@@ -199,8 +198,13 @@ def test_entropy_decides_everything(prepared: RobustCover) -> None:
 def test_what_was_destroyed_is_told_from_what_was_never_there(
     stego: Gaussians, prepared: RobustCover
 ) -> None:
-    with pytest.raises(InputError, match="the key is right, but too much"):
-        extract(noise("log scale", 0.03)(random_pruning(0.4, 1)(stego)), key("a"))
+    """Headers stand a little more loss than payloads; now and then one is lost first all the same."""
+    told = 0
+    for seed in range(5):
+        with pytest.raises((InputError, WrongKeyError)) as error:
+            extract(random_pruning(0.45, seed)(stego), key("a"))
+        told += "the key is right, but too much" in str(error.value)
+    assert told >= 3
     with pytest.raises(WrongKeyError):
         extract(prepared.model, key("a"))
 
