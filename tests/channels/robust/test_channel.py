@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from channels.robust.made import cover, key
 from keyss.channels.robust import RobustCover, capacity, embed, extract
+from keyss.channels.robust.carriers import Numbers
+from keyss.channels.robust.salts import SALTS, Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.measure.robustness.changes import cropping, half_floats, noise, opacity_pruning, random_pruning
@@ -182,7 +185,13 @@ def test_equal_keys_and_none_are_refused(prepared: RobustCover) -> None:
 
 
 def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: RobustCover) -> None:
-    first, second = (prepared.embed([(key("a"), b"same")], strength=STRENGTH) for _ in range(2))
+    """But for what lies under a salt that two files share by chance, which is told (docs/robust.md)."""
+    many = [prepared.embed([(key("a"), b"same")], strength=STRENGTH) for _ in range(6)]
+    salts = [set(Salts.of(Numbers.of(each)).salts) for each in many]
+    shared = {pair: len(salts[pair[0]] & salts[pair[1]]) for pair in combinations(range(6), 2)}
+    assert max(shared.values()) < SALTS // 4
+    first, second = (many[index] for index in min(shared, key=lambda pair: shared[pair]))
+    assert min(shared.values()) == 0
     written = [(each.sh[:, 0] - prepared.model.sh[:, 0])[:, 1:].flatten() for each in (first, second)]
     both = (written[0] != 0) & (written[1] != 0)
     small = [each[both].clip(-0.03, 0.03) for each in written]  # salts move by more
