@@ -154,7 +154,7 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     sizes = [len(each) for each in vars(found.parameters.two_sample).values()]
     assert sizes == [2, 1, 2]
     assert found.leaks is not None
-    assert [row.attack for row in found.leaks.secrets[0] if row.with_key] == ["with the key"]
+    assert not any(row.with_key for row in found.leaks.secrets[0])  # records never lie in the cover's frame
     assert found.images is not None
     pictures = {item.file for view in found.images.pictures for item in view.items}
     pictures |= {str(row.picture) for row in found.leaks.secrets[0]}

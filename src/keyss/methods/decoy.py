@@ -13,6 +13,7 @@ from keyss.methods.base import Frame, Remains
 
 _STRENGTH = 0.02  # standard deviation of the changes of opacity logits
 _MOVE = 1e-4  # of turns (radians), shifts (of the model's size) and changes of scale
+_FAINT = 1.6 * DRAWN_OPACITY  # appended Gaussians are below it, and no part of the cover
 _KNOTS, _LOGITS = 16, 10.0  # the changes are a piecewise linear function of logits from -10 to 10
 
 
@@ -47,7 +48,7 @@ class Decoy:
         left = place.long().clamp_max(_KNOTS - 2)
         change = torch.lerp(self.changes[left], self.changes[left + 1], place - left)
         shown = replace(stego, opacity_logits=stego.opacity_logits + change)
-        if (drawn := shown.opacities >= DRAWN_OPACITY).any():
+        if (drawn := stego.opacities > _FAINT).any():
             shown = shown[drawn]
         return shown if frame == "cover" else self.frame.inverse().apply_gaussians(shown)
 
