@@ -13,7 +13,7 @@ from keyss.methods.base import Frame, Remains
 
 _STRENGTH = 0.02  # standard deviation of the changes of opacity logits
 _MOVE = 1e-4  # of turns (radians), shifts (of the model's size) and changes of scale
-_FAINT = 1.6 * DRAWN_OPACITY  # appended Gaussians are below it, and no part of the cover
+_FAINT = 1.6 * DRAWN_OPACITY  # appended Gaussians are below it
 _KNOTS, _LOGITS = 16, 10.0  # the changes are a piecewise linear function of logits from -10 to 10
 
 
@@ -27,10 +27,11 @@ class Decoy:
 
     frame: Similarity
     changes: torch.Tensor  # [_KNOTS] of opacity logits
+    appended: bool = False  # whether there are Gaussians that are no part of the cover
     decode: None = None
 
     @staticmethod
-    def of(stego: Gaussians, key: DerivedKey) -> Decoy:
+    def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False) -> Decoy:
         """The decoy of a wrong key: the same model and key give the same."""
         generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
         changes = _STRENGTH * torch.randn(_KNOTS, generator=generator)
@@ -39,7 +40,7 @@ class Decoy:
         skew[[2, 0, 1], [1, 2, 0]] = turn
         size = (stego.means - stego.means.mean(0)).norm(dim=1).median().double().clamp_min(1e-9).cpu()
         scale = 1 + _MOVE + abs(float(shift.mean()))  # never so near to 1 that log scales stay the same
-        return Decoy(Similarity(scale, torch.matrix_exp(skew - skew.T), shift * size), changes)
+        return Decoy(Similarity(scale, torch.matrix_exp(skew - skew.T), shift * size), changes, appended)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The drawn Gaussians of the cover, all changed; see `Opened.reveal`."""
@@ -48,7 +49,10 @@ class Decoy:
         left = place.long().clamp_max(_KNOTS - 2)
         change = torch.lerp(self.changes[left], self.changes[left + 1], place - left)
         shown = replace(stego, opacity_logits=stego.opacity_logits + change)
-        if (drawn := stego.opacities > _FAINT).any():
+        drawn = shown.opacities >= DRAWN_OPACITY
+        if self.appended:
+            drawn = stego.opacities > _FAINT
+        if drawn.any():
             shown = shown[drawn]
         return shown if frame == "cover" else self.frame.inverse().apply_gaussians(shown)
 

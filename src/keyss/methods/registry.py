@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from keyss.channels.appended import AppendedReader
 from keyss.channels.base import Content
 from keyss.channels.opening import open_content, quick_attempts
 from keyss.core.errors import InputError, UsageError, WrongKeyError
@@ -46,7 +47,7 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
         try:
             return _unpacked(reader.extract(derived))
         except WrongKeyError:
-            return Decoy.of(stego, derived)
+            return Decoy.of(stego, derived, appended=isinstance(reader, AppendedReader))
     raise WrongKeyError("this key opens nothing here")
 
 
