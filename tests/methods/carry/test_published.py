@@ -9,7 +9,7 @@ import torch
 
 import keyss
 from channels.codes.published import model_of
-from keyss import CarryOptions
+from keyss import CarryOptions, api
 from keyss.channels.codes.order import Counted
 from keyss.channels.codes.published import SUFFIXES, prepare
 from keyss.core import InputError, UsageError
@@ -40,6 +40,12 @@ def test_hide_reveal_verify_and_info(publish: str, tmp_path: Path) -> None:
         keyss.reveal(stego, "another key")
     assert keyss.info(stego).kind == "3DGS model"
     assert keyss.info(tmp_path / "run").kind == "hiding"
+
+
+@EVERY
+def test_what_was_made_in_memory_opens_there(publish: str) -> None:
+    found = api.hide_files(model_of(3000), [api.SecretFile(b"a note", "key one")], publish=publish)  # type: ignore[arg-type]
+    assert api.reveal_file(found.stego, "key one").data == b"a note"
 
 
 @EVERY

@@ -41,8 +41,8 @@ class Codes:
 class CodedGaussians(Gaussians):
     """The model of a file, and the codes that it has there.
 
-    Whatever makes another model of it, its own methods included, gives `Gaussians` without codes: they are
-    those of a file that nobody has changed.
+    Whatever makes another model of it, its own methods but `to` included, gives `Gaussians` without codes:
+    they are those of a file that nobody has changed.
     """
 
     __slots__ = ("codes",)  # and not in vars(), which are the tensors
@@ -55,6 +55,9 @@ class CodedGaussians(Gaussians):
         found = CodedGaussians(*(getattr(model, each.name) for each in fields(model)))
         object.__setattr__(found, "codes", codes)
         return found
+
+    def to(self, device: torch.device | str) -> CodedGaussians:
+        return CodedGaussians.of(super().to(device), self.codes)
 
 
 def _same(a: Any, b: Any) -> bool:
