@@ -46,6 +46,8 @@ def test_hide_reveal_verify_and_info(publish: str, tmp_path: Path) -> None:
 def test_what_was_made_in_memory_opens_there(publish: str) -> None:
     found = api.hide_files(model_of(3000), [api.SecretFile(b"a note", "key one")], publish=publish)  # type: ignore[arg-type]
     assert api.reveal_file(found.stego, "key one").data == b"a note"
+    with pytest.raises(keyss.WrongKeyError):  # another model, of which the codes are none
+        api.reveal_file(found.stego.with_sh_degree(0), "key one")
 
 
 @EVERY

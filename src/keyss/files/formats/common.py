@@ -56,8 +56,9 @@ class CodedGaussians(Gaussians):
         object.__setattr__(found, "codes", codes)
         return found
 
-    def to(self, device: torch.device | str) -> CodedGaussians:
-        return CodedGaussians.of(super().to(device), self.codes)
+    def to(self, device: torch.device | str) -> Gaussians:
+        moved = super().to(device)
+        return CodedGaussians.of(moved, self.codes) if hasattr(self, "codes") else moved  # after `replace`
 
 
 def _same(a: Any, b: Any) -> bool:
