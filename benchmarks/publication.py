@@ -12,28 +12,13 @@ pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or 
 from __future__ import annotations
 
 import argparse
-import statistics
 from pathlib import Path
 
-import torch
-
+from codes import against_photos
 from keyss import reveal
-from keyss.core import Gaussians, Scene
 from keyss.core.errors import BackendError, KeyssError
-from keyss.measure.images import psnr
 from keyss.measure.robustness.conversions import Converter, converters
-from keyss.rendering import render
 from keyss.runs.opening import HidingRun, open_run
-
-
-@torch.no_grad()
-def against_photos(model: Gaussians, scene: Scene) -> float:
-    """Mean PSNR over the test views."""
-    found = []
-    for view in scene.test:
-        image = (render(model, view.camera, scene.background).clamp(0, 1) * 255).round() / 255
-        found.append(float(psnr(image, view.image.float() / 255)))
-    return statistics.mean(found)
 
 
 def row(run: HidingRun, name: str, converter: Converter | None) -> str:
