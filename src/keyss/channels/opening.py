@@ -1,4 +1,4 @@
-"""What a key opens in a model, in whichever channel it lies."""
+"""Opening with a key, in whichever channel of a model the secret lies."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _SMALLER = (
     "keys can notice that there are other secrets"
 )
 _ANY = '`publish="any"` has room for all'
-APPENDED = "what the keys open lies in appended Gaussians instead, and everybody can see that they are there"
+APPENDED = "the secrets lie in appended Gaussians instead, and everybody can see that they are there"
 
 
 def prepared_cover(cover: Gaussians, entropy: bytes) -> LowBitsCover:
