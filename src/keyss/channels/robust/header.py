@@ -1,4 +1,4 @@
-"""What a key is tried on first: a file key and how to read the rest, in a few Gaussians that the key chooses.
+"""The header, on which a key is tried first: how to read the rest, in a few Gaussians that the key chooses.
 
 There is a *header* under each of a few salts, and all say the same. So they are parts of one code
 (`fountain`) and are read together: what one salt's Gaussians have lost, another's make up for. Salts that
