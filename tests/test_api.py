@@ -151,7 +151,7 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     heads = [data[: data.index(b"end_header")].splitlines() for data in (right, wrong)]
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
     decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "stego.ply")
-    stego = whole[whole.opacities >= 1 / 255]
+    stego = whole[whole.opacities > 1.6 / 255]  # without what is appended
     assert len(decoy) == len(stego)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
         assert (getattr(decoy, name) != getattr(stego, name)).float().mean() > 0.9, name
