@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from keyss.channels.robust.fountain import Fountain, equations, mixed
+from keyss.channels.mixing import mixed
+from keyss.channels.robust.fountain import Fountain, equations
 
 
 def _random_bits(count: int, seed: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from keyss.channels.appended.lattice import WORD_BITS, Bits, Words, bits_of, number
-from keyss.channels.robust.fountain import mixed
+from keyss.channels.mixing import mixed
 
 Bytes = npt.NDArray[np.uint8]
 

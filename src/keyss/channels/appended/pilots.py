@@ -26,7 +26,7 @@ from keyss.channels.appended.lattice import (
     Words,
     bits_of,
 )
-from keyss.channels.robust.fountain import mixed
+from keyss.channels.mixing import mixed
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 

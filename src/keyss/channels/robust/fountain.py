@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from keyss.channels.mixing import Words, mixed
 from keyss.rendering.cpu.jit import kernel
 
 # Shares of code bits that are sums of 1, 2, ... intermediate bits (Shokrollahi 2006, table I, k = 65,536),
@@ -35,7 +36,6 @@ _RANK = np.uint64(0xD1B54A32D192ED03)
 _BLOCK = 1 << 16  # equations at a time
 
 Bits = npt.NDArray[np.uint8]
-Words = npt.NDArray[np.uint64]
 Ratios = npt.NDArray[np.float32]
 
 
@@ -94,15 +94,6 @@ class Fountain:
         given = np.concatenate([ratios, np.full(self.parity, _SURE)]).astype(np.float32).clip(-_SURE, _SURE)
         total, done = _propagate(starts, members, given, self.length, self.parity, rounds)
         return (total < 0).astype(np.uint8), bool(done)
-
-
-def mixed(words: Words) -> Words:
-    """[...] numbers that look random for different ones: the finaliser of splitmix64 (Steele et al. 2014)."""
-    state = words.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
-    state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-    state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
-    result: Words = state ^ state >> np.uint64(31)
-    return result
 
 
 def equations(

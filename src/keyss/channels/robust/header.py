@@ -21,8 +21,9 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from keyss.channels.mixing import Words, mixed
 from keyss.channels.robust.carriers import Carriers, Doubles, Names
-from keyss.channels.robust.fountain import NOISY, Bits, Fountain, Words, mixed
+from keyss.channels.robust.fountain import NOISY, Bits, Fountain
 from keyss.channels.robust.lattice import COLUMNS, LEVELS, SPACINGS, Lattice, dithers, rank
 from keyss.channels.robust.salts import SALTS
 from keyss.keys.derivation import expand, stream

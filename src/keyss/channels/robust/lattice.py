@@ -20,8 +20,9 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
+from keyss.channels.mixing import Words, mixed
 from keyss.channels.robust.carriers import Carriers, Doubles, Names
-from keyss.channels.robust.fountain import Bits, Ratios, Words, mixed
+from keyss.channels.robust.fountain import Bits, Ratios
 from keyss.keys.derivation import expand
 
 COLUMNS = 2  # numbers of a Gaussian that are written
