@@ -1,5 +1,6 @@
 /** What takes time: files into models, and what keys open in them. Nothing of it outlives the page. */
-import { type Content, LowBitsReader } from './channels/reader.ts';
+import type { Content, Reader } from './channels/content.ts';
+import { readerOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
@@ -7,7 +8,7 @@ import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
 let port: MessagePort | null = null;
-let prepared: Promise<LowBitsReader | null> = Promise.resolve(null);
+let prepared: Promise<Reader | null> = Promise.resolve(null);
 
 function answer(message: Answer, moved: Transferable[] = []): void {
   (self as unknown as Worker).postMessage(message, moved);
@@ -17,7 +18,7 @@ async function load(id: number, bytes: Uint8Array): Promise<void> {
   const model = await readModel(bytes);
   answer({ id, model });
   // Afterwards: the picture comes first.
-  prepared = new Promise((resolve) => setTimeout(() => resolve(LowBitsReader.of(model)), 0));
+  prepared = new Promise((resolve) => setTimeout(() => resolve(readerOf(model)), 0));
 }
 
 /** What a key becomes with a salt, by the worker at the other end of the port that the page gave. */

@@ -28,6 +28,9 @@ export function keyBytes(key: string): Uint8Array {
   return bytes;
 }
 
+/** `master`, or what asks another worker for it. */
+export type Derive = (key: string, salt: Uint8Array) => Promise<Uint8Array>;
+
 /** 32 bytes. Takes some tenths of a second and 64 MiB. */
 export async function master(key: string, salt: Uint8Array, costs: Costs = COSTS): Promise<Uint8Array> {
   const inRange =

@@ -1,5 +1,5 @@
 /** A carried secret, as `keyss reveal` gives it. */
-import type { Content } from '../channels/reader.ts';
+import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
 import { type Gaussians, opacity } from '../core/gaussians.ts';
 import { Codec, damagedHeader } from './codec.ts';

@@ -4,9 +4,10 @@
  * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
  * tried, so that how long it takes tells next to nothing.
  */
-import { bytesKey } from '../core/bytes.ts';
-import { type Gaussians, selected } from '../core/gaussians.ts';
-import { expand, master } from '../keys/derivation.ts';
+import { bytesKey } from '../../core/bytes.ts';
+import { type Gaussians, selected } from '../../core/gaussians.ts';
+import { type Derive, expand, master } from '../../keys/derivation.ts';
+import type { Content, Payload, Reader, Records } from '../content.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
 import { CellCipher } from './cells.ts';
 import {
@@ -23,24 +24,8 @@ const NUMBER_BYTES = 3;
 const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
 
-export interface Records {
-  readonly service: 'records';
-  readonly method: string;
-  readonly header: Uint8Array;
-  readonly records: Uint8Array[]; // in the order of their carriers
-}
-
-export interface Payload {
-  readonly service: 'payload';
-  readonly method: string;
-  readonly data: Uint8Array;
-}
-
-export type Content = Records | Payload;
-type Derive = (key: string, salt: Uint8Array) => Promise<Uint8Array>;
-
 /** The low bits of a model, prepared for any number of keys. */
-export class LowBitsReader {
+export class LowBitsReader implements Reader {
   private constructor(
     private readonly names: Uint8Array, // [N, 16] identities
     private readonly low: Uint8Array, // [N, width]

@@ -1,10 +1,10 @@
 /** Bytes that come out whole or not at all: from chunks to what was encrypted; see docs/format.md, "A payload". */
 import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
-import { ascii, joined, viewOf } from '../core/bytes.ts';
-import { inflated } from '../core/inflate.ts';
-import { expand } from '../keys/derivation.ts';
+import { ascii, joined, viewOf } from '../../core/bytes.ts';
+import { inflated } from '../../core/inflate.ts';
+import { expand } from '../../keys/derivation.ts';
 import { damaged, type PayloadParameters, tooMuchRemoved } from './parameters.ts';
-import { decodeCodeword } from './reed_solomon.ts';
+import { decodeCodeword } from '../reed_solomon.ts';
 
 const ASSOCIATED = ascii('keyss/v1/low-bits');
 

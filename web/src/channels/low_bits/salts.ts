@@ -1,6 +1,6 @@
 /** The Gaussians that serve as the salt of Argon2id; see docs/format.md, "From a key to a data key". */
 import { sha256 } from '@noble/hashes/sha2.js';
-import { ascii, joined } from '../core/bytes.ts';
+import { ascii, joined } from '../../core/bytes.ts';
 import { coarseLength, type Fields, GEOMETRY, IDENTITY_BYTES, UNIT_TOLERANCE } from './bits.ts';
 
 export const SALTS = 12;

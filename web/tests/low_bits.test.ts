@@ -1,7 +1,7 @@
 import { expect, test } from 'vitest';
-import { CellCipher } from '../src/channels/cells.ts';
-import { decrypted } from '../src/channels/payload.ts';
-import { LowBitsReader } from '../src/channels/reader.ts';
+import { CellCipher } from '../src/channels/low_bits/cells.ts';
+import { decrypted } from '../src/channels/low_bits/payload.ts';
+import { LowBitsReader } from '../src/channels/low_bits/reader.ts';
 import { selected, type Gaussians } from '../src/core/gaussians.ts';
 import { readPly, writePly } from '../src/files/ply.ts';
 import { secretOf } from '../src/records/secret.ts';

@@ -1,6 +1,6 @@
 /** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/format.md, "Cells". */
 import { ecb } from '@noble/ciphers/aes.js';
-import { expand } from '../keys/derivation.ts';
+import { expand } from '../../keys/derivation.ts';
 import { IDENTITY_BYTES } from './bits.ts';
 
 const BLOCK = 16;

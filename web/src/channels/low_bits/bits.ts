@@ -3,8 +3,8 @@
  * See docs/format.md, "Low bits".
  */
 import { blake2b } from '@noble/hashes/blake2.js';
-import { ascii } from '../core/bytes.ts';
-import { coefficients, type Gaussians } from '../core/gaussians.ts';
+import { ascii } from '../../core/bytes.ts';
+import { coefficients, type Gaussians } from '../../core/gaussians.ts';
 
 export const IDENTITY_BYTES = 16;
 export const GEOMETRY = 8; // fields before the harmonics: three scales, four parts of a quaternion, opacity

@@ -1,6 +1,6 @@
 /** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
-import { bytesKey, joined, viewOf } from '../core/bytes.ts';
-import { InputError } from '../core/errors.ts';
+import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
+import { InputError } from '../../core/errors.ts';
 
 const VERSION = 2;
 const PREFIX_BYTES = 40;
