@@ -1,4 +1,4 @@
-"""The published model in a report: the viewer in a frame, or where else it can be looked at."""
+"""The published model in a report: the viewer in a frame, or how else it can be looked at."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ MOST_EMBEDDED = 32 << 20  # bytes; 130,000 Gaussians of SH degree 3
 class Published:
     """What a report says of the published model."""
 
-    path: str
     page: str | None  # the whole page of the viewer with the model in it
-    why_not: str = ""  # there is none: a sentence
+    instead: str = ""  # where there is none: sentences
 
 
 def published_model(path: Path, up: str) -> Published:
-    """The viewer with a model of at most 32 MiB: what is larger makes a report that takes long to open."""
+    """The viewer with a run's published model, of at most 32 MiB: with more, a report takes long to open."""
+    how = f"`keyss view RUN/publish/{path.name}` shows it."
+    inside = path.resolve().parent == path.parent.parent.resolve() / path.parent.name  # no link to elsewhere
     try:
         with path.open("rb") as file:
-            data = file.read(MOST_EMBEDDED + 1)
+            data = file.read(MOST_EMBEDDED + 1) if inside else b""
     except OSError:
-        return Published(str(path), None, "It is not where it was, or cannot be read.")
-    if len(data) > MOST_EMBEDDED:
-        return Published(str(path), None, f"It has more than {MOST_EMBEDDED >> 20} MiB, too many here.")
+        data = b""
     if not is_shown(path.name, data):
-        return Published(str(path), None, "It is no model that the viewer reads.")
-    return Published(str(path), page_with(data, path.name, up).decode())
+        return Published(None, "It was not in RUN/publish when this page was written.")
+    if len(data) > MOST_EMBEDDED:
+        return Published(None, f"It has more than {MOST_EMBEDDED >> 20} MiB, too many for this page. {how}")
+    return Published(page_with(data, path.name, up).decode())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from keyss.core.errors import InputError
 from keyss.measure.distances import AttributeDistance
@@ -40,7 +40,7 @@ class AuditedRun:
     photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
-    up: Literal["-y", "z", "y"] = "-y"  # the way up in the cover
+    up: str = "-y"  # the way up in the cover: "-y", "z" or "y"
 
 
 @dataclass(frozen=True)
