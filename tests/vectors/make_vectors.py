@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import lzma
 import sys
 import unicodedata
 from dataclasses import fields, replace
@@ -38,6 +39,7 @@ from keyss.files import read_model  # noqa: E402
 from keyss.files.formats import compressed_ply, sog, spz  # noqa: E402
 from keyss.files.ply import read_ply, write_ply  # noqa: E402
 from keyss.methods.learned.payload import pack_secret  # noqa: E402
+from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import unpack_records  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.learned.hiding import some_secret  # noqa: E402
@@ -131,6 +133,7 @@ def main() -> None:
     write_ply(FOLDER / "learned-secret.ply", some_secret(cover).reveal(cover))
     write_revealed(key)
     write_published()
+    write_whole()
 
 
 def write_published() -> None:
@@ -148,6 +151,38 @@ def write_published() -> None:
         (FOLDER / name).write_bytes(data)
         read[name] = digests(read_model(FOLDER / name))
     (FOLDER / "published.json").write_text(json.dumps(read, indent=1) + "\n")
+
+
+def write_whole() -> None:
+    """Models as one string of bytes, and streams of the compression in it that have every kind of chunk."""
+    far = trained_like(40, 8, 0)
+    far.means[3, 1] = -1e5  # an outlier
+    models = [trained_like(40, 9, 3), far, trained_like(10, 10, 1)[:1]]
+    encoded = [whole.encode(each) for each in models]
+    found = {
+        "models": [{"data": data.hex(), "sha256": digests(whole.decode(data).gaussians)} for data in encoded],
+        "streams": [
+            {"data": stream.hex(), "size": len(plain), "sha256": hashlib.sha256(plain).hexdigest()}
+            for stream, plain in lzma_streams()
+        ],
+    }
+    (FOLDER / "whole.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def lzma_streams() -> list[tuple[bytes, bytes]]:
+    """Raw LZMA2 streams of this program's parameters and of others, with what they become."""
+    random = np.random.default_rng(1)
+    words = [bytes(random.integers(97, 110, size).tolist()) for size in random.integers(2, 9, 60)]
+    text = b" ".join(words[i] for i in random.integers(0, len(words), 400))
+    plains = (b"", text, bytes(3 << 20), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
+    others = {"lc": 3, "lp": 1, "pb": 2}
+    packed = [
+        lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole.FILTERS[0], **changed}])
+        for each, changed in zip(plains, ({}, {}, {}, others, others), strict=True)
+    ]
+    # Chunks of all of them in one stream: each begins as the first does.
+    joined = b"".join(each[:-1] for each in packed) + b"\0"
+    return [*zip(packed, plains, strict=True), (joined, b"".join(plains))]
 
 
 def digests(model: Gaussians) -> dict[str, str]:

@@ -10,9 +10,11 @@ import pytest
 
 from keyss.core.errors import KeyssWarning
 from keyss.files import read_model
+from keyss.methods.records import whole
 from vectors.make_vectors import FOLDER, digests, revealed
 
 REVEALED = json.loads((FOLDER / "revealed.json").read_text())
+WHOLE = json.loads((FOLDER / "whole.json").read_text())
 PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
 
@@ -30,3 +32,8 @@ def test_what_keys_open(expected: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_what_published_files_hold(name: str) -> None:
     assert digests(read_model(FOLDER / name)) == PUBLISHED[name]
+
+
+@pytest.mark.parametrize("expected", WHOLE["models"], ids=lambda each: f"{len(each['data']) // 2} bytes")
+def test_what_whole_models_hold(expected: dict[str, Any]) -> None:
+    assert digests(whole.decode(bytes.fromhex(expected["data"])).gaussians) == expected["sha256"]

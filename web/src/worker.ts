@@ -33,11 +33,9 @@ const derive = (key: string, salt: Uint8Array): Promise<Uint8Array> =>
 async function unlock(id: number, key: string): Promise<void> {
   const reader = await prepared;
   const content = reader === null ? null : await reader.open(key, derive);
-  if (content === null) answer({ id });
-  else if (content.service === 'records') {
-    const model = secretOf(content).gaussians;
-    answer({ id, model }, buffersOf(model));
-  } else answer({ id, file: fileOf(content) });
+  const model = content && secretOf(content)?.gaussians;
+  if (model) answer({ id, model }, buffersOf(model));
+  else answer({ id, file: content ? fileOf(content) : undefined });
 }
 
 /** A hidden file: its name, which is to be shown and never to be taken as a path, and its bytes. */

@@ -1,16 +1,10 @@
 import { expect, test } from 'vitest';
-import type { Gaussians } from '../src/core/gaussians.ts';
 import { readModel } from '../src/files/models.ts';
 import { openZip } from '../src/files/zip.ts';
-import { digest, jsonVector, vector } from './vectors.ts';
+import { columns, jsonVector, vector } from './vectors.ts';
 
 const PUBLISHED = jsonVector<Record<string, Record<string, string>>>('published.json');
 const HERE = Object.keys(PUBLISHED).filter((name) => !name.endsWith('.sog')); // whose images only browsers decode
-
-function columns({ means, quats, logScales, opacityLogits, sh }: Gaussians): Record<string, string> {
-  const found = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
-  return Object.fromEntries(Object.entries(found).map(([name, values]) => [name, digest(values)]));
-}
 
 test.each(HERE)('%s is what Python reads, bit for bit', async (name) => {
   expect(columns(await readModel(vector(name)))).toEqual(PUBLISHED[name]);

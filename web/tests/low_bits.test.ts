@@ -1,9 +1,9 @@
 import { expect, test } from 'vitest';
 import { CellCipher } from '../src/channels/low_bits/cells.ts';
-import { decrypted } from '../src/channels/low_bits/payload.ts';
 import { LowBitsReader } from '../src/channels/low_bits/reader.ts';
 import { selected, type Gaussians } from '../src/core/gaussians.ts';
 import { readPly, writePly } from '../src/files/ply.ts';
+import { decrypted } from '../src/keys/encryption.ts';
 import { secretOf } from '../src/records/secret.ts';
 import { digest, hex, jsonVector, vector } from './vectors.ts';
 
@@ -33,7 +33,7 @@ test.each(REVEALED)('$file gives $key what Python reveals, bit for bit', async (
     expect(digest(content.data)).toBe(expected.payload);
     return;
   }
-  const secret = secretOf(content!);
+  const secret = secretOf(content!)!;
   expect([secret.gaussians.count, secret.hidden]).toEqual([expected.count, expected.hidden]);
   for (const [name, values] of Object.entries(columns(secret.gaussians))) {
     if (name === 'opacity_logits' && expected.opacity_logits) {
@@ -60,7 +60,7 @@ test('one changed bit costs one Gaussian at most', async () => {
   const model = readPly(vector('carried.ply'));
   new Uint32Array(model.sh.buffer)[5 * 48 + 20] ^= 1 << 6;
   const content = await LowBitsReader.of(model).open(CARRIED.key);
-  expect(secretOf(content!).gaussians.count).toBeGreaterThanOrEqual(7);
+  expect(secretOf(content!)!.gaussians.count).toBeGreaterThanOrEqual(7);
 });
 
 test('a cell', () => {

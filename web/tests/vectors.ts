@@ -1,6 +1,7 @@
 /** The frozen vectors that Python's tests use too. */
 import { createHash } from 'node:crypto';
 import { readFileSync } from 'node:fs';
+import type { Gaussians } from '../src/core/gaussians.ts';
 
 const FOLDER = new URL('../../tests/vectors/', import.meta.url);
 
@@ -14,6 +15,12 @@ export function jsonVector<T>(name: string): T {
 
 export function digest(values: Float32Array | Uint8Array): string {
   return createHash('sha256').update(new Uint8Array(values.buffer, values.byteOffset, values.byteLength)).digest('hex');
+}
+
+/** SHA-256 of the float32 columns, by the names that they have in Python. */
+export function columns({ means, quats, logScales, opacityLogits, sh }: Gaussians): Record<string, string> {
+  const found = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
+  return Object.fromEntries(Object.entries(found).map(([name, values]) => [name, digest(values)]));
 }
 
 export function hex(text: string): Uint8Array {

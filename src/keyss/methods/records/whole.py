@@ -43,7 +43,7 @@ _GOOD_ENOUGH = 44.0  # dB of pictures against those of the model: of photos at 3
 _GOALS, _BIT = range(47, 61), 6.02  # dB
 _ATTRIBUTES, _SHARES = ("means", "log_scales", "quats", "opacity_logits"), (0, 0, 0, 4.8, 0, -8)
 _FEWEST = (8, 4, 4, 4, 4)  # bits
-_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
+FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
 _POSITIONS = range(3, 6)  # among the columns of a layout
 
 
@@ -70,7 +70,7 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     codec = Codec.fit(plain, table)
     columns = codes_of_records(codec.encode(plain), _layout(table))
     planes = [plane for i, each in enumerate(columns) for plane in _planes(each, _layout(table)[i][1], i)]
-    packed = lzma.compress(b"".join(planes) + _harmonics(model, step), lzma.FORMAT_RAW, filters=_FILTERS)
+    packed = lzma.compress(b"".join(planes) + _harmonics(model, step), lzma.FORMAT_RAW, filters=FILTERS)
     return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + packed
 
 
@@ -89,7 +89,7 @@ def decode(data: bytes) -> CarriedSecret:
     start = _HEAD.size + Codec.packed_size(0)
     size = own + count * harmonics
     try:
-        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS)
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=FILTERS)
         planes = unpacker.decompress(data[start:], size + 1)
     except lzma.LZMAError as error:
         raise InputError(f"the hidden secret is damaged: {error}") from error

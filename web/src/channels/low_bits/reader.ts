@@ -7,12 +7,12 @@
 import { bytesKey } from '../../core/bytes.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import { type Derive, expand, master } from '../../keys/derivation.ts';
+import { damaged } from '../../keys/encryption.ts';
 import type { Content, Payload, Reader, Records } from '../content.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
 import { CellCipher } from './cells.ts';
 import {
-  damaged, mostFrequent, type Parameters, type PayloadParameters, type RecordParameters, tooMuchRemoved,
-  unpackParameters,
+  mostFrequent, type Parameters, type PayloadParameters, type RecordParameters, tooMuchRemoved, unpackParameters,
 } from './parameters.ts';
 import { decodePayload } from './payload.ts';
 import { salts } from './salts.ts';
