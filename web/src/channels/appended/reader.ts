@@ -1,10 +1,9 @@
 /** Secrets in appended Gaussians (docs/appended.md); `keyss.channels.appended.channel` on the other side. */
 import { ascii, bytesKey } from '../../core/bytes.ts';
-import { InputError } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { type Derive, expand, master } from '../../keys/derivation.ts';
+import { damaged, decrypted } from '../../keys/encryption.ts';
 import type { Payload, Reader } from '../content.ts';
-import { decrypted } from '../low_bits/payload.ts';
 import { Blocks } from './blocks.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
@@ -53,7 +52,7 @@ export class AppendedReader implements Reader {
       return null;
     }
     const plain = decrypted(data, blocks.decode(packets, this.words), ASSOCIATED);
-    if (plain.length < METHOD_BYTES) throw new InputError('What this key opens is damaged.');
+    if (plain.length < METHOD_BYTES) throw damaged();
     const method = bytesKey(plain.subarray(0, METHOD_BYTES)).replace(/\0+$/, '');
     return { service: 'payload', method, data: plain.slice(METHOD_BYTES) };
   }
