@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import lzma
+import struct
 import sys
 import unicodedata
 from dataclasses import fields, replace
@@ -31,12 +32,12 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 
 from channels.low_bits.trained_like import trained_like  # noqa: E402
-from files.formats.examples import model_of, random_spz  # noqa: E402
+from files.formats.examples import ksplat_of, model_of, random_spz  # noqa: E402
 from keyss.channels.base import Payload  # noqa: E402
 from keyss.channels.low_bits import LOW_BITS  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.files import read_model  # noqa: E402
-from keyss.files.formats import compressed_ply, sog, spz  # noqa: E402
+from keyss.files.formats import compressed_ply, glb, sog, splat, spz  # noqa: E402
 from keyss.files.ply import read_ply, write_ply  # noqa: E402
 from keyss.methods.learned.payload import pack_secret  # noqa: E402
 from keyss.methods.records import whole  # noqa: E402
@@ -145,7 +146,11 @@ def write_published() -> None:
         "published-4.spz": spz.serialise(spz.quantise(model, version=4)),
         "published.compressed.ply": compressed_ply.write_compressed_ply(model),
         "published.sog": sog.write_sog(model),
+        "published.splat": splat.write_splat(model),
+        "published.glb": glb.write_glb(model[:100]),
+        "published-moved.glb": placed_elsewhere(model[:40]),
     }
+    files |= {f"published-{level}.ksplat": ksplat_of(model_of(150, 2, seed=8), level) for level in range(3)}
     read = {}
     for name, data in files.items():
         (FOLDER / name).write_bytes(data)
@@ -183,6 +188,21 @@ def lzma_streams() -> list[tuple[bytes, bytes]]:
     # Chunks of all of them in one stream: each begins as the first does.
     joined = b"".join(each[:-1] for each in packed) + b"\0"
     return [*zip(packed, plains, strict=True), (joined, b"".join(plains))]
+
+
+def placed_elsewhere(model: Gaussians) -> bytes:
+    """A .glb whose nodes move, turn and scale the Gaussians, which are shown twice."""
+    data = glb.write_glb(model)
+    (size,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + size])
+    turned = {"rotation": [0.1, -0.7, 0.3, 0.64], "scale": [1.5, 1.5, 1.5], "children": [1, 2]}
+    document["nodes"] = [turned, {"mesh": 0}, {"mesh": 0, "translation": [1, -2, 0.5]}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    start = struct.pack(
+        "<4sIIII", b"glTF", 2, 12 + 8 + len(text) + len(data) - 20 - size, len(text), 0x4E4F534A
+    )
+    return start + text + data[20 + size :]
 
 
 def digests(model: Gaussians) -> dict[str, str]:

@@ -6,6 +6,7 @@ export interface Question {
   readonly id: number;
   readonly port?: MessagePort;
   readonly bytes?: Uint8Array;
+  readonly name?: string; // of the file; some formats are known by it only
   readonly key?: string;
 }
 

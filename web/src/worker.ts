@@ -14,8 +14,8 @@ function answer(message: Answer, moved: Transferable[] = []): void {
   (self as unknown as Worker).postMessage(message, moved);
 }
 
-async function load(id: number, bytes: Uint8Array): Promise<void> {
-  const model = await readModel(bytes);
+async function load(id: number, bytes: Uint8Array, name = ''): Promise<void> {
+  const model = await readModel(bytes, name);
   answer({ id, model });
   // Afterwards: the picture comes first.
   prepared = new Promise((resolve) => setTimeout(() => resolve(readerOf(model)), 0));
@@ -52,7 +52,7 @@ self.onmessage = async ({ data }: MessageEvent<Question>) => {
     return;
   }
   try {
-    if (data.bytes) await load(data.id, data.bytes);
+    if (data.bytes) await load(data.id, data.bytes, data.name);
     else await unlock(data.id, data.key ?? '');
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';

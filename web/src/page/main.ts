@@ -128,7 +128,7 @@ class Page {
     const own = ++this.loads;
     this.say('Reading …');
     page.problem.textContent = '';
-    const { model, error } = await this.opener.load(bytes);
+    const { model, error } = await this.opener.load(bytes, name);
     if (own !== this.loads) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published, this.secret] = [name, model, null];

@@ -24,8 +24,8 @@ export class Opener {
   }
 
   /** The model in a file; keys are tried on it from now on. */
-  load(bytes: Uint8Array): Promise<Answer> {
-    return this.ask({ id: this.next++, bytes }, [bytes.buffer as ArrayBuffer]);
+  load(bytes: Uint8Array, name: string): Promise<Answer> {
+    return this.ask({ id: this.next++, bytes, name }, [bytes.buffer as ArrayBuffer]);
   }
 
   /** What a key opens. */

@@ -3,8 +3,8 @@
  * `keyss.channels.appended.lattice` on the other side.
  */
 import { coefficients, type Gaussians, opacity, selected } from '../../core/gaussians.ts';
+import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
-import { moved, type Similarity } from './similarity.ts';
 
 export const [COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS] = [7, 6, 10, 5];
 const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
@@ -92,16 +92,12 @@ export function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
 /** [N, 6] the nearest lattice points of positions and turns; `toOwn`: from the world to the own frame. */
 export function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
   const found = new Uint16Array(6 * faint.count);
-  const [a, b, c, d] = toOwn.quat;
+  const { means, quats } = moved(faint, toOwn);
   for (let row = 0; row < faint.count; row++) {
-    moved(toOwn, faint.means, row).forEach((place, axis) => {
-      found[6 * row + axis] = nearest(place * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
-    });
-    const [w, x, y, z] = faint.quats.subarray(4 * row, 4 * row + 4);
-    const turned = [
-      a * w - b * x - c * y - d * z, b * w + a * x - d * y + c * z,
-      c * w + d * x + a * y - b * z, d * w - c * x + b * y + a * z,
-    ];
+    for (let axis = 0; axis < 3; axis++) {
+      found[6 * row + axis] = nearest(means[3 * row + axis] * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
+    }
+    const turned = [...quats.subarray(4 * row, 4 * row + 4)];
     withLargestW(turned).slice(1).forEach((part, axis) => {
       found[6 * row + 3 + axis] = nearest(((part + TURNS_REACH) / (2 * TURNS_REACH)) * 2 ** TURN_BITS - 0.5, TURN_BITS);
     });

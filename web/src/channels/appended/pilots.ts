@@ -1,9 +1,10 @@
 /** Pilots: appended Gaussians that everybody can read; `keyss.channels.appended.pilots` on the other side. */
-import { SALT_BYTES } from '../../keys/derivation.ts';
+import type { Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
+import { SALT_BYTES } from '../../keys/derivation.ts';
 import { mixAt } from '../mixing.ts';
+import { fittedSimilarity, movedPoint } from './fitting.ts';
 import { POSITION_BITS } from './lattice.ts';
-import { fittedSimilarity, moved, type Similarity } from './similarity.ts';
 
 export const LEAST = 128; // of a model
 export const ONE_IN = 64; // words is a pilot by chance
@@ -56,7 +57,7 @@ function agreeing(there: Float64Array, expected: Float64Array, chosen: number[])
   const found: number[] = [];
   const similarity = fittedSimilarity(there, expected, chosen);
   for (let at = 0; similarity && at < there.length / 3; at++) {
-    const place = moved(similarity, there, at);
+    const place = movedPoint(similarity, there, at);
     if (place.every((each, axis) => Math.abs(each - expected[3 * at + axis]) < NEAR)) found.push(at);
   }
   return found;

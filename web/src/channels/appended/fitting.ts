@@ -1,15 +1,8 @@
 /** Similarity transforms, found by least squares. */
-
-/** x -> scale * rotation x + translation. */
-export interface Similarity {
-  readonly scale: number;
-  readonly quat: readonly number[]; // [4] wxyz, of unit length
-  readonly rotation: readonly number[]; // [3, 3]
-  readonly translation: readonly number[]; // [3]
-}
+import type { Similarity } from '../../core/similarity.ts';
 
 /** Where it takes the point at `at` of points [P, 3]. */
-export function moved({ scale, rotation, translation }: Similarity, points: ArrayLike<number>, at: number): number[] {
+export function movedPoint({ scale, rotation, translation }: Similarity, points: ArrayLike<number>, at: number): number[] {
   const [x, y, z] = [points[3 * at], points[3 * at + 1], points[3 * at + 2]];
   return [0, 1, 2].map((row) => {
     return scale * (rotation[3 * row] * x + rotation[3 * row + 1] * y + rotation[3 * row + 2] * z) + translation[row];
@@ -47,7 +40,7 @@ export function fittedSimilarity(
   const translation = goal.map((each, row) => {
     return each - scale * (rotation[3 * row] * centre[0] + rotation[3 * row + 1] * centre[1] + rotation[3 * row + 2] * centre[2]);
   });
-  return { scale, quat: vector, rotation, translation };
+  return { scale, rotation, translation };
 }
 
 function middle(points: ArrayLike<number>, rows: ArrayLike<number>): number[] {
