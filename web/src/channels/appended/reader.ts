@@ -1,8 +1,9 @@
 /** Secrets in appended Gaussians (docs/appended.md); `keyss.channels.appended.channel` on the other side. */
 import { ascii, bytesKey } from '../../core/bytes.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
-import { type Derive, expand, master } from '../../keys/derivation.ts';
+import { type Derive, expand } from '../../keys/derivation.ts';
 import { damaged, decrypted } from '../../keys/encryption.ts';
+import { here } from '../../keys/pool.ts';
 import type { Payload, Reader } from '../content.ts';
 import { Blocks } from './blocks.ts';
 import {
@@ -19,6 +20,8 @@ const ASSOCIATED = ascii('keyss/v1/appended/data');
 
 /** A model's appended Gaussians, prepared for any number of keys. */
 export class AppendedReader implements Reader {
+  readonly derivations = 1;
+
   private constructor(readonly salt: Uint8Array, private readonly words: TaggedWords) {}
 
   /** null where there are none, or where their frame cannot be found. */
@@ -42,7 +45,7 @@ export class AppendedReader implements Reader {
   }
 
   /** What `key` opens, null for nothing. Raises InputError where too much was lost or changed. */
-  async open(key: string, derive: Derive = master): Promise<Payload | null> {
+  async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     const [headers, packets, data] = ['header', 'packets', 'data'].map((use) => expand(secret, `appended/${use}`, 32));
     const header = readHeader(headers, this.words);

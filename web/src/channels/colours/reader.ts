@@ -8,8 +8,8 @@ import { ascii, joined, viewOf } from '../../core/bytes.ts';
 import { InputError } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { namesakes } from '../../core/words.ts';
-import { type Derive, expand, master, SALT_BYTES } from '../../keys/derivation.ts';
-import { pooled } from '../../keys/pool.ts';
+import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
+import { here } from '../../keys/pool.ts';
 import type { Payload, Reader } from '../content.ts';
 import { unpackPayload } from '../packing.ts';
 import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
@@ -48,8 +48,12 @@ export class ColoursReader implements Reader {
     return new ColoursReader(numbers, saltsOf(numbers));
   }
 
+  get derivations(): number {
+    return 1 + this.salts.length;
+  }
+
   /** What `key` opens, null for nothing. Raises InputError for damage. */
-  async open(key: string, derive: Derive = pooled([master])): Promise<Payload | null> {
+  async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const masters = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
     const fixed = expand(masters[0], 'robust/static', 32);
     const secrets = masters.slice(1).map((each) => expand(each, 'robust/header', 32));
