@@ -1,20 +1,26 @@
 /**
- * Opening with a key, in whichever channel of a model the secret lies.
+ * Opening with a key, in whichever channel of a model the secret lies; `keyss.channels.opening` on the other side.
  *
  * All channels are looked through for every key, also when one of them has opened already: how long it takes tells
  * neither whether a key opens something nor where.
  */
-import type { Gaussians } from '../core/gaussians.ts';
+import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/derivation.ts';
 import { AppendedReader } from './appended/reader.ts';
+import { CodesReader } from './codes/reader.ts';
 import { ColoursReader } from './colours/reader.ts';
 import type { Content, Reader } from './content.ts';
 import { LowBitsReader } from './low_bits/reader.ts';
 
 /** The channels of a model, prepared for any number of keys. */
-export function readerOf(model: Gaussians): Reader {
-  const appended = AppendedReader.of(model);
-  return new Channels([LowBitsReader.of(model), ...(appended ? [appended] : []), ColoursReader.of(model)]);
+export function readerOf(model: ReadModel): Reader {
+  return new Channels(readersOf(model));
+}
+
+/** One for each channel that a model has, those that come first counting most. */
+export function readersOf(model: ReadModel): Reader[] {
+  const exact = model.codes ? CodesReader.of(model.codes) : LowBitsReader.of(model);
+  return [exact, AppendedReader.of(model), ColoursReader.of(model)].filter((each) => each !== null);
 }
 
 /** Several channels, of which the first one that opens counts. */
@@ -25,7 +31,7 @@ export class Channels implements Reader {
     return this.readers.reduce((sum, each) => sum + each.derivations, 0);
   }
 
-  async open(key: string, derive: Derive): Promise<Content | null> {
+  async open(key: string, derive?: Derive): Promise<Content | null> {
     const outcomes = await Promise.allSettled(this.readers.map((each) => each.open(key, derive)));
     for (const outcome of outcomes) {
       if (outcome.status === 'rejected') throw outcome.reason;
