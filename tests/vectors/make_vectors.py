@@ -58,6 +58,7 @@ from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import OPENED_BY, unpack_records  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.learned.hiding import some_secret  # noqa: E402
+from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
 def cell() -> dict[str, object]:
@@ -283,6 +284,9 @@ def write_revealed(key: str) -> None:
     for suffix in codes_examples.FORMATS:
         write_coded(suffix)
         opened += [revealed(f"coded{suffix}", each) for each in TWO_KEYS]
+    write_surviving(FOLDER, TWO_KEYS)
+    opened += [revealed(name, TWO_KEYS[0]) for name in NAMES]
+    opened += [revealed(name, TWO_KEYS[1]) for name in NAMES[:3]]
     (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 

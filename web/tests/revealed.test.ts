@@ -1,5 +1,6 @@
 import { expect, test } from 'vitest';
-import { readerOf } from '../src/channels/opening.ts';
+import type { Content } from '../src/channels/content.ts';
+import { readersOf } from '../src/channels/opening.ts';
 import { secretOf } from '../src/records/secret.ts';
 import { columns, digest, jsonVector, modelOf } from './vectors.ts';
 
@@ -16,8 +17,17 @@ interface Revealed {
 
 const REVEALED = jsonVector<Revealed[]>('revealed.json');
 
+/** In the first channel in which it opens something: to look into all of them would take ten times as long. */
+async function opened(file: string, key: string): Promise<Content | null> {
+  for (const reader of readersOf(await modelOf(file))) {
+    const content = await reader.open(key);
+    if (content !== null) return content;
+  }
+  return null;
+}
+
 test.each(REVEALED)('$file gives $key what Python reveals, bit for bit', async (expected) => {
-  const content = await readerOf(await modelOf(expected.file))!.open(expected.key);
+  const content = await opened(expected.file, expected.key);
   expect(content?.method).toBe(expected.method);
   const secret = secretOf(content!);
   if (secret === null) {
