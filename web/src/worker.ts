@@ -3,7 +3,7 @@ import type { Content, Reader } from './channels/content.ts';
 import { readerOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf } from './core/gaussians.ts';
-import { readModel } from './files/models.ts';
+import { readModel, type ReadModel } from './files/models.ts';
 import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
@@ -15,10 +15,19 @@ function answer(message: Answer, moved: Transferable[] = []): void {
 }
 
 async function load(id: number, bytes: Uint8Array): Promise<void> {
-  const model = await readModel(bytes);
+  const read = await readModel(bytes);
+  const { codes, ...model } = read;
   answer({ id, model });
   // Afterwards: the picture comes first.
-  prepared = new Promise((resolve) => setTimeout(() => resolve(readerOf(model)), 0));
+  prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
+}
+
+function readerWhereThereIsMemory(model: ReadModel): Reader | null {
+  try {
+    return readerOf(model);
+  } catch {
+    return null; // it opens nothing, and the page goes on
+  }
 }
 
 /** What a key becomes with a salt, by the worker at the other end of the port that the page gave. */

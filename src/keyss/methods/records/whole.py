@@ -41,7 +41,7 @@ _STEP, _HALVED = 0.06, 20  # of harmonics at the usual bits; with so many more b
 _LARGEST = 127  # code of a harmonic
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
 _FINER = 6  # half octaves by which a step is finer or coarser, at most
-FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
 _POSITIONS = range(3, 6)  # among the columns of a layout
 
 
@@ -71,7 +71,7 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     columns = codes_of_records(records, _layout(table))
     planes = [plane for i, each in enumerate(columns) for plane in _planes(each, _layout(table)[i][1], i)]
     planes.append(_harmonics(model, codec.decode(records), step))
-    packed = lzma.compress(b"".join(planes), lzma.FORMAT_RAW, filters=FILTERS)
+    packed = lzma.compress(b"".join(planes), lzma.FORMAT_RAW, filters=_FILTERS)
     return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + packed
 
 
@@ -90,7 +90,7 @@ def decode(data: bytes) -> CarriedSecret:
     start = _HEAD.size + Codec.packed_size(0)
     size = own + count * harmonics
     try:
-        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=FILTERS)
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS)
         planes = unpacker.decompress(data[start:], size + 1)
     except lzma.LZMAError as error:
         raise InputError(f"the hidden secret is damaged: {error}") from error
