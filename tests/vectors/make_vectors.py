@@ -248,7 +248,7 @@ def lzma_streams() -> list[tuple[bytes, bytes]]:
     plains = (b"", text, bytes(3 << 20), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
     others = {"lc": 3, "lp": 1, "pb": 2}
     packed = [
-        lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole.FILTERS[0], **changed}])
+        lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole._FILTERS[0], **changed}])
         for each, changed in zip(plains, ({}, {}, {}, others, others), strict=True)
     ]
     # Chunks of all of them in one stream: each begins as the first does.

@@ -3,7 +3,7 @@ import type { Content, Reader } from './channels/content.ts';
 import { readerOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf } from './core/gaussians.ts';
-import { readModel } from './files/models.ts';
+import { readModel, type ReadModel } from './files/models.ts';
 import type { Derive } from './keys/derivation.ts';
 import { derivedBy, here, inTurn } from './keys/pool.ts';
 import { secretOf } from './records/secret.ts';
@@ -17,10 +17,19 @@ function answer(message: Answer, moved: Transferable[] = []): void {
 }
 
 async function load(id: number, bytes: Uint8Array, name = ''): Promise<void> {
-  const model = await readModel(bytes, name);
+  const read = await readModel(bytes, name);
+  const { codes, ...model } = read;
   answer({ id, model });
   // Afterwards: the picture comes first.
-  prepared = new Promise((resolve) => setTimeout(() => resolve(readerOf(model)), 0));
+  prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
+}
+
+function readerWhereThereIsMemory(model: ReadModel): Reader | null {
+  try {
+    return readerOf(model);
+  } catch {
+    return null; // it opens nothing, and the page goes on
+  }
 }
 
 async function unlock(id: number, key: string): Promise<void> {

@@ -19,8 +19,8 @@ from keyss.files.models import (
     model_of_bytes,
 )
 from keyss.files.streams import StandardOutput, is_standard
-from keyss.methods.dither import cost
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.difference import cost
 from keyss.runs.config import PathLike
 from keyss.runs.folder import check_not_published
 from keyss.runs.opening import as_model

@@ -7,6 +7,8 @@ import { Codec, type Layout, putColours } from './codec.ts';
 
 const MOST_GAUSSIANS = 1 << 22;
 const HEAD_BYTES = 9; // Gaussians (4), SH degree (1), step of harmonics (4)
+const PER_OCTAVE = 0.5 / Math.LN2; // half octaves of the step
+const FINER = 6; // half octaves by which a step is finer or coarser, at most
 const [FIRST_POSITION, AFTER_POSITIONS] = [3, 6]; // among the parts of a layout
 
 /** The model. Raises InputError for damage, before anything is allocated that the data do not hold. */
@@ -54,12 +56,30 @@ function columnsOf(planes: Uint8Array, layout: Layout, count: number): Uint32Arr
   return found;
 }
 
-/** `codes` [K - 1, 3, N]: of each coefficient above degree 0 brightness and two differences, in steps. */
+/** `codes` [K - 1, 3, N]: of each coefficient above degree 0 brightness and two differences, equal steps together. */
 function putHarmonics(to: Gaussians, codes: Int8Array, step: number): void {
   const { count, shDegree, sh } = to;
   const k = coefficients(shDegree);
+  const finer = finerSteps(to);
+  const rows = Array.from(finer.keys()).sort((a, b) => finer[a] - finer[b]); // equal ones stay in their order
   for (let each = 1; each < k; each++) {
     const [a, b, c] = [0, 1, 2].map((value) => codes.subarray(count * (3 * (each - 1) + value)));
-    for (let row = 0; row < count; row++) putColours(sh, 3 * (k * row + each), a[row] * step, b[row] * step, c[row] * step);
+    rows.forEach((row, at) => {
+      const own = step * (finer[row] % 2 ? Math.SQRT2 : 1) * 2 ** -Math.floor((finer[row] + 1) / 2);
+      putColours(sh, 3 * (k * row + each), a[at] * own, b[at] * own, c[at] * own);
+    });
   }
+}
+
+/** [N] half octaves by which the steps of each Gaussian are finer than those of the middle one, by area and opacity. */
+function finerSteps({ count, logScales, opacityLogits }: Gaussians): Int8Array {
+  const seen = Float64Array.from({ length: count }, (_, row) => {
+    const [, second, third] = logScales.slice(3 * row, 3 * row + 3).sort();
+    return third + second + 2 * Math.min(opacityLogits[row], 0);
+  });
+  const middle = seen.slice().sort()[(count - 1) >> 1];
+  return Int8Array.from(seen, (each) => {
+    const found = Math.floor((each - middle) * PER_OCTAVE + 0.5);
+    return Math.min(Math.max(found, -FINER), FINER);
+  });
 }
