@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import lzma
 import struct
 import sys
 import unicodedata
@@ -30,18 +31,34 @@ from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB  # noqa: E402
 from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 
+from channels.codes import published as codes_examples  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
-from files.formats.examples import ksplat_of, model_of, random_spz  # noqa: E402
+from files.formats.examples import (  # noqa: E402
+    ksplat_of,
+    model_of,
+    random_compressed,
+    random_sog,
+    random_spz,
+)
 from keyss.channels.base import Payload  # noqa: E402
+from keyss.channels.codes import published  # noqa: E402
+from keyss.channels.codes.channel import _last_bits  # noqa: E402
+from keyss.channels.codes.fields import _log2  # noqa: E402
+from keyss.channels.codes.order import Counted  # noqa: E402
 from keyss.channels.low_bits import LOW_BITS  # noqa: E402
+from keyss.channels.opening import open_content  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
-from keyss.files import read_model  # noqa: E402
+from keyss.files import read_model, write_model  # noqa: E402
 from keyss.files.formats import compressed_ply, glb, sog, splat, spz  # noqa: E402
-from keyss.files.ply import read_ply, write_ply  # noqa: E402
+from keyss.files.formats.common import CodedGaussians  # noqa: E402
+from keyss.files.ply import write_ply  # noqa: E402
+from keyss.methods.hidden_file import HiddenFile  # noqa: E402
 from keyss.methods.learned.payload import pack_secret  # noqa: E402
-from keyss.methods.records.embedding import unpack_records  # noqa: E402
+from keyss.methods.records import whole  # noqa: E402
+from keyss.methods.records.embedding import OPENED_BY, unpack_records  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.learned.hiding import some_secret  # noqa: E402
+from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
 def cell() -> dict[str, object]:
@@ -85,10 +102,10 @@ def derivation() -> dict[str, object]:
 
 def revealed(name: str, key: str) -> dict[str, Any]:
     """What `key` opens in a file of this folder: SHA-256 of float32 columns, or of a payload."""
-    stego = read_ply(FOLDER / name)
-    content = LOW_BITS.extract(stego, key)
+    stego = read_model(FOLDER / name)
+    content = open_content(stego, key)
     found: dict[str, Any] = {"file": name, "key": key, "method": content.method}
-    if isinstance(content, Payload):
+    if isinstance(content, Payload) and content.method != OPENED_BY:
         return found | {"payload": hashlib.sha256(content.data).hexdigest()}
     secret = unpack_records(content)
     model = secret.reveal(stego)
@@ -132,6 +149,9 @@ def main() -> None:
     write_ply(FOLDER / "learned-secret.ply", some_secret(cover).reveal(cover))
     write_revealed(key)
     write_published()
+    write_extremes()
+    write_counted()
+    write_whole()
 
 
 def write_published() -> None:
@@ -153,6 +173,87 @@ def write_published() -> None:
         (FOLDER / name).write_bytes(data)
         read[name] = digests(read_model(FOLDER / name))
     (FOLDER / "published.json").write_text(json.dumps(read, indent=1) + "\n")
+
+
+def write_coded(suffix: str) -> None:
+    """A model whose codes hold two secrets: a model, and another one or a file."""
+    cover = codes_examples.model_of(2300, 11, 0)
+    other = {
+        ".spz": Payload(OPENED_BY, whole.encode(trained_like(25, 12, 2))),
+        ".sog": Payload(OPENED_BY, whole.encode(trained_like(60, 13, 0))),
+        ".compressed.ply": HiddenFile("a note.txt", b"Written at noon, read at night.\n").payload(),
+    }[suffix]
+    secrets = [(TWO_KEYS[0], Payload(OPENED_BY, whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
+    name = next(each for each, end in published.SUFFIXES.items() if end == suffix)
+    coded = published.coded(published.prepare(cover, name).embed(secrets, entropy=bytes(32)))
+    write_model(FOLDER / f"coded{suffix}", coded)
+
+
+def write_extremes() -> None:
+    """Numbers far from what training gives, in formats in which they tell how many bits carry."""
+    random = np.random.default_rng(15)
+    codes = random_sog(random, 60, 0)
+    same = {
+        name: getattr(codes, name).copy() for name in ("scales", "colors", "alphas", "largest", "positions")
+    }
+    for each in same.values():
+        each[40:] = each[:20]  # Gaussians alike in all that is not written
+    codes = replace(codes, **same, mins=np.array([-40.0, 1, 5e-310]), maxs=np.array([60.0, 1, 0]))
+    codes = replace(codes, scale_codebook=(16 * codes.scale_codebook).astype(np.float32))
+    (FOLDER / "extreme.sog").write_bytes(sog.serialise(codes))
+    chunks = random_compressed(random, 700, 0)
+    chunks.bounds[0, 6:12] = [0, 1, -3e38, 0, -1, 3e38]
+    chunks.bounds[1, 6:12] = [0, 0, -1e-3, 1e-44, 1e-6, 1e-3]
+    (FOLDER / "extreme.compressed.ply").write_bytes(compressed_ply.serialise(chunks))
+
+
+def write_counted() -> None:
+    """How many bits carry in the codes of this folder's files, and which these are."""
+    bits = {}
+    for path in sorted([*FOLDER.glob("published*"), *FOLDER.glob("coded*"), *FOLDER.glob("extreme*")]):
+        if path.suffix != ".json" and isinstance(model := read_model(path), CodedGaussians):
+            bits[path.name] = counted(model)
+    numbers = [0.0, 1.0, -3.0, 0.75, 1e-5, 6.5e4, 5e-324, -1e-310, 2.0**-1022, 1.7e308, 2.0**-14 * 1.0001]
+    logs = {repr(each): float(_log2(np.array([each]))[0]) for each in numbers}
+    (FOLDER / "counted.json").write_text(json.dumps({"bits": bits, "log2": logs}, indent=1) + "\n")
+
+
+def counted(model: CodedGaussians) -> dict[str, Any]:
+    """The last bits of all levels: their number, and SHA-256 of a byte for each."""
+    bits = _last_bits(Counted.of(model.codes).fields)
+    return {"count": len(bits), "sha256": hashlib.sha256(bits.tobytes()).hexdigest()}
+
+
+def write_whole() -> None:
+    """Models as one string of bytes, and streams of the compression in it that have every kind of chunk."""
+    far = trained_like(40, 8, 0)
+    far.means[3, 1] = -1e5  # an outlier
+    models = [trained_like(40, 9, 3), far, trained_like(10, 10, 1)[:1]]
+    encoded = [whole.encode(each) for each in models]
+    found = {
+        "models": [{"data": data.hex(), "sha256": digests(whole.decode(data).gaussians)} for data in encoded],
+        "streams": [
+            {"data": stream.hex(), "size": len(plain), "sha256": hashlib.sha256(plain).hexdigest()}
+            for stream, plain in lzma_streams()
+        ],
+    }
+    (FOLDER / "whole.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def lzma_streams() -> list[tuple[bytes, bytes]]:
+    """Raw LZMA2 streams of this program's parameters and of others, with what they become."""
+    random = np.random.default_rng(1)
+    words = [bytes(random.integers(97, 110, size).tolist()) for size in random.integers(2, 9, 60)]
+    text = b" ".join(words[i] for i in random.integers(0, len(words), 400))
+    plains = (b"", text, bytes(3 << 20), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
+    others = {"lc": 3, "lp": 1, "pb": 2}
+    packed = [
+        lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole._FILTERS[0], **changed}])
+        for each, changed in zip(plains, ({}, {}, {}, others, others), strict=True)
+    ]
+    # Chunks of all of them in one stream: each begins as the first does.
+    joined = b"".join(each[:-1] for each in packed) + b"\0"
+    return [*zip(packed, plains, strict=True), (joined, b"".join(plains))]
 
 
 def placed_elsewhere(model: Gaussians) -> bytes:
@@ -180,6 +281,12 @@ def write_revealed(key: str) -> None:
     write_ply(FOLDER / "pruned.ply", pruned())
     opened = [revealed(name, key) for name in ("carried.ply", "learned.ply")]
     opened += [revealed("pruned.ply", each) for each in TWO_KEYS]
+    for suffix in codes_examples.FORMATS:
+        write_coded(suffix)
+        opened += [revealed(f"coded{suffix}", each) for each in TWO_KEYS]
+    write_surviving(FOLDER, TWO_KEYS)
+    opened += [revealed(name, TWO_KEYS[0]) for name in NAMES]
+    opened += [revealed(name, TWO_KEYS[1]) for name in NAMES[:3]]
     (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 

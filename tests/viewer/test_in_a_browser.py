@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,21 +18,9 @@ from keyss.files.models import read_model, write_model
 from keyss.files.ply import write_ply
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
-from viewer.browser import (
-    PATIENCE,
-    POSE,
-    PROGRAM,
-    SWITCHES,
-    WEB,
-    Visit,
-    camera_of,
-    drawn,
-    made,
-    psnr,
-    visit,
-)
+from viewer.browser import POSE, PROGRAM, WEB, Visit, camera_of, drawn, made, psnr
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
 pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
 
 KEYS = ("the first key", "ein zweiter Schlüssel")
@@ -58,20 +45,6 @@ def page_file(stego: Path) -> Path:
 @pytest.fixture(scope="module")
 def secrets(stego: Path) -> list[Gaussians]:
     return [extract(read_model(stego), key).gaussians for key in KEYS]
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture
-def tab(chromium: Any) -> Iterator[Visit]:
-    with visit(chromium) as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

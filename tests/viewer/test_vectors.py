@@ -10,9 +10,12 @@ import pytest
 
 from keyss.core.errors import KeyssWarning
 from keyss.files import read_model
-from vectors.make_vectors import FOLDER, digests, revealed
+from keyss.methods.records import whole
+from vectors.make_vectors import FOLDER, counted, digests, revealed
 
 REVEALED = json.loads((FOLDER / "revealed.json").read_text())
+WHOLE = json.loads((FOLDER / "whole.json").read_text())
+COUNTED = json.loads((FOLDER / "counted.json").read_text())
 PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
 
@@ -30,3 +33,13 @@ def test_what_keys_open(expected: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_what_published_files_hold(name: str) -> None:
     assert digests(read_model(FOLDER / name)) == PUBLISHED[name]
+
+
+@pytest.mark.parametrize("expected", WHOLE["models"], ids=lambda each: f"{len(each['data']) // 2} bytes")
+def test_what_whole_models_hold(expected: dict[str, Any]) -> None:
+    assert digests(whole.decode(bytes.fromhex(expected["data"])).gaussians) == expected["sha256"]
+
+
+@pytest.mark.parametrize("name", COUNTED["bits"])
+def test_which_bits_of_published_files_carry(name: str) -> None:
+    assert counted(read_model(FOLDER / name)) == COUNTED["bits"][name]

@@ -1,30 +1,29 @@
 /** The page: a published model, a field for a key, and what the key opens. */
-import { type Gaussians, opacity } from '../core/gaussians.ts';
+import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
-import { COLOURINGS, type Look, lookedAt } from './attacker.ts';
+import { COLOURINGS } from './attacker.ts';
 import { Controls } from './controls.ts';
 import { page } from './elements.ts';
 import { type TrainedSide, watch } from './live.ts';
+import { listenToLooks, looked } from './looking.ts';
 import { Opener } from './opener.ts';
-import { placeBorder, preparePanel, save, showKey } from './panel.ts';
+import { count, placeBorder, preparePanel, save, showKey } from './panel.ts';
 import { alike, firstPose, type Pose, poseOfHash, poseToHash, UPS, upOf } from './pose.ts';
 import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
 const MOST_BYTES = 2 ** 31;
-const FAINT = 0.1; // opacity below which Gaussians are called faint, unless another threshold is chosen
 const EMBEDDED = location.protocol === 'about:'; // in another page, which has the address to itself
 
 class Page {
   private name = 'model';
   private published: Gaussians | null = null;
   private secret: Gaussians | null = null;
-  private readonly opener = new Opener();
+  private readonly opener = new Opener((share) => (page.progress.value = share));
   private readonly controls: Controls;
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
   private addressTimer = 0;
-  private lookTimer = 0;
   private loads = 0;
   private longest = 0; // milliseconds that a key took so far
 
@@ -60,12 +59,10 @@ class Page {
       page.key.focus();
     });
     page.wipe.addEventListener('input', () => this.split(Number(page.wipe.value) / 100));
-    page.faint.addEventListener('input', () => {
-      if (page.faint.checked && Number(page.threshold.value) === 0) page.threshold.value = String(FAINT);
+    listenToLooks(() => {
+      this.showPublished();
+      if (this.secret) this.split(1); // it is the published one that is looked at
     });
-    for (const input of [page.threshold, page.faint, page.opaque, page.colouring]) {
-      input.addEventListener('input', () => this.look());
-    }
     window.addEventListener('hashchange', ({ newURL }) => {
       const pose = poseOfHash(new URL(newURL).hash); // that of now may be one that was written meanwhile
       if (pose) this.controls.setPose(pose);
@@ -153,6 +150,8 @@ class Page {
     page.open.disabled = true;
     page.main.setAttribute('aria-busy', 'true');
     this.say('Trying the key …');
+    page.progress.value = 0;
+    page.progress.hidden = false;
     const { model, file } = await this.opener.unlock(key);
     page.key.value = '';
     showKey(false);
@@ -174,6 +173,7 @@ class Page {
     }
     page.open.disabled = false;
     page.main.setAttribute('aria-busy', 'false');
+    page.progress.hidden = true;
     this.say(found);
   }
 
@@ -225,27 +225,9 @@ class Page {
     if (this.published && !EMBEDDED && location.hash !== hash) history.replaceState(null, '', hash);
   }
 
-  private look(): void {
-    clearTimeout(this.lookTimer);
-    page.thresholdText.value = Number(page.threshold.value).toFixed(3);
-    this.lookTimer = window.setTimeout(() => {
-      this.showPublished();
-      if (this.secret) this.split(1); // it is the published one that is looked at
-    }, 100);
-  }
-
   private showPublished(): void {
     if (this.published === null) return;
-    const look: Look = {
-      threshold: Number(page.threshold.value),
-      faintOnly: page.faint.checked,
-      opaque: page.opaque.checked,
-      colouring: page.colouring.value as Look['colouring'],
-    };
-    const model = lookedAt(this.published, look);
-    const faint = this.published.opacityLogits.filter((logit) => opacity(logit) < 1 / 255).length;
-    page.count.textContent =
-      `${count(model.count)} of ${count(this.published.count)} Gaussians shown; ${count(faint)} are too faint to be drawn`;
+    const model = looked(this.published);
     this.viewer.show(model.count ? model : null);
   }
 
@@ -263,10 +245,6 @@ class Page {
     this.say('');
     page.problem.textContent = text;
   }
-}
-
-function count(number: number): string {
-  return number.toLocaleString('en');
 }
 
 async function main(): Promise<void> {

@@ -45,6 +45,10 @@ export function placeBorder(share: number | null): void {
   page.border.style.left = `${100 * (share ?? 0)}%`;
 }
 
+export function count(number: number): string {
+  return number.toLocaleString('en');
+}
+
 export function save(name: string, data: Blob): void {
   const link = document.createElement('a');
   link.href = URL.createObjectURL(data);

@@ -1,9 +1,12 @@
-/** A carried secret, as `keyss reveal` gives it. */
+/** A secret that is a model, as `keyss reveal` gives it. */
 import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
 import { type Gaussians, opacity } from '../core/gaussians.ts';
-import { Codec, damagedHeader } from './codec.ts';
+import { damaged } from '../keys/encryption.ts';
+import { Codec } from './codec.ts';
+import { decodeWhole } from './whole.ts';
 
+const WHOLE = 'carry'; // the method of models that are hidden whole, whoever trained them
 const GROWTH = 0.25;
 const MOST_LOST = 0.9;
 const LEAST_LOST = 0.01;
@@ -13,12 +16,17 @@ export interface Secret {
   readonly hidden: number; // how many there were
 }
 
-/** The Gaussians that are left of records. Raises InputError for damage. */
-export function secretOf(content: Content): Secret {
-  if (content.service !== 'records' || content.header.length < 4) throw damagedHeader();
+/** The Gaussians that are left; null for what is no model. Raises InputError for damage. */
+export function secretOf(content: Content): Secret | null {
+  if (content.service === 'payload') {
+    if (content.method !== WHOLE) return null;
+    const gaussians = decodeWhole(content.data);
+    return { gaussians, hidden: gaussians.count };
+  }
+  if (content.header.length < 4) throw damaged();
   const hidden = viewOf(content.header).getUint32(0, true);
   const codec = Codec.unpack(content.header.subarray(4));
-  if (content.records[0].length !== codec.recordBytes) throw damagedHeader();
+  if (content.records[0].length !== codec.recordBytes) throw damaged();
   return { gaussians: compensated(codec.decode(content.records), hidden), hidden };
 }
 
