@@ -13,6 +13,7 @@ import json
 import lzma
 import sys
 import unicodedata
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -216,16 +217,42 @@ def write_whole() -> None:
     """Models as one string of bytes, and streams of the compression in it that have every kind of chunk."""
     far = trained_like(40, 8, 0)
     far.means[3, 1] = -1e5  # an outlier
-    models = [trained_like(40, 9, 3), far, trained_like(10, 10, 1)[:1]]
+    seen = trained_like(40, 9, 3)
+    seen.log_scales[2] += 8  # of which harmonics are as fine as they get, and of the next as coarse
+    seen.opacity_logits[3] = -14
+    models = [seen, far, trained_like(10, 10, 1)[:1]]
     encoded = [whole.encode(each) for each in models]
     found = {
         "models": [{"data": data.hex(), "sha256": digests(whole.decode(data).gaussians)} for data in encoded],
         "streams": [
-            {"data": stream.hex(), "size": len(plain), "sha256": hashlib.sha256(plain).hexdigest()}
+            {
+                "data": stream.hex(),
+                "size": len(plain),
+                "sha256": hashlib.sha256(plain).hexdigest(),
+                "flipped": flipped(stream, len(plain)),
+            }
             for stream, plain in lzma_streams()
         ],
     }
     (FOLDER / "whole.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def flipped(stream: bytes, size: int) -> dict[int, str | None]:
+    """By numbers of bits: what a stream with this one flipped becomes, None where it is damaged."""
+    found: dict[int, str | None] = {}
+    for at in sorted(
+        {*range(0, len(stream), 7 if size < 1 << 20 else 41), *range(max(0, len(stream) - 9), len(stream))}
+    ):
+        bit = 8 * at + at % 8
+        changed = bytearray(stream)
+        changed[at] ^= 1 << at % 8
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=whole._FILTERS)
+        found[bit] = None
+        with suppress(lzma.LZMAError):
+            plain = unpacker.decompress(bytes(changed), size + 1)
+            if len(plain) == size and unpacker.eof and not unpacker.unused_data:
+                found[bit] = hashlib.sha256(plain).hexdigest()
+    return found
 
 
 def lzma_streams() -> list[tuple[bytes, bytes]]:
@@ -233,7 +260,7 @@ def lzma_streams() -> list[tuple[bytes, bytes]]:
     random = np.random.default_rng(1)
     words = [bytes(random.integers(97, 110, size).tolist()) for size in random.integers(2, 9, 60)]
     text = b" ".join(words[i] for i in random.integers(0, len(words), 400))
-    plains = (b"", text, bytes(3 << 20), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
+    plains = (b"", text, bytes((2 << 20) + 999), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
     others = {"lc": 3, "lp": 1, "pb": 2}
     packed = [
         lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole._FILTERS[0], **changed}])
