@@ -123,7 +123,7 @@ def _left(model: Gaussians, key: str, device: torch.device) -> int:
 def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
     """Why nothing was written."""
     first = result.secrets[lost[0] - 1]
-    which = "the secret that the key opens" if len(result.secrets) == 1 else f"what key {lost[0]} opens"
+    which = "the secret that the key opens" if len(result.secrets) == 1 else f"the secret of key {lost[0]}"
     left = f"{first.after:,} of its {first.before:,} {first.unit} would open from {path}"
     why = (
         ""
