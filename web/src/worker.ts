@@ -2,12 +2,13 @@
 import type { Content, Reader } from './channels/content.ts';
 import { readerOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
-import { buffersOf } from './core/gaussians.ts';
+import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel, type ReadModel } from './files/models.ts';
 import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
 let port: MessagePort | null = null;
+let stego: Gaussians | null = null;
 let prepared: Promise<Reader | null> = Promise.resolve(null);
 
 function answer(message: Answer, moved: Transferable[] = []): void {
@@ -18,6 +19,7 @@ async function load(id: number, bytes: Uint8Array): Promise<void> {
   const read = await readModel(bytes);
   const { codes, ...model } = read;
   answer({ id, model });
+  stego = model;
   // Afterwards: the picture comes first.
   prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
 }
@@ -42,7 +44,7 @@ const derive = (key: string, salt: Uint8Array): Promise<Uint8Array> =>
 async function unlock(id: number, key: string): Promise<void> {
   const reader = await prepared;
   const content = reader === null ? null : await reader.open(key, derive);
-  const model = content && secretOf(content)?.gaussians;
+  const model = content && stego && secretOf(content, stego)?.gaussians;
   if (model) answer({ id, model }, buffersOf(model));
   else answer({ id, file: content ? fileOf(content) : undefined });
 }
