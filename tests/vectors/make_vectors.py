@@ -14,6 +14,7 @@ import lzma
 import struct
 import sys
 import unicodedata
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from cryptography.hazmat.primitives.ciphers.algorithms import AES  # noqa: E402
 from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB  # noqa: E402
 from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
 
 from channels.codes import published as codes_examples  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
@@ -48,12 +50,20 @@ from keyss.channels.codes.order import Counted  # noqa: E402
 from keyss.channels.low_bits import LOW_BITS  # noqa: E402
 from keyss.channels.opening import open_content  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
+from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
 from keyss.files.formats import compressed_ply, glb, sog, splat, spz  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
+from keyss.keys.derivation import random_embeddings  # noqa: E402
 from keyss.methods.hidden_file import HiddenFile  # noqa: E402
-from keyss.methods.learned.payload import pack_secret  # noqa: E402
+from keyss.methods.learned.decoder import ATTRIBUTES, Decoder, DecoderShape  # noqa: E402
+from keyss.methods.learned.payload import (  # noqa: E402
+    HiddenSecret,
+    choose_anchors,
+    pack_secret,
+    unpack_secret,
+)
 from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import OPENED_BY, unpack_records  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
@@ -152,6 +162,7 @@ def main() -> None:
     write_extremes()
     write_counted()
     write_whole()
+    write_learned()
 
 
 def write_published() -> None:
@@ -228,16 +239,86 @@ def write_whole() -> None:
     """Models as one string of bytes, and streams of the compression in it that have every kind of chunk."""
     far = trained_like(40, 8, 0)
     far.means[3, 1] = -1e5  # an outlier
-    models = [trained_like(40, 9, 3), far, trained_like(10, 10, 1)[:1]]
+    seen = trained_like(40, 9, 3)
+    seen.log_scales[2] += 8  # of which harmonics are as fine as they get, and of the next as coarse
+    seen.opacity_logits[3] = -14
+    models = [seen, far, trained_like(10, 10, 1)[:1]]
     encoded = [whole.encode(each) for each in models]
     found = {
         "models": [{"data": data.hex(), "sha256": digests(whole.decode(data).gaussians)} for data in encoded],
         "streams": [
-            {"data": stream.hex(), "size": len(plain), "sha256": hashlib.sha256(plain).hexdigest()}
+            {
+                "data": stream.hex(),
+                "size": len(plain),
+                "sha256": hashlib.sha256(plain).hexdigest(),
+                "flipped": flipped(stream, len(plain)),
+            }
             for stream, plain in lzma_streams()
         ],
     }
     (FOLDER / "whole.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def flipped(stream: bytes, size: int) -> dict[int, str | None]:
+    """By numbers of bits: what a stream with this one flipped becomes, None where it is damaged."""
+    found: dict[int, str | None] = {}
+    for at in sorted(
+        {*range(0, len(stream), 7 if size < 1 << 20 else 41), *range(max(0, len(stream) - 9), len(stream))}
+    ):
+        bit = 8 * at + at % 8
+        changed = bytearray(stream)
+        changed[at] ^= 1 << at % 8
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=whole._FILTERS)
+        found[bit] = None
+        with suppress(lzma.LZMAError):
+            plain = unpacker.decompress(bytes(changed), size + 1)
+            if len(plain) == size and unpacker.eof and not unpacker.unused_data:
+                found[bit] = hashlib.sha256(plain).hexdigest()
+    return found
+
+
+def write_learned() -> None:
+    """Some rows of what decoders of every kind make of `carried.ply`, and that in `learned.ply` of this."""
+    shapes = [
+        DecoderShape(mask=ATTRIBUTES, hidden=(6, 5), branch=4, frequencies=2, sh_degree=1),
+        DecoderShape(
+            mask=("op", "sh"),
+            conditioning="bias",
+            hidden=(4, 4),
+            branch=3,
+            frequencies=0,
+            design="published",
+            residuals="one-sided",
+        ),
+    ]
+    stego = read_model(FOLDER / "carried.ply")
+    payloads = [("carried.ply", pack_secret(decoder_of(shape, stego))) for shape in shapes]
+    key = json.loads((FOLDER / "carried.json").read_text())["key"]
+    payloads.append(("learned.ply", LOW_BITS.extract(read_model(FOLDER / "learned.ply"), key).data))
+    found = [
+        {"file": name, "payload": payload.hex()} | decoded(payload, read_model(FOLDER / name))
+        for name, payload in payloads
+    ]
+    (FOLDER / "learned.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:
+    """A secret with a decoder that changes much, in a frame of its own; a third of it was lost."""
+    generator = torch.Generator().manual_seed(16)
+    decoder = Decoder(shape)
+    decoder.prepare(stego.with_sh_degree(shape.sh_degree), random_embeddings(1, generator)[0])
+    for weights in decoder.network.parameters():
+        torch.nn.init.normal_(weights, std=0.3, generator=generator)
+    turn = torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix())
+    frame = Similarity(0.8, turn, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
+    return HiddenSecret(decoder.requires_grad_(False), frame, choose_anchors(stego, generator), 600)
+
+
+def decoded(payload: bytes, stego: Gaussians) -> dict[str, Any]:
+    """How many Gaussians a payload reveals, and every 99th of them."""
+    model = unpack_secret(payload).reveal(stego)
+    rows = {each.name: getattr(model[::99], each.name).flatten().tolist() for each in fields(Gaussians)}
+    return {"count": len(model), "rows": {name: [round(v, 7) for v in each] for name, each in rows.items()}}
 
 
 def lzma_streams() -> list[tuple[bytes, bytes]]:
@@ -245,7 +326,7 @@ def lzma_streams() -> list[tuple[bytes, bytes]]:
     random = np.random.default_rng(1)
     words = [bytes(random.integers(97, 110, size).tolist()) for size in random.integers(2, 9, 60)]
     text = b" ".join(words[i] for i in random.integers(0, len(words), 400))
-    plains = (b"", text, bytes(3 << 20), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
+    plains = (b"", text, bytes((2 << 20) + 999), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
     others = {"lc": 3, "lp": 1, "pb": 2}
     packed = [
         lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole._FILTERS[0], **changed}])

@@ -11,11 +11,12 @@ import pytest
 from keyss.core.errors import KeyssWarning
 from keyss.files import read_model
 from keyss.methods.records import whole
-from vectors.make_vectors import FOLDER, counted, digests, revealed
+from vectors.make_vectors import FOLDER, counted, decoded, digests, revealed
 
 REVEALED = json.loads((FOLDER / "revealed.json").read_text())
 WHOLE = json.loads((FOLDER / "whole.json").read_text())
 COUNTED = json.loads((FOLDER / "counted.json").read_text())
+LEARNED = json.loads((FOLDER / "learned.json").read_text())
 PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
 
@@ -43,3 +44,11 @@ def test_what_whole_models_hold(expected: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", COUNTED["bits"])
 def test_which_bits_of_published_files_carry(name: str) -> None:
     assert counted(read_model(FOLDER / name)) == COUNTED["bits"][name]
+
+
+@pytest.mark.parametrize("expected", LEARNED, ids=lambda each: f"{each['file']} {each['count']}")
+def test_what_decoders_reveal(expected: dict[str, Any]) -> None:
+    found = decoded(bytes.fromhex(expected["payload"]), read_model(FOLDER / expected["file"]))
+    assert found["count"] == expected["count"]
+    for name, values in expected["rows"].items():
+        assert found["rows"][name] == pytest.approx(values, abs=1e-5, rel=1e-5)

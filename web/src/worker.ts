@@ -2,7 +2,7 @@
 import type { Content, Reader } from './channels/content.ts';
 import { readerOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
-import { buffersOf } from './core/gaussians.ts';
+import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel, type ReadModel } from './files/models.ts';
 import type { Derive } from './keys/derivation.ts';
 import { derivedBy, here, inTurn } from './keys/pool.ts';
@@ -10,6 +10,7 @@ import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
 let derive: Derive = here;
+let stego: Gaussians | null = null;
 let prepared: Promise<Reader | null> = Promise.resolve(null);
 
 function answer(message: Answer, moved: Transferable[] = []): void {
@@ -21,6 +22,7 @@ async function load({ id, name, keyless }: Question, bytes: Uint8Array): Promise
   const { codes, ...model } = read;
   answer({ id, model }, keyless ? buffersOf(model) : []);
   if (keyless) return;
+  stego = model;
   // Afterwards: the picture comes first.
   prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
 }
@@ -36,7 +38,7 @@ function readerWhereThereIsMemory(model: ReadModel): Reader | null {
 async function unlock(id: number, key: string): Promise<void> {
   const reader = await prepared;
   const content = reader === null ? null : await reader.open(key, counted(id, reader.derivations));
-  const model = content && secretOf(content)?.gaussians;
+  const model = content && stego && secretOf(content, stego)?.gaussians;
   if (model) answer({ id, model }, buffersOf(model));
   else answer({ id, file: content ? fileOf(content) : undefined });
 }

@@ -5,7 +5,7 @@ import { columns, digest, hex, jsonVector } from './vectors.ts';
 
 interface Vectors {
   models: { data: string; sha256: Record<string, string> }[];
-  streams: { data: string; size: number; sha256: string }[];
+  streams: { data: string; size: number; sha256: string; flipped: Record<string, string | null> }[];
 }
 
 const { models, streams } = jsonVector<Vectors>('whole.json');
@@ -18,6 +18,20 @@ test.each(models)('a whole model is what Python reads, bit for bit', ({ data, sh
 test.each(streams)('a raw LZMA2 stream of $size bytes', ({ data, size, sha256 }) => {
   expect(digest(unpackedLzma2(hex(data), size))).toBe(sha256);
   for (const other of [size - 1, size + 1]) expect(() => unpackedLzma2(hex(data), other)).toThrow(DAMAGED);
+});
+
+test.each(streams)('a stream of $size bytes with one bit flipped', ({ data, size, flipped }) => {
+  for (const [bit, expected] of Object.entries(flipped)) {
+    const bytes = hex(data);
+    bytes[Number(bit) >> 3] ^= 1 << (Number(bit) & 7);
+    let found: string | null = null;
+    try {
+      found = digest(unpackedLzma2(bytes, size));
+    } catch (error) {
+      expect((error as Error).message).toMatch(DAMAGED);
+    }
+    expect([bit, found]).toEqual([bit, expected]);
+  }
 });
 
 test.each(models)('a damaged model ends in one sentence or is one', ({ data }) => {

@@ -91,9 +91,9 @@ function middle(a: number, b: number, c: number): number {
   return Math.max(Math.min(a, b), Math.min(Math.max(a, b), c));
 }
 
-/** How many bits of levels span 2 to `log` at most. */
+/** How many bits of levels span 2 to `log` at most; NaN, of which bytes make 0, for NaN. */
 function fitting(log: number): number {
-  return Math.min(Math.max(Math.floor(log || 0), 0), MOST_BITS); // NaN counts as 0
+  return Math.min(Math.max(Math.floor(log), 0), MOST_BITS);
 }
 
 const NUMBER = new Float64Array(1);
