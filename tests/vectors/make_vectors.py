@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import lzma
+import struct
 import sys
 import unicodedata
 from contextlib import suppress
@@ -34,7 +35,13 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 from channels.codes import published as codes_examples  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
-from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
+from files.formats.examples import (  # noqa: E402
+    ksplat_of,
+    model_of,
+    random_compressed,
+    random_sog,
+    random_spz,
+)
 from keyss.channels.base import Payload  # noqa: E402
 from keyss.channels.codes import published  # noqa: E402
 from keyss.channels.codes.channel import _last_bits  # noqa: E402
@@ -45,7 +52,7 @@ from keyss.channels.opening import open_content  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
-from keyss.files.formats import compressed_ply, sog, spz  # noqa: E402
+from keyss.files.formats import compressed_ply, glb, sog, splat, spz  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
@@ -61,6 +68,7 @@ from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import OPENED_BY, unpack_records  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.learned.hiding import some_secret  # noqa: E402
+from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
 def cell() -> dict[str, object]:
@@ -166,7 +174,11 @@ def write_published() -> None:
         "published-4.spz": spz.serialise(spz.quantise(model, version=4)),
         "published.compressed.ply": compressed_ply.write_compressed_ply(model),
         "published.sog": sog.write_sog(model),
+        "published.splat": splat.write_splat(model),
+        "published.glb": glb.write_glb(model[:100]),
+        "published-moved.glb": placed_elsewhere(model[:40]),
     }
+    files |= {f"published-{level}.ksplat": ksplat_of(model_of(150, 2, seed=8), level) for level in range(3)}
     read = {}
     for name, data in files.items():
         (FOLDER / name).write_bytes(data)
@@ -325,6 +337,21 @@ def lzma_streams() -> list[tuple[bytes, bytes]]:
     return [*zip(packed, plains, strict=True), (joined, b"".join(plains))]
 
 
+def placed_elsewhere(model: Gaussians) -> bytes:
+    """A .glb whose nodes move, turn and scale the Gaussians, which are shown twice."""
+    data = glb.write_glb(model)
+    (size,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + size])
+    turned = {"rotation": [0.1, -0.7, 0.3, 0.64], "scale": [1.5, 1.5, 1.5], "children": [1, 2]}
+    document["nodes"] = [turned, {"mesh": 0}, {"mesh": 0, "translation": [1, -2, 0.5]}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    start = struct.pack(
+        "<4sIIII", b"glTF", 2, 12 + 8 + len(text) + len(data) - 20 - size, len(text), 0x4E4F534A
+    )
+    return start + text + data[20 + size :]
+
+
 def digests(model: Gaussians) -> dict[str, str]:
     """SHA-256 of the float32 columns."""
     columns = {field.name: getattr(model, field.name).numpy() for field in fields(Gaussians)}
@@ -338,6 +365,9 @@ def write_revealed(key: str) -> None:
     for suffix in codes_examples.FORMATS:
         write_coded(suffix)
         opened += [revealed(f"coded{suffix}", each) for each in TWO_KEYS]
+    write_surviving(FOLDER, TWO_KEYS)
+    opened += [revealed(name, TWO_KEYS[0]) for name in NAMES]
+    opened += [revealed(name, TWO_KEYS[1]) for name in NAMES[:3]]
     (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cli.said import PROGRAM as KEYSS
+from files.formats.examples import ksplat_of
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
 from keyss.files.ply import write_ply
@@ -92,11 +93,14 @@ def test_served_it_is_the_same(tab: Visit, served: str, secrets: list[Gaussians]
     assert all(url.startswith((served, f"blob:{served}")) for url in tab.requests), tab.requests
 
 
-@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply"])
+@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "splat", "glb", "ksplat"])
 def test_published_formats_are_shown(tab: Visit, page_file: Path, tmp_path: Path, suffix: str) -> None:
     converted = tmp_path / f"model.{suffix}"
     model = made(600, 5)
-    write_model(converted, model)
+    if suffix == "ksplat":  # which keyss only reads
+        converted.write_bytes(ksplat_of(model, level=1))
+    else:
+        write_model(converted, model)
     tab.goto(page_file.as_uri() + POSE)
     tab.page.set_input_files("#file", converted)
     tab.page.wait_for_function("() => document.getElementById('facts').textContent.includes('600')")

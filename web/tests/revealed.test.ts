@@ -1,5 +1,7 @@
 import { expect, test } from 'vitest';
-import { readerOf } from '../src/channels/opening.ts';
+import type { Content } from '../src/channels/content.ts';
+import { readersOf } from '../src/channels/opening.ts';
+import type { ReadModel } from '../src/files/models.ts';
 import { secretOf } from '../src/records/secret.ts';
 import { columns, digest, jsonVector, modelOf } from './vectors.ts';
 
@@ -16,9 +18,18 @@ interface Revealed {
 
 const REVEALED = jsonVector<Revealed[]>('revealed.json');
 
+/** In the first channel in which it opens something: to look into all of them would take ten times as long. */
+async function opened(stego: ReadModel, key: string): Promise<Content | null> {
+  for (const reader of readersOf(stego)) {
+    const content = await reader.open(key);
+    if (content !== null) return content;
+  }
+  return null;
+}
+
 test.each(REVEALED)('$file gives $key what Python reveals, bit for bit', async (expected) => {
   const stego = await modelOf(expected.file);
-  const content = await readerOf(stego)!.open(expected.key);
+  const content = await opened(stego, expected.key);
   expect(content?.method).toBe(expected.method);
   if (expected.payload) {
     expect(content!.service === 'payload' && digest(content!.data)).toBe(expected.payload);

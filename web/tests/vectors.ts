@@ -18,7 +18,7 @@ export function jsonVector<T>(name: string): T {
 
 /** The model in a file; the images of a .sog, which browsers decode otherwise, by another program's decoder. */
 export async function modelOf(name: string): Promise<ReadModel> {
-  if (!name.endsWith('.sog')) return readModel(vector(name));
+  if (!name.endsWith('.sog')) return readModel(vector(name), name);
   const codec = await WebPCodec.create();
   return readSog(vector(name), async (data, count) => codec.decodeRGBA(data).rgba.slice(0, 4 * count));
 }

@@ -24,6 +24,7 @@ const page = {
   key: element<HTMLInputElement>('key'),
   open: element<HTMLButtonElement>('open'),
   status: element('status'),
+  progress: element<HTMLProgressElement>('progress'),
   problem: element('problem'),
   facts: element('facts'),
   up: element<HTMLSelectElement>('up'),
@@ -45,7 +46,7 @@ class Page {
   private name = 'model';
   private published: Gaussians | null = null;
   private secret: Gaussians | null = null;
-  private readonly opener = new Opener();
+  private readonly opener = new Opener((share) => (page.progress.value = share));
   private readonly controls: Controls;
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
   private addressTimer = 0;
@@ -128,7 +129,7 @@ class Page {
     const own = ++this.loads;
     this.say('Reading …');
     page.problem.textContent = '';
-    const { model, error } = await this.opener.load(bytes);
+    const { model, error } = await this.opener.load(bytes, name);
     if (own !== this.loads) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published, this.secret] = [name, model, null];
@@ -154,6 +155,8 @@ class Page {
     page.open.disabled = true;
     page.main.setAttribute('aria-busy', 'true');
     this.say('Trying the key …');
+    page.progress.value = 0;
+    page.progress.hidden = false;
     const { model, file } = await this.opener.unlock(key);
     page.key.value = '';
     if (own === this.loads) {
@@ -168,6 +171,7 @@ class Page {
     if (file) save(file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file', new Blob([file.data as BlobPart]));
     page.open.disabled = false;
     page.main.setAttribute('aria-busy', 'false');
+    page.progress.hidden = true;
     this.say('');
   }
 

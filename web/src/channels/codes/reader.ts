@@ -6,8 +6,9 @@
  */
 import { ascii, bytesKey } from '../../core/bytes.ts';
 import type { Codes } from '../../files/models.ts';
-import { type Derive, expand, master, SALT_BYTES } from '../../keys/derivation.ts';
+import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
 import { damaged, decrypted } from '../../keys/encryption.ts';
+import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
 import { findHeader, order, Room, ZONE_RATE } from './layout.ts';
 import { lastBits } from './order.ts';
@@ -19,6 +20,8 @@ const USUAL_RATE = 800; // of a key that opens nothing
 const MOST_BITS = 2 ** 30; // of which more would take more memory than tabs have
 
 export class CodesReader implements Reader {
+  readonly derivations = 1;
+
   private constructor(
     private readonly room: Room,
     private readonly zone: Uint8Array, // salt and slots
@@ -47,7 +50,7 @@ export class CodesReader implements Reader {
   }
 
   /** What `key` opens, null for nothing. Raises InputError for damage. */
-  async open(key: string, derive: Derive = master): Promise<Content | null> {
+  async open(key: string, derive: Derive = here): Promise<Content | null> {
     const secret = await derive(key, this.salt);
     const header = findHeader(this.zone, secret, this.room);
     const most = Math.floor((this.room.dataBlocks * USUAL_RATE) / 8);
