@@ -18,7 +18,7 @@ from keyss.files.models import read_model, write_model
 from keyss.files.ply import write_ply
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
-from viewer.browser import POSE, PROGRAM, WEB, Visit, drawn, made, psnr
+from viewer.browser import POSE, PROGRAM, WEB, Visit, camera_of, drawn, made, psnr
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
 pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
@@ -136,14 +136,20 @@ def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path
 def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:
     tab.goto(page_file.as_uri())
     reached: list[str] = []
+    tab.page.focus("#more")  # folded on a narrow screen
+    tab.page.keyboard.press("Enter")
+    tab.page.focus("#picture")
     for _ in range(14):
         tab.page.keyboard.press("Tab")
         reached.append(tab.page.evaluate("document.activeElement.id || document.activeElement.tagName"))
-    assert {"picture", "key", "open", "file", "fly", "home", "snapshot", "SUMMARY"} <= set(reached)
+    assert {"more", "key", "show", "open", "file", "fly", "home", "snapshot", "SUMMARY"} <= set(reached)
     tab.page.focus("#key")
     tab.page.keyboard.type(KEYS[0])
     tab.page.keyboard.press("Enter")
     tab.page.wait_for_selector("#revealed:not([hidden])")
+    tab.page.wait_for_selector("main[aria-busy=false]")
+    assert tab.page.locator("[role=status]").inner_text() == "The secret is shown: 200 Gaussians."
+    assert tab.page.evaluate("document.activeElement.id") == "key"  # where the next one can be typed
     tab.page.focus("#picture")
     before = tab.page.url
     for key in ("ArrowLeft", "w", "-"):
@@ -152,14 +158,20 @@ def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:
 
 
 @pytest.mark.skipif(not AXE.exists(), reason="no axe-core: `make test-web` installs it")
-def test_axe_finds_nothing_serious(tab: Visit, page_file: Path) -> None:
+@pytest.mark.parametrize("width", [390, 1280])
+def test_axe_finds_nothing(tab: Visit, page_file: Path, width: int) -> None:
+    tab.page.set_viewport_size({"width": width, "height": 800})
     tab.goto(page_file.as_uri())
     tab.try_key(KEYS[0])
-    tab.page.click("summary")
+    if width < 600:
+        tab.page.click("#more")
+    for summary in tab.page.locator("summary").all():
+        summary.click()
     tab.page.evaluate(AXE.read_text())
     found = tab.page.evaluate("axe.run()")
-    assert [each["id"] for each in found["violations"] if each["impact"] in ("serious", "critical")] == []
+    assert [each["id"] for each in found["violations"]] == []
     assert len(found["passes"]) > 10
+    assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
 def test_looking_saving_and_wiping(
@@ -167,6 +179,7 @@ def test_looking_saving_and_wiping(
 ) -> None:
     tab.goto(page_file.as_uri() + POSE)
     plain = tab.picture()
+    tab.page.click("#more")
     tab.page.click("summary")
     tab.page.fill("#threshold", "0.5")
     tab.page.wait_for_function("() => !document.getElementById('count').textContent.startsWith('4,000 of')")
@@ -192,3 +205,47 @@ def test_looking_saving_and_wiping(
         tab.page.click("#snapshot")
     download.value.save_as(tmp_path / "view.png")
     assert (tmp_path / "view.png").read_bytes().startswith(b"\x89PNG")
+    assert download.value.suggested_filename == "stego.png"
+    tab.page.fill("#wipe", "0")
+    tab.page.click("#close")
+    tab.at(POSE)
+    assert tab.page.locator("#revealed").is_hidden()
+    assert psnr(tab.picture(), plain) > 40
+
+
+def test_a_file_can_be_dropped(tab: Visit, page_file: Path) -> None:
+    tab.goto(page_file.as_uri())
+    drag = """name => {
+        const data = new DataTransfer();
+        data.items.add(new File([new Uint8Array(64)], 'dropped.splat'));
+        const how = {dataTransfer: data, bubbles: true, cancelable: true};
+        document.body.dispatchEvent(new DragEvent(name, how));
+    }"""
+    tab.page.evaluate(drag, "dragover")
+    assert tab.page.locator("#drop").is_visible()
+    tab.page.evaluate(drag, "drop")
+    assert tab.page.locator("#drop").is_hidden()
+    tab.page.wait_for_function("() => document.getElementById('facts').textContent.includes('dropped')")
+    assert "2 Gaussians" in tab.page.locator("#facts").inner_text()
+
+
+def test_a_key_can_be_seen_while_it_is_typed_and_not_afterwards(tab: Visit, page_file: Path) -> None:
+    tab.goto(page_file.as_uri())
+    tab.page.click("#show")
+    assert tab.page.get_attribute("#key", "type") == "text"
+    tab.try_key("another key")
+    assert tab.page.get_attribute("#key", "type") == "password"
+    assert tab.page.input_value("#key") == ""
+
+
+def test_a_high_screen_has_the_scene_in_it(tab: Visit, page_file: Path) -> None:
+    def distance() -> float:
+        tab.goto(page_file.as_uri())
+        tab.page.wait_for_function("() => location.hash.includes('eye')")
+        camera = camera_of(tab.page.url)
+        return float(camera.viewmat[:3, 3].norm())
+
+    wide = distance()
+    tab.page.set_viewport_size({"width": 300, "height": 600})
+    tab.page.goto("about:blank")
+    assert distance() > 1.5 * wide

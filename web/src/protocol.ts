@@ -7,6 +7,7 @@ export interface Question {
   readonly ports?: readonly MessagePort[];
   readonly bytes?: Uint8Array;
   readonly name?: string; // of the file; some formats are known by it only
+  readonly keyless?: boolean; // no key will be tried on these bytes
   readonly key?: string;
 }
 

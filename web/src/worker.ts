@@ -17,10 +17,11 @@ function answer(message: Answer, moved: Transferable[] = []): void {
   (self as unknown as Worker).postMessage(message, moved);
 }
 
-async function load(id: number, bytes: Uint8Array, name = ''): Promise<void> {
+async function load({ id, name, keyless }: Question, bytes: Uint8Array): Promise<void> {
   const read = await readModel(bytes, name);
   const { codes, ...model } = read;
-  answer({ id, model });
+  answer({ id, model }, keyless ? buffersOf(model) : []);
+  if (keyless) return;
   stego = model;
   // Afterwards: the picture comes first.
   prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
@@ -66,7 +67,7 @@ self.onmessage = async ({ data }: MessageEvent<Question>) => {
     return;
   }
   try {
-    if (data.bytes) await load(data.id, data.bytes, data.name);
+    if (data.bytes) await load(data, data.bytes);
     else await unlock(data.id, data.key ?? '');
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';

@@ -36,6 +36,11 @@ export class Opener {
     return this.ask({ id: this.next++, bytes, name }, [bytes.buffer as ArrayBuffer]);
   }
 
+  /** The model in a file that nobody has a key for. */
+  look(bytes: Uint8Array, name: string): Promise<Answer> {
+    return this.ask({ id: this.next++, bytes, name, keyless: true }, [bytes.buffer as ArrayBuffer]);
+  }
+
   /** What a key opens. */
   unlock(key: string): Promise<Answer> {
     return this.ask({ id: this.next++, key });
