@@ -163,6 +163,7 @@ def test_a_fit_is_seen_while_it_goes_on(tmp_path: Path) -> None:
         *SMALL[4:],
         "--live",
         "--iterations",
+        100_000,
     ]
     with (
         subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as process,

@@ -48,7 +48,7 @@ test('what is moved and moved back is as it was', async () => {
   const model = await modelOf('carried.ply');
   const turn = [0, -0.6, 0.8, 1, 0, 0, 0, 0.8, 0.6];
   const similarity = { scale: 2.5, rotation: turn, translation: [3, -4, 0.1] };
-  const back = moved(moved(model, similarity), inverse(similarity));
+  const back = moved(inverse(similarity), moved(similarity, model));
   for (const column of ['means', 'logScales', 'sh'] as const) {
     back[column].forEach((each, at) => {
       if (Math.abs(each - model[column][at]) > 1e-5) throw new Error(`${column} ${at}`);

@@ -1,10 +1,13 @@
 /** Reader of .glb with KHR_gaussian_splatting; `keyss.files.formats.glb` on the other side. */
 import { InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { type Matrix, moved, product, similarityOf } from '../core/similarity.ts';
+import { isSimilarity, moved, type Similarity } from '../core/similarity.ts';
 import { damagedFile, logitOf, logScale, unitQuat } from './coded.ts';
 import { chunksOf, type Document, EXTENSION, type Node, type Primitive, values } from './gltf.ts';
 import { checkedFinite } from './ply.ts';
+
+/** [4, 4] in rows. */
+type Matrix = readonly number[];
 
 const COUNTS = [1, 3, 5, 7]; // coefficients of each degree
 const MOST_DEPTH = 64; // of nodes in nodes
@@ -113,7 +116,25 @@ function gaussiansOf(document: Document, primitive: Primitive, binary: Uint8Arra
 function inFrameOfPly(model: Gaussians, placed: Matrix): Gaussians {
   const whole = product(TURN, placed);
   if (whole.every((each, at) => each === IDENTITY[at])) return model;
-  return moved(model, similarityOf(whole));
+  return moved(similarityOf(whole), model);
+}
+
+function product(a: Matrix, b: Matrix): Matrix {
+  const at = (row: number, column: number): number =>
+    [0, 1, 2, 3].reduce((sum, each) => sum + a[4 * row + each] * b[4 * each + column], 0);
+  return Array.from({ length: 16 }, (_, index) => at(Math.floor(index / 4), index % 4));
+}
+
+/** Raises InputError for a transform that does more than move, turn and scale evenly. */
+function similarityOf(whole: Matrix): Similarity {
+  const linear = [0, 1, 2].flatMap((row) => whole.slice(4 * row, 4 * row + 3));
+  const [a, b, c, d, e, f, g, h, i] = linear;
+  const determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g);
+  const scale = Math.abs(determinant) ** (1 / 3);
+  const rotation = linear.map((each) => each / scale);
+  const found = { scale, rotation, translation: [whole[3], whole[7], whole[11]] };
+  if (isSimilarity(found)) return found;
+  throw new InputError('This .glb does more to its Gaussians than move, turn and scale them evenly.');
 }
 
 /** One model of several, of their largest degree. */

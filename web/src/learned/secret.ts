@@ -1,7 +1,7 @@
 /** A learned secret whose key opens a decoder; `keyss.methods.learned.payload` on the other side. */
 import { type Gaussians, opacity, selected } from '../core/gaussians.ts';
 import { InputError } from '../core/errors.ts';
-import { inverse, isRotation, moved, type Similarity } from '../core/similarity.ts';
+import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
 import { ascii } from '../core/bytes.ts';
 import { damaged } from '../keys/encryption.ts';
 import { compensated } from '../records/compensation.ts';
@@ -29,7 +29,7 @@ export function decodeLearned(payload: Uint8Array, stego: Gaussians): { gaussian
   const decoded = Decoder.of(header.shape, read).decode(own);
   const drawn = rowsWhere(decoded, (row) => Math.fround(opacity(decoded.opacityLogits[row])) >= DRAWN_OPACITY);
   const left = drawn.count ? compensated(drawn, count) : decoded;
-  return { gaussians: moved(left, inverse(frame)), hidden: count };
+  return { gaussians: moved(inverse(frame), left), hidden: count };
 }
 
 function frameOf(described: Record<string, unknown>): Similarity {
@@ -38,7 +38,7 @@ function frameOf(described: Record<string, unknown>): Similarity {
   const [scale] = numbersOf([described.scale], 1);
   const rotation = rows.flatMap((row) => numbersOf(row, 3));
   const found = { scale, rotation, translation: numbersOf(described.translation, 3) };
-  if (!(scale > 0) || !isRotation(rotation)) throw damaged();
+  if (!isSimilarity(found)) throw damaged();
   return found;
 }
 

@@ -52,12 +52,7 @@ class Page {
     page.download.addEventListener('click', () => {
       if (this.secret) save('secret.ply', new Blob([writePly(this.secret) as BlobPart]));
     });
-    page.close.addEventListener('click', () => {
-      this.hideSecret();
-      this.controls.setPose(this.firstPose());
-      this.say('');
-      page.key.focus();
-    });
+    page.close.addEventListener('click', () => this.closeSecret());
     page.wipe.addEventListener('input', () => this.split(Number(page.wipe.value) / 100));
     listenToLooks(() => {
       this.showPublished();
@@ -177,13 +172,24 @@ class Page {
     this.say(found);
   }
 
+  /** Seen as what was there before was. */
   private reveal(model: Gaussians): void {
+    const pose = alike(this.pose, this.secret ?? this.published ?? model, model);
     this.secret = model;
     this.viewer.show(model, 'right');
     this.split(0);
     page.revealed.hidden = false;
-    this.controls.setPose(this.firstPose());
+    this.controls.setPose(pose);
     this.writeAddress();
+  }
+
+  private closeSecret(): void {
+    const pose = this.secret && this.published ? alike(this.pose, this.secret, this.published) : this.pose;
+    this.hideSecret();
+    this.controls.setPose(pose);
+    this.writeAddress();
+    this.say('');
+    page.key.focus();
   }
 
   private hideSecret(): void {

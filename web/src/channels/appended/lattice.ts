@@ -92,7 +92,7 @@ export function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
 /** [N, 6] the nearest lattice points of positions and turns; `toOwn`: from the world to the own frame. */
 export function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
   const found = new Uint16Array(6 * faint.count);
-  const { means, quats } = moved(faint, toOwn);
+  const { means, quats } = moved(toOwn, faint);
   for (let row = 0; row < faint.count; row++) {
     for (let axis = 0; axis < 3; axis++) {
       found[6 * row + axis] = nearest(means[3 * row + axis] * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
