@@ -115,7 +115,9 @@ def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     _, *fields = words_of(gaussians)
     low = np.empty((len(gaussians), layout.width), np.uint8)
     in_blocks(
-        lambda start, stop: kernels.pack(start, stop, *fields, layout.quats, low), len(gaussians), KERNEL_BLOCK
+        lambda start, stop: kernels.pack(start, stop, *fields, layout.quats, low),
+        len(gaussians),
+        KERNEL_BLOCK,
     )
     return low
 

@@ -46,7 +46,15 @@ def _ranks(gaussians: Gaussians, layout: Layout) -> npt.NDArray[np.uint64]:
     ranks = np.empty(len(gaussians), np.uint64)
     in_blocks(
         lambda start, stop: kernels.ranks(
-            start, stop, *fields, layout.mask, layout.shifts, layout.quats, EQUAL_HARMONICS, UNIT_TOLERANCE, ranks
+            start,
+            stop,
+            *fields,
+            layout.mask,
+            layout.shifts,
+            layout.quats,
+            EQUAL_HARMONICS,
+            UNIT_TOLERANCE,
+            ranks,
         ),
         len(gaussians),
         KERNEL_BLOCK,

@@ -199,7 +199,9 @@ def _frequent_values(gaussians: Gaussians) -> list[Words]:
     for words, first in ((scales, 0), (quats, 0), (opacities[:, None], 0), (sh, 3)):
         copies = _unlikely_copies(words[:, first:].size)
         flat = np.sort(crowded(words, first, copies))
-        found.append(np.unique(flat[copies - 1 :][flat[copies - 1 :] == flat[: max(0, len(flat) - copies + 1)]]))
+        found.append(
+            np.unique(flat[copies - 1 :][flat[copies - 1 :] == flat[: max(0, len(flat) - copies + 1)]])
+        )
     return found
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from keyss.rendering.cpu.jit import exact_inlined, exact_kernel
 
 GEOMETRY = 7  # numbers before the harmonics
-TABLE_BITS = 16  # codes of so many bits or fewer are looked up
 _LEAST_LENGTH = 0.5  # of a quaternion that was put together
 
 
@@ -77,23 +76,20 @@ def beyond(start, stop, means, scales, opacities, sh, overflow, limits, opponent
 def reaches(
     start, stop, means, scales, opacities, sh, overflow, limits, opponent, line_of, centres, outlier, found
 ):
-    """`found` [L, 5] of the numbers of each line: least, largest, sum and most of the distance from its centre
-    [L], these of Gaussians that are no outliers; and the largest distance of those that are.
+    """`found` [L, 5]: least and largest number of each line, sum of the distances from its centre [L], all
+    without outliers; least and largest number of these.
     """
     numbers = np.empty(len(line_of))
-    found[:, 0], found[:, 1], found[:, 2:] = np.inf, -np.inf, 0.0
+    found[:, 0], found[:, 1], found[:, 2], found[:, 3], found[:, 4] = np.inf, -np.inf, 0.0, np.inf, -np.inf
     for row in range(start, stop):
         _numbers(row, means, scales, opacities, sh, overflow, limits, opponent, numbers)
+        at = 3 if outlier[row] else 0
         for i in range(len(line_of)):
-            line = line_of[i]
-            distance = abs(numbers[i] - centres[line])
-            if outlier[row]:
-                found[line, 4] = max(found[line, 4], distance)
-            else:
-                found[line, 0] = min(found[line, 0], numbers[i])
-                found[line, 1] = max(found[line, 1], numbers[i])
-                found[line, 2] += distance
-                found[line, 3] = max(found[line, 3], distance)
+            line, value = line_of[i], numbers[i]
+            found[line, at] = min(found[line, at], value)
+            found[line, at + 1] = max(found[line, at + 1], value)
+            if not outlier[row]:
+                found[line, 2] += abs(value - centres[line])
 
 
 @exact_inlined
