@@ -79,7 +79,9 @@ def read_ply(path: Path | str | StandardInput) -> Gaussians:
         means, quats, log_scales, opacity_logits, sh = tensors
         means[part], quats[part], log_scales[part] = rows[:, 0:3], rows[:, -4:], rows[:, -7:-4]
         opacity_logits[part], sh[part, 0] = rows[:, -8], rows[:, 3:6]
-        sh[part, 1:] = rows[:, 6:-8].reshape(len(rows), 3, -1).transpose(0, 2, 1)
+        rest = rows[:, 6:-8].reshape(len(rows), 3, -1)
+        for colour in range(3):
+            sh[part, 1:, colour] = rest[:, colour]
 
     read_row_blocks(path, begin)
     return Gaussians(*map(torch.from_numpy, tensors))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from keyss.core.errors import InputError
-from keyss.files.ply_table import MAX_HEADER_BYTES, Rows, read_vertex_blocks
+from keyss.files.ply_table import MAX_HEADER_BYTES, Rows, WholeTable, read_vertex_blocks
 from keyss.files.streams import StandardInput
 
 # Stands in for an infinite opacity logit. Converters write infinities for opacities of 0 and 1; a larger
@@ -31,17 +31,8 @@ def read_rows(path: Path | str | StandardInput) -> tuple[list[str], Rows]:
 
     Raises InputError for anything that is not a whole, finite 3DGS model in binary or ascii PLY.
     """
-    whole: list[Rows] = []
-
-    def begin(names: list[str], count: int) -> Callable[[int, Rows], None]:
-        whole.append(np.empty((count, len(names)), np.float32))
-
-        def place(start: int, rows: Rows) -> None:
-            whole[0][start : start + len(rows)] = rows
-
-        return place
-
-    return read_row_blocks(path, begin), whole[0]
+    whole = WholeTable()
+    return read_row_blocks(path, whole.begin), whole.rows
 
 
 def read_row_blocks(

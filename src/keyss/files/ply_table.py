@@ -47,17 +47,19 @@ def read_vertices(
 
     See `read_vertex_blocks`.
     """
-    whole: list[Rows] = []
+    whole = WholeTable()
+    return read_vertex_blocks(path, choose, whole.begin), whole.rows
 
-    def begin(names: list[str], count: int) -> Callable[[int, Rows], None]:
-        whole.append(np.empty((count, len(names)), np.float32))
 
-        def place(start: int, rows: Rows) -> None:
-            whole[0][start : start + len(rows)] = rows
+class WholeTable:
+    """What takes all vertices of `read_vertex_blocks`."""
 
-        return place
+    def begin(self, names: list[str], count: int) -> Callable[[int, Rows], None]:
+        self.rows = np.empty((count, len(names)), np.float32)
+        return self._place
 
-    return read_vertex_blocks(path, choose, begin), whole[0]
+    def _place(self, start: int, rows: Rows) -> None:
+        self.rows[start : start + len(rows)] = rows
 
 
 def read_vertex_blocks(

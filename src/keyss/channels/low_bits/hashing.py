@@ -41,7 +41,8 @@ _SIGMA = np.array(
         [10, 2, 8, 4, 7, 6, 1, 5, 15, 11, 9, 14, 3, 12, 13, 0],
         [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15],
         [14, 10, 4, 8, 9, 15, 13, 6, 1, 12, 0, 2, 11, 7, 5, 3],
-    ]
+    ],
+    np.uint64,  # as indices, these need not be held to be negative
 )  # fmt: skip
 _ROTATE = tuple(np.uint64(each) for each in (32, 24, 16, 63))
 _BACK = tuple(np.uint64(64 - int(each)) for each in _ROTATE)

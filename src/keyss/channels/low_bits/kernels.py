@@ -1,9 +1,9 @@
 """What is done with the words of every Gaussian, compiled: low bits, and what gives a Gaussian away.
 
-All functions take four arrays of bit patterns (uint32, see `bits.words_of`): log scales [N, 3], quaternions [N, 4],
-opacity logits [N] and harmonics [N, 3 K], and work on the rows `start` to `stop`. The
-*fields* of a Gaussian are its log scales, quaternion, opacity and harmonics above the constant ones: F
-numbers, for which `mask` [F] has the bits in use.
+All functions take four arrays of bit patterns (uint32, see `bits.words_of`): log scales [N, 3], quaternions
+[N, 4], opacity logits [N] and harmonics [N, 3 K], and work on the rows `start` to `stop`. The *fields* of a
+Gaussian are its log scales, quaternion, opacity and harmonics above the constant ones: F numbers, for which
+`mask` [F] has the bits in use.
 
 The kernels may use nothing else of other files: they would outlive their change, see `rendering.cpu.jit`.
 """
@@ -18,6 +18,10 @@ from keyss.rendering.cpu.jit import exact_inlined, exact_kernel
 
 GEOMETRY = 8  # fields before the harmonics
 MOST_ZEROS, EXPONENTS = 12, 256
+# [4096] the zero bits at the end of a number of MOST_ZEROS bits.
+_TRAILING = np.array(
+    [min((i & -i).bit_length() - 1, MOST_ZEROS) if i else MOST_ZEROS for i in range(4096)], np.uint8
+)
 _ABSOLUTE = np.uint32(0x7FFFFFFF)
 _MANTISSA = np.uint32((1 << 23) - 1)
 _ONE, _EXPONENT = np.uint32(1), np.uint32(255)
@@ -104,7 +108,7 @@ def _coarse_length(used, middle, floats):
 
 
 @exact_inlined
-def _near_equal(used, shifts, with_quats, equal_harmonics, high):
+def _near_equal(used, shifts, with_quats, high):
     """Whether two numbers are nearly equal that should not be; see `usable.near_equal`."""
     fields = len(used)
     for i in range(fields):
@@ -122,20 +126,17 @@ def _near_equal(used, shifts, with_quats, equal_harmonics, high):
         red, green, blue = high[i], high[i + 1], high[i + 2]
         if abs(red - green) <= 1 or abs(red - blue) <= 1 or abs(green - blue) <= 1:
             return True
-    # Of numbers in ascending order as many are equal to the next as have an equal one before them.
-    equal = 0
-    for i in range(GEOMETRY + 3, fields):
-        before = False
-        for j in range(GEOMETRY + (i - GEOMETRY) % 3, i, 3):
-            before |= high[j] == high[i]
-        equal += before
-    return equal >= equal_harmonics
+    # Where two numbers are equal to the next in ascending order there are two pairs of equal ones, or three.
+    pairs = 0
+    for apart in range(3, fields - GEOMETRY, 3):
+        one, other = high[GEOMETRY : fields - apart], high[GEOMETRY + apart :]
+        for i in range(len(one)):
+            pairs += one[i] == other[i]
+    return pairs >= 2
 
 
 @exact_kernel
-def ranks(
-    start, stop, scales, quats, opacities, sh, mask, shifts, with_quats, equal_harmonics, unit_tolerance, out
-):
+def ranks(start, stop, scales, quats, opacities, sh, mask, shifts, with_quats, unit_tolerance, out):
     """`out` [N] uint64: 256 for what may well be left alone, and less the larger the least harmonic is."""
     fields = len(mask)
     used, high = np.empty(fields, np.uint32), np.empty(fields, np.int32)
@@ -143,7 +144,7 @@ def ranks(
     floats = middle.view(np.float32)
     for row in range(start, stop):
         _fields(scales, quats, opacities, sh, row, used)
-        doubtful = _near_equal(used, shifts, with_quats, equal_harmonics, high)
+        doubtful = _near_equal(used, shifts, with_quats, high)
         least = _EXPONENT
         for i in range(fields):
             if i < 3 or i > 6 or with_quats:
@@ -158,26 +159,26 @@ def ranks(
 
 
 @exact_kernel
-def tally(values, first, shift, begin, end, times):
+def tally(start, stop, values, first, shift, times):
     """Add to `times` [P] uint8 how many of the `values` [N, C] from column `first` on fall to each place.
 
-    A place is the upper bits of a product, `shift` fewer than 64. Only places from `begin` to `end` are
-    counted, so that threads do not meet. 255 means so many or more.
+    A place is the upper bits of a product, `shift` fewer than 64. 255 means so many or more.
     """
-    for row in range(values.shape[0]):
+    for row in range(start, stop):
         for column in range(first, values.shape[1]):
-            place = np.int64(np.uint64(values[row, column]) * _HASH >> shift)
-            if begin <= place < end:
-                times[place] += times[place] < 255
+            place = np.uint64(values[row, column]) * _HASH >> shift
+            before = times[place]
+            times[place] = before + np.uint8(before < 255)
 
 
 @exact_kernel
-def crowded(start, stop, values, first, shift, times, least, out):
-    """`out` [N, C - first]: which of the values have a place that `least` or more share."""
-    for row in range(start, stop):
+def crowded(values, first, shift, places, out):
+    """`out` [N, C - first]: which of the values have one of the `places`, eight of which are bits of a byte."""
+    for row in range(values.shape[0]):
         for column in range(first, values.shape[1]):
-            place = np.int64(np.uint64(values[row, column]) * _HASH >> shift)
-            out[row, column - first] = times[place] >= least
+            place = np.uint64(values[row, column]) * _HASH >> shift
+            bit = places[place >> np.uint64(3)] >> (place & np.uint64(7)) & np.uint64(1)
+            out[row, column - first] = bit != 0
 
 
 @exact_kernel
@@ -226,7 +227,7 @@ def _is_among(value, ascending, begin, end):
 @exact_kernel
 def judge(
     start, stop, scales, quats, opacities, sh, mask, shifts, groups, with_quats, short, frequent, ends,
-    equal_harmonics, zero_fields, unit_tolerance, exact, usable, counts,
+    zero_fields, unit_tolerance, exact, usable, counts,
 ):  # fmt: skip
     """Clear `usable` [N] for what is no measurement or a coincidence, and count the zeros of what is left.
 
@@ -255,7 +256,7 @@ def judge(
                     fine &= not _is_among(used[i], frequent[: ends[group + 1]], ends[group], ends[group + 1])
         fine &= zeros < zero_fields
         if fine:
-            fine = not _near_equal(used, shifts, with_quats, equal_harmonics, high)
+            fine = not _near_equal(used, shifts, with_quats, high)
         if fine and with_quats and abs(_coarse_length(used, middle, floats) - 1) < unit_tolerance:
             for i in range(4):
                 middle[i] = used[3 + i]
@@ -266,10 +267,8 @@ def judge(
         usable[row] = fine
         if fine:
             for i in range(fields):
-                zeros = 0
-                while zeros < MOST_ZEROS and used[i] >> np.uint32(zeros) & _ONE == 0:
-                    zeros += 1
-                counts[groups[i], used[i] >> np.uint32(23) & _EXPONENT, zeros] += 1
+                exponent = used[i] >> np.uint32(23) & _EXPONENT
+                counts[groups[i], exponent, _TRAILING[used[i] & np.uint32(0xFFF)]] += 1
 
 
 @exact_kernel

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from keyss.channels.low_bits import kernels
 from keyss.channels.low_bits.bits import KERNEL_BLOCK, UNIT_TOLERANCE, Bytes, Layout, words_of
 from keyss.channels.low_bits.layout import SALTS
-from keyss.channels.low_bits.usable import EQUAL_HARMONICS
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES
 from keyss.rendering.cpu.parallel import in_blocks
@@ -52,7 +51,6 @@ def _ranks(gaussians: Gaussians, layout: Layout) -> npt.NDArray[np.uint64]:
             layout.mask,
             layout.shifts,
             layout.quats,
-            EQUAL_HARMONICS,
             UNIT_TOLERANCE,
             ranks,
         ),

@@ -63,7 +63,6 @@ _SHORT_BITS = 20
 # Nor is a Gaussian, when so many of its values have 12 zeros; by chance one in three million is that.
 _ZERO_FIELDS = 3
 
-EQUAL_HARMONICS = 2  # pairs; in 1 % of the Gaussians by chance
 _EXACT = 1e-6  # of the length of a unit quaternion in single precision
 # Sets of equal values that there may be by chance: those are left alone, and embedding makes as many again.
 _SETS_BY_CHANCE = 0.1
@@ -89,7 +88,7 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None) -> Flags:
     def judge(start: int, stop: int) -> Counts:
         counts = np.zeros((len(_GROUPS), EXPONENTS, MOST_ZEROS + 1), np.int64)
         of_fields = (mask, shifts, groups, quats, short, values, ends)
-        limits = (EQUAL_HARMONICS, _ZERO_FIELDS, UNIT_TOLERANCE, _EXACT)
+        limits = (_ZERO_FIELDS, UNIT_TOLERANCE, _EXACT)
         kernels.judge(start, stop, *fields, *of_fields, *limits, usable, counts)
         return counts
 

@@ -1,9 +1,9 @@
 """Records of Gaussians, compiled: the numbers of a Gaussian as codes of a few bits, and back.
 
-A *number* is what one code stands for, in the order of records: x, y, z, three log scales, opacity logit, then
-of each band of harmonics the brightness of all coefficients and the two differences of all. `line_of` [M] says
-on which line each number lies; `lines` [L, 3] are centre, spread and reach of these (see `quantise.Line`), and
-`far` [L] the reach of outliers.
+A *number* is what one code stands for, in the order of records: x, y, z, three log scales, opacity logit,
+then of each band of harmonics the brightness of all coefficients and the two differences of all. `line_of`
+[M] says on which line each number lies; `lines` [L, 3] are centre, spread and reach of these (see
+`lines.Line`), and `far` [L] the reach of outliers.
 
 The kernels may use nothing else of other files: they would outlive their change, see `rendering.cpu.jit`.
 """
@@ -47,6 +47,22 @@ def _numbers(row, means, scales, opacities, sh, overflow, limits, opponent, numb
         at += 3 * count
         first += count
         count += 2
+
+
+@exact_kernel
+def overflow(start, stop, means, scales, quats, sh, limits, out):
+    """`out` [N]: `core.Gaussians.overflow`; `limits` [4]: of a coordinate, log scale, length and colour."""
+    for row in range(start, stop):
+        fine, length = True, 0.0
+        for i in range(3):
+            fine &= abs(means[row, i]) <= limits[0] and scales[row, i] <= limits[1]
+        for i in range(4):
+            length += np.float64(quats[row, i]) * np.float64(quats[row, i])
+        fine &= math.sqrt(length) <= limits[2]
+        for i in range(sh.shape[1]):
+            for j in range(3):
+                fine &= abs(sh[row, i, j]) < limits[3]
+        out[row] = not fine
 
 
 @exact_kernel
@@ -94,7 +110,7 @@ def reaches(
 
 @exact_inlined
 def _code(value, centre, spread, reach, bits):
-    """See `quantise.Line.encode`."""
+    """See `lines.Line.encode`."""
     offset = value - centre
     if spread > 0:
         scaled = abs(offset) / spread
@@ -105,8 +121,8 @@ def _code(value, centre, spread, reach, bits):
 
 @exact_kernel
 def encode(
-    start, stop, means, scales, quats, opacities, sh, overflow, limits, opponent, line_of, lines, far, outlier,
-    bits_of, quat_bits, quat_reach, least_length, records,
+    start, stop, means, scales, quats, opacities, sh, overflow, limits, opponent, line_of, lines, far,
+    outlier, bits_of, quat_bits, quat_reach, least_length, records,
 ):  # fmt: skip
     """`records` [N, bytes]: all codes of a Gaussian, one after the other; see docs/format.md."""
     numbers, unit = np.empty(len(line_of)), np.empty(4)
@@ -161,7 +177,7 @@ def _read(record, at, bits):
 
 @exact_inlined
 def _value(code, centre, spread, reach, bits):
-    """See `quantise.Line.decode`."""
+    """See `lines.Line.decode`."""
     position = (np.float64(code) * (2 / np.float64((1 << bits) - 1)) - 1) * reach
     if spread > 0:
         position = math.sinh(position) * spread
@@ -170,8 +186,8 @@ def _value(code, centre, spread, reach, bits):
 
 @exact_kernel
 def decode(
-    start, stop, records, line_of, lines, far, tables, begins, bits_of, quat_bits, quat_reach, opponent, means,
-    scales, quats, opacities, sh,
+    start, stop, records, line_of, lines, far, tables, begins, bits_of, quat_bits, quat_reach, opponent,
+    means, scales, quats, opacities, sh,
 ):  # fmt: skip
     """Fill the tensors of the Gaussians in records [N, bytes].
 

@@ -29,7 +29,7 @@ import torch
 
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
-from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
+from keyss.core.gaussians import MAX_COLOUR, MAX_COORDINATE, MAX_LENGTH, MAX_LOG_SCALE, Gaussians
 from keyss.methods.records import kernels
 from keyss.methods.records.lines import (
     COLOUR,
@@ -62,6 +62,8 @@ _LOOKED_UP = 13  # bits of codes for which there is a table of numbers
 _BLOCK = 1 << 14  # Gaussians that a thread takes at a time
 _QUAT_REACH = 0.5**0.5  # of the three smaller components
 _LIMITS = np.array([MAX_COORDINATE, MAX_LOG_SCALE, MAX_LOGIT, _MAX_HARMONIC], np.float32)
+# Limits of what is drawn, those of single precision as it has them.
+_OVERFLOW = np.array([np.float32(MAX_COORDINATE), MAX_LOG_SCALE, MAX_LENGTH, np.float32(MAX_COLOUR)])
 
 
 @dataclass(frozen=True)
@@ -215,12 +217,12 @@ def _numbers(gaussians: Gaussians) -> tuple[Any, ...]:
     A Gaussian that is never drawn becomes transparent, so that its numbers in the limits are not drawn
     either.
     """
-    tensors = (gaussians.means, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
-    parts = in_blocks(
-        lambda start, stop: gaussians[start:stop].overflow.detach().cpu().numpy(), len(gaussians), _BLOCK
+    means, scales, opacities, sh = map(
+        _array, (gaussians.means, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
     )
-    overflow = np.concatenate([np.zeros(0, bool), *parts])
-    return *map(_array, tensors), overflow, _LIMITS, OPPONENT
+    overflow = np.empty(len(gaussians), bool)
+    _for_all(gaussians, kernels.overflow, means, scales, _array(gaussians.quats), sh, _OVERFLOW, overflow)
+    return means, scales, opacities, sh, overflow, _LIMITS, OPPONENT
 
 
 def _sampled(gaussians: Gaussians) -> Iterator[Floats]:
