@@ -173,7 +173,7 @@ def tally(start, stop, values, first, shift, times):
 
 @exact_kernel
 def crowded(values, first, shift, places, out):
-    """`out` [N, C - first]: which of the values have one of the `places`, eight of which are bits of a byte."""
+    """`out` [N, C - first]: which of the values have one of the `places`, which are bits of bytes."""
     for row in range(values.shape[0]):
         for column in range(first, values.shape[1]):
             place = np.uint64(values[row, column]) * _HASH >> shift
