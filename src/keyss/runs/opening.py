@@ -13,12 +13,22 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.foreign import what_it_is
 from keyss.files.models import known_suffixes, read_model
+from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
-from keyss.methods import registry
+from keyss.methods import handed, registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
 from keyss.runs.config import Background, PathLike, RunConfig, read_config, secret_ids
-from keyss.runs.files import CONFIG, METRICS, is_run, model_in, plain_names, run_folder, stego_in
+from keyss.runs.files import (
+    CONFIG,
+    METRICS,
+    handed_names,
+    is_run,
+    model_in,
+    plain_names,
+    run_folder,
+    stego_in,
+)
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 
@@ -38,7 +48,7 @@ class HidingRun:
     metrics: HideMetrics
     stego: Gaussians
     opened: tuple[Opened, ...]  # in the order of the secrets
-    keys: tuple[str, ...] = field(repr=False)  # in the same order
+    keys: tuple[str, ...] = field(repr=False)  # in the same order; "" where the method has none
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
 
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
@@ -76,15 +86,40 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego = read_model(stego_in(folder))
-    every = [open_in(stego, key) for key in keys]
+    abilities = registry.get(config.method).abilities
+    if not abilities.keys:
+        if keys:
+            raise UsageError(f"the method {config.method} has no keys: give none")
+        keys = [""] * len(config.payloads)
+    if abilities.hands_over:
+        every = [
+            read_handed(folder / name, key or None)
+            for name, key in zip(handed_names(len(config.payloads)), keys, strict=False)
+        ]
+    else:
+        every = [open_in(stego, key) for key in keys]
     names = secret_ids(config.options.fit.known_seed, every)
-    found = dict(zip(names, zip(every, keys, strict=True), strict=True))
+    found = dict(zip(names, zip(every, keys, strict=False), strict=True))
     if set(found) != set(config.payloads):
         raise UsageError(
             f"expected the keys of all {len(config.payloads)} secret(s), got {len(found)} of them"
         )
     secrets, own = zip(*(found[each] for each in config.payloads), strict=True)
     return HidingRun(folder, config, metrics, stego, secrets, own, sources)
+
+
+def read_handed(path: PathLike, key: str | None) -> Opened:
+    """The secret in a file that was handed over; see `registry.open_handed`."""
+    data = read_file(Path(path), handed.MOST_BYTES)
+    try:
+        return registry.open_handed(data, key)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def is_sealed(path: PathLike) -> bool:
+    """Whether it takes a key to open a file that was handed over. Raises InputError."""
+    return handed.is_sealed(read_file(Path(path), handed.MOST_BYTES))
 
 
 def open_in(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
