@@ -7,5 +7,6 @@ from keyss.methods.peers.bound import BoundMethod
 from keyss.methods.peers.decoder import DecoderMethod
 from keyss.methods.peers.gs_hider import GsHiderMethod
 from keyss.methods.peers.sh import ShMethod
+from keyss.methods.peers.watergs import WaterGsMethod
 
-PEERS = (BoundMethod(), ShMethod(), DecoderMethod(), GsHiderMethod())
+PEERS = (BoundMethod(), ShMethod(), DecoderMethod(), GsHiderMethod(), WaterGsMethod())
