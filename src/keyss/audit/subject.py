@@ -20,7 +20,6 @@ from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
 from keyss.measure.robustness.survival import Reopener
-from keyss.methods import registry
 from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun, as_model
@@ -52,10 +51,8 @@ class AuditSubject:
 
     @property
     def reopeners(self) -> list[Reopener]:
-        """What opens the secrets in a changed model; what was handed over does not change."""
-        if registry.get(self.run.config.method).abilities.hands_over:
-            return [Reopener("", lambda stego, key, own=own: own) for own in self.run.opened]  # type: ignore[misc]
-        return [Reopener(key, registry.open_model) for key in self.run.keys]
+        """What opens the secrets in a changed model."""
+        return self.run.reopeners
 
     @property
     def secrets(self) -> tuple[Scene, ...]:

@@ -15,6 +15,7 @@ from keyss.files.foreign import what_it_is
 from keyss.files.models import known_suffixes, read_model
 from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
+from keyss.measure.robustness.survival import Reopener
 from keyss.methods import handed, registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
@@ -50,6 +51,13 @@ class HidingRun:
     opened: tuple[Opened, ...]  # in the order of the secrets
     keys: tuple[str, ...] = field(repr=False)  # in the same order; "" where the method has none
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
+
+    @property
+    def reopeners(self) -> list[Reopener]:
+        """What opens the secrets in a changed model; what was handed over does not change."""
+        if registry.get(self.config.method).abilities.hands_over:
+            return [Reopener("", lambda stego, key, own=own: own) for own in self.opened]  # type: ignore[misc]
+        return [Reopener(key, registry.open_model) for key in self.keys]
 
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
         """The cover and the secrets with their photos, or with pictures of the models that they are."""

@@ -120,7 +120,7 @@ def read_bits(stego: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
         for row, ((index, bit), (home, low)) in enumerate(zip(places, homes, strict=False)):
             value = ((part[:, home] >> np.uint32(low)) & np.uint32(1)) ^ bits[:, row]
             codes[:, index] |= value << np.uint32(bit)
-        for index in range(codes.shape[1]):
+        for index in range(stego.shape[1]):
             each = math.isqrt(index)
             step = 2 * float(ranges[each]) / max(1, 2 ** sizes[each] - 1)
             found[block, index] = codes[:, index] * step - float(ranges[each])
