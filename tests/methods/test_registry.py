@@ -22,7 +22,7 @@ from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import registry
 from keyss.methods.base import (
-    Abilities,
+    Capabilities,
     CommandLineOption,
     Context,
     Frame,
@@ -73,7 +73,7 @@ class WholeMethod:
     summary = "embed the floats themselves"
     trains = False
     most_secrets = 1
-    abilities = Abilities()
+    capabilities = Capabilities()
     options = WholeOptions
     presets: Mapping[str, WholeOptions] = {"small": WholeOptions(), "large": WholeOptions(most=1000)}
 

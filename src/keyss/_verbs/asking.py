@@ -39,7 +39,7 @@ def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[
             f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
         )
     keys = [secret.key for secret in secrets]
-    if method.abilities.keys:
+    if method.capabilities.keys:
         check_keys(keys)
     elif any(keys):
         raise UsageError(

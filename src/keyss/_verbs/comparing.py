@@ -95,7 +95,7 @@ def compare(
         if (done := folder / f"{place.name}.json").exists():
             rows.append(read_record(done, ComparedMethod))
             continue
-        own = key if method.abilities.keys else ""
+        own = key if method.capabilities.keys else ""
         try:
             if not is_run(place):
                 hide(
@@ -113,7 +113,7 @@ def compare(
             rows.append(_measured(name, method, open_run(place, [own] if own else []), device))
             write_record(done, rows[-1])
         except KeyssError as error:
-            rows.append(ComparedMethod(name=name, error=str(error), abilities=method.abilities))
+            rows.append(ComparedMethod(name=name, error=str(error), capabilities=method.capabilities))
     found = Comparison(arguments=told | {"seed": seed}, methods=tuple(rows))
     write_record(folder / RECORD, found)
     write_bytes(folder / TABLE, markdown(found).encode())
@@ -194,7 +194,7 @@ def _measured(name: str, method: Method, run: HidingRun, device: Backend) -> Com
         )
     return ComparedMethod(
         name=name,
-        abilities=method.abilities,
+        capabilities=method.capabilities,
         most_secrets=method.most_secrets,
         cover=found[0],
         secret=found[1],
@@ -211,7 +211,7 @@ def _runs(folder: Path, found: Comparison) -> list[tuple[str, HidingRun]]:
     """Those that came to something, by name."""
     key = read_text(folder / KEY).strip()
     return [
-        (each.name, open_run(folder / each.name.replace(":", "-"), [key] if each.abilities.keys else []))
+        (each.name, open_run(folder / each.name.replace(":", "-"), [key] if each.capabilities.keys else []))
         for each in found.methods
         if each.error is None
     ]

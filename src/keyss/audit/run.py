@@ -65,7 +65,7 @@ def audit(
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
     started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
-    standard = registry.get(opened.config.method).abilities.standard
+    standard = registry.get(opened.config.method).capabilities.standard
     if impossible := sorted(set(only) & OF_3DGS_MODELS) if not standard else []:
         raise UsageError(
             f"what the method {opened.config.method} publishes is no 3DGS model: there is nothing for "
@@ -138,7 +138,7 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         width=run.config.width,
         gaussians=len(run.stego),
         photos=run.metrics.photos,
-        standard=registry.get(run.config.method).abilities.standard,
+        standard=registry.get(run.config.method).capabilities.standard,
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as it will be read again
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

@@ -160,7 +160,7 @@ def hide(
                 f"leave {'it' if len(idle) == 1 else 'them'} out"
             )
     models = secret_model or (None,) * len(secret)
-    if chosen.abilities.keys or key_file:
+    if chosen.capabilities.keys or key_file:
         opening = keys(key_file, len(secret), confirm=True)
         warn_of_doubtful_keys(opening)
     else:
@@ -199,7 +199,7 @@ def hide(
     )
     print_hiding(result.metrics)
     how = _HOW[publish == "any"]
-    what = "the cover, with the secret in it" if chosen.trains or chosen.abilities.keys else "the cover"
+    what = "the cover, with the secret in it" if chosen.trains or chosen.capabilities.keys else "the cover"
     print_files(
         out,
         {
@@ -208,12 +208,13 @@ def hide(
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
     )
-    if not chosen.abilities.keys:
+    if not chosen.capabilities.keys:
         print(f"The method {method} has no keys: whoever has both files sees the secret.")
         return
+    files = "both files" if chosen.capabilities.hands_over else "file"
     print(
         "The key: send it over another channel than the file, and keep a copy: without it nothing is opened. "
-        f"Whoever has {'both files' if chosen.abilities.hands_over else 'file'} and key runs `keyss reveal`."
+        f"Whoever has {files} and key runs `keyss reveal`."
     )
 
 

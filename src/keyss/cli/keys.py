@@ -44,7 +44,7 @@ def keys_of_run(run: Path, files: Sequence[Path]) -> list[str]:
     from keyss.runs.config import read_config
     from keyss.runs.files import CONFIG, is_run
 
-    if not files and is_run(run) and not registry.get(read_config(run / CONFIG).method).abilities.keys:
+    if not files and is_run(run) and not registry.get(read_config(run / CONFIG).method).capabilities.keys:
         return []
     return keys(files, len(files) or 1)
 

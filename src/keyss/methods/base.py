@@ -135,7 +135,7 @@ class Stego:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Abilities:
+class Capabilities:
     """What a method can do; what it cannot is said where it is asked for, and in comparisons."""
 
     keys: bool = True  # a key opens each secret; else whoever has what is handed over sees it
@@ -203,7 +203,7 @@ class Method(Protocol):
         """How many secrets one model can have."""
 
     @property
-    def abilities(self) -> Abilities:
+    def capabilities(self) -> Capabilities:
         """What it can and cannot do."""
 
     @property

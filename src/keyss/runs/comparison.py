@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from keyss._version import __version__
-from keyss.methods.base import Abilities
+from keyss.methods.base import Capabilities
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class ComparedMethod:
     version: int = 1
     name: str  # METHOD, or METHOD:PRESET where it is not the first
     error: str | None = None
-    abilities: Abilities = field(default_factory=Abilities)
+    capabilities: Capabilities = field(default_factory=Capabilities)
     most_secrets: int = 1
     cover: SceneScores | None = None
     secret: SceneScores | None = None
@@ -59,7 +59,7 @@ def table(found: Comparison) -> list[list[str]]:
 def _row(each: ComparedMethod) -> list[str]:
     if each.cover is None or each.secret is None:
         return [each.name, f"not possible: {each.error}", *[""] * 14]
-    able = each.abilities
+    able = each.capabilities
     losses = [scene.pruned_loss for scene in (each.cover, each.secret)]
     lost = ["gone" if loss is None else f"{-loss:+.1f} dB" for loss in losses]
     return [

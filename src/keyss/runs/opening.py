@@ -55,7 +55,7 @@ class HidingRun:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model; what was handed over does not change."""
-        if registry.get(self.config.method).abilities.hands_over:
+        if registry.get(self.config.method).capabilities.hands_over:
             return [Reopener("", lambda stego, key, own=own: own) for own in self.opened]  # type: ignore[misc]
         return [Reopener(key, registry.open_model) for key in self.keys]
 
@@ -94,12 +94,12 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego = read_model(stego_in(folder))
-    abilities = registry.get(config.method).abilities
-    if not abilities.keys:
+    capabilities = registry.get(config.method).capabilities
+    if not capabilities.keys:
         if keys:
             raise UsageError(f"the method {config.method} has no keys: give none")
         keys = [""] * len(config.payloads)
-    if abilities.hands_over:
+    if capabilities.hands_over:
         every = [
             read_handed(folder / name, key or None)
             for name, key in zip(handed_names(len(config.payloads)), keys, strict=False)

@@ -51,8 +51,8 @@ def test_a_table_a_picture_and_a_second_start(
     assert rows["3dgs-sh"]["handed_bytes"] > rows["3dgs-sh"]["gaussians"] * 16 * 3 * 4
     assert rows["3dgs-sh"]["secret"]["pruned_loss"] is None  # what is handed over belongs to every row
     assert rows["3dgs"]["secret"]["pruned_loss"] == pytest.approx(0)
-    assert {rows[name]["abilities"]["keys"] for name in ("3dgs", "3dgs-sh")} == {False}
-    assert rows["watergs"]["abilities"]["keys"]
+    assert {rows[name]["capabilities"]["keys"] for name in ("3dgs", "3dgs-sh")} == {False}
+    assert rows["watergs"]["capabilities"]["keys"]
     lines = (out / "comparison.md").read_text().splitlines()
     assert len(lines) == 2 + len(rows)
     assert len({line.count("|") for line in lines}) == 1

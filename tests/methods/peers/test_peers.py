@@ -12,6 +12,7 @@ import torch
 
 import keyss
 from keyss import FitConfig, Secret
+from keyss.audit import audit
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.core.decoded import DecodedGaussians
@@ -38,7 +39,7 @@ def options_of(name: str, **changes: Any) -> PeerOptions:
 
 
 def key_of(name: str) -> str:
-    return KEY if registry.METHODS[name].abilities.keys else ""
+    return KEY if registry.METHODS[name].capabilities.keys else ""
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,13 @@ def test_what_is_written_is_what_was_measured(made: Made) -> None:
 
 
 def test_both_files_show_the_secret(made: Made, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    abilities = registry.METHODS[made.name].abilities
+    capabilities = registry.METHODS[made.name].capabilities
     stego = stego_in(made.out)
-    assert (stego.suffix == ".ply") == abilities.standard
-    out = tmp_path / ("secret.ply" if abilities.models else "secret.3dgs.safetensors")
-    key = KEY if abilities.keys else None
+    assert (stego.suffix == ".ply") == capabilities.standard
+    out = tmp_path / ("secret.ply" if capabilities.models else "secret.3dgs.safetensors")
+    key = KEY if capabilities.keys else None
     keyss.reveal(stego, key, handed=made.handed, out=out)
-    assert isinstance(keyss.read_model(out), DecodedGaussians) != abilities.models
+    assert isinstance(keyss.read_model(out), DecodedGaussians) != capabilities.models
     scene = keyss.load_scene(folders[1])
     pictures = dict(keyss.render(out, folders[1]))
     errors = [
@@ -104,10 +105,10 @@ def test_both_files_show_the_secret(made: Made, folders: tuple[Path, Path], tmp_
     ]
     psnr = float(-10 * torch.stack(errors).log10().mean())
     assert psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
-    if not abilities.models:
+    if not capabilities.models:
         with pytest.raises(UsageError, match="network"):
             keyss.reveal(stego, key, handed=made.handed, out=tmp_path / "secret.ply")
-    if abilities.keys:
+    if capabilities.keys:
         with pytest.raises(WrongKeyError):
             keyss.reveal(stego, "wrong", handed=made.handed)
     else:
@@ -145,7 +146,8 @@ def test_the_command_line(
     given = ["--key-file", str(key)] if made.keys else []
     assert main(["evaluate", str(made.out), *given]) == 0
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in capsys.readouterr().out
-    out = str(tmp_path / ("a.ply" if registry.METHODS[made.name].abilities.models else "a.3dgs.safetensors"))
+    models = registry.METHODS[made.name].capabilities.models
+    out = str(tmp_path / ("a.ply" if models else "a.3dgs.safetensors"))
     stego = str(stego_in(made.out))
     assert main(["reveal", stego, "--handed", str(made.handed), *given, "-o", out]) == 0
     assert main(["info", out]) == 0
@@ -187,3 +189,22 @@ def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
     for key, value in ends[0].items():
         assert torch.equal(value, ends[1][key]), key
     assert whole.evaluate() == resumed.evaluate()
+
+
+def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    if made.name not in ("3dgs-decoder", "gs-hider"):  # the others are 3DGS models throughout
+        return
+    standard = registry.METHODS[made.name].capabilities.standard
+    if not standard:
+        with pytest.raises(UsageError, match="no 3DGS model"):
+            audit(made.out, [], only=["images", "stealth"])
+    found = audit(made.out, [], only=["images", "speed"], controls=2)
+    assert found.run.standard == standard
+    assert found.images is not None
+    assert found.images.secrets[0].mean.psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
+    assert found.speed is not None
+    ours = [each for each in found.speed.readers if each.file == "secret 1"]
+    assert ours
+    assert not any(each.loads for each in ours)
+    assert main(["report", str(made.out)]) == 0
+    assert "no 3DGS model" in (made.out / "private" / "report.html").read_text()

@@ -25,7 +25,7 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.base import Abilities, Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego
+from keyss.methods.base import Capabilities, Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego
 from keyss.methods.dither import cost
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.joint import JointRun
@@ -54,7 +54,7 @@ class LearnedMethod:
     summary = "train the secrets for the cover, then carry them"
     trains = True
     most_secrets = 9
-    abilities = Abilities()
+    capabilities = Capabilities()
     options = LearnedOptions
     presets: Mapping[str, LearnedOptions] = PRESETS
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from keyss.channels.base import Content
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Abilities, Context, KeyedSource, Outlook, SceneInput, Source, Stego
+from keyss.methods.base import Capabilities, Context, KeyedSource, Outlook, SceneInput, Source, Stego
 from keyss.methods.peers.options import PeerOptions, presets_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 
@@ -28,7 +28,7 @@ class BoundMethod:
     summary = "two plain models, the second handed over: nothing is hidden, the bound of all others"
     trains = False
     most_secrets = 1
-    abilities = Abilities(keys=False, hands_over=True)
+    capabilities = Capabilities(keys=False, hands_over=True)
     options = BoundOptions
     presets: Mapping[str, PeerOptions] = presets_of(BoundOptions)
 

@@ -17,7 +17,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.fitting.parameters import to_gaussians
-from keyss.methods.base import Abilities
+from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors
 from keyss.methods.peers.options import PeerOptions, presets_of
@@ -55,7 +55,7 @@ class DecoderMethod(JointPeer):
 
     name = NAME
     summary = "a network from the cover's picture to the secret's, handed over (baseline)"
-    abilities = Abilities(keys=False, hands_over=True, models=False)
+    capabilities = Capabilities(keys=False, hands_over=True, models=False)
     options = DecoderOptions
     presets: Mapping[str, PeerOptions] = presets_of(DecoderOptions)
 

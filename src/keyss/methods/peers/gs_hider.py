@@ -17,7 +17,7 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
-from keyss.methods.base import Abilities
+from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors
 from keyss.methods.peers.options import PeerOptions, presets_of
@@ -66,7 +66,7 @@ class GsHiderMethod(JointPeer):
 
     name = NAME
     summary = "features in place of harmonics, and a network for each scene"
-    abilities = Abilities(keys=False, hands_over=True, standard=False, models=False)
+    capabilities = Capabilities(keys=False, hands_over=True, standard=False, models=False)
     options = GsHiderOptions
     presets: Mapping[str, PeerOptions] = presets_of(GsHiderOptions)
 

@@ -16,7 +16,7 @@ from keyss.core.alignment import align
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
-from keyss.methods.base import Abilities, Context, KeyedSource, Outlook, SceneInput, Source, Stego
+from keyss.methods.base import Capabilities, Context, KeyedSource, Outlook, SceneInput, Source, Stego
 from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 from keyss.methods.peers.training import PeerRun
@@ -28,7 +28,7 @@ class JointPeer(ABC):
 
     name: str
     summary: str
-    abilities: Abilities
+    capabilities: Capabilities
     trains = True
     most_secrets = 1
     options: type[PeerOptions]

@@ -16,7 +16,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.fitting.parameters import make_optimizers
-from keyss.methods.base import Abilities
+from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
 from keyss.methods.peers.options import PeerOptions, presets_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
@@ -60,7 +60,7 @@ class ShMethod(JointPeer):
 
     name = NAME
     summary = "second harmonics for the secret, handed over (baseline)"
-    abilities = Abilities(keys=False, hands_over=True)
+    capabilities = Capabilities(keys=False, hands_over=True)
     options = ShOptions
     presets: Mapping[str, PeerOptions] = presets_of(ShOptions)
 

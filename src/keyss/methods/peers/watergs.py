@@ -35,7 +35,7 @@ from keyss.core.similarity import Similarity
 from keyss.files.formats.common import morton_order
 from keyss.fitting.parameters import make_optimizers
 from keyss.keys.derivation import stream
-from keyss.methods.base import Abilities
+from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
 from keyss.methods.peers.options import PeerOptions, presets_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
@@ -233,7 +233,7 @@ class WaterGsMethod(JointPeer):
 
     name = NAME
     summary = "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)"
-    abilities = Abilities(hands_over=True)
+    capabilities = Capabilities(hands_over=True)
     options = WaterGsOptions
     presets: Mapping[str, PeerOptions] = presets_of(WaterGsOptions)
 
