@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
-from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene
@@ -15,7 +14,7 @@ from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, SceneInput
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import PathLike, path_of
-from keyss.runs.opening import as_model
+from keyss.runs.opening import as_3dgs_model
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,7 @@ def inputs_of(
                 what = "a source in memory" if isinstance(source, Gaussians) else source
                 raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
             model = source  # type: ignore[assignment]
-        found = None if model is None else as_model(model)
-        if isinstance(found, DecodedGaussians):
-            what = "the secret" if index else "the cover"
-            raise UsageError(f"a network makes the pictures of {what}'s model: expected a 3DGS model")
+        found = None if model is None else as_3dgs_model(model, "the secret" if index else "the cover")
         if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
             what = "the secret" if index else "the cover"
             raise UsageError(f"nothing of {what}'s model can be seen: all of its Gaussians are transparent")

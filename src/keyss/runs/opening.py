@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -184,3 +185,11 @@ def as_model(source: PathLike | Gaussians) -> Gaussians:
     if inside := model_in(Path(source)):
         raise InputError(f"{source}: expected the file of a 3DGS model, found a folder; give {inside}")
     return read_model(source)
+
+
+def as_3dgs_model(source: PathLike | Gaussians, what: str) -> Gaussians:
+    """`as_model`, and UsageError where a network makes its pictures."""
+    found = as_model(source)
+    if isinstance(found, DecodedGaussians):
+        raise UsageError(f"a network makes the pictures of {what}'s model: expected a 3DGS model")
+    return found

@@ -12,6 +12,7 @@ import torch
 
 import keyss
 from keyss import FitConfig, Secret
+from keyss.api import SecretFile, hide_files
 from keyss.audit import audit
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
@@ -166,6 +167,17 @@ def test_a_key_for_what_has_none_and_what_it_cannot_do_are_refused(folders: tupl
         options_of("gs-hider", publish="any")
     with pytest.raises(UsageError, match="key is empty"):
         keyss.hide(folders[0], [Secret(folders[1])], method="learned")
+
+
+def test_what_a_network_draws_is_no_cover(made: Made, folders: tuple[Path, Path]) -> None:
+    if registry.METHODS[made.name].capabilities.standard:
+        return
+    stego = stego_in(made.out)
+    for cover, secret in ((stego, folders[1]), (folders[0], stego)):
+        with pytest.raises(UsageError, match="network"):
+            keyss.hide(cover, [Secret(secret, KEY)])
+    with pytest.raises(UsageError, match="network"):
+        hide_files(stego, [SecretFile(made.handed, KEY)], out=made.out.parent / "files")
 
 
 @pytest.mark.parametrize("name", TRAINED)

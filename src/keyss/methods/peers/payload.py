@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -76,12 +76,15 @@ class HandedTensors:
                 raise InputError(f"what was handed over is damaged: {name[:80]} is not finite numbers")
         return HandedTensors(tensors, frame, header.rows)
 
-    def taken(self, names: Iterable[str]) -> list[Tensor]:
-        """Tensors by name, when there are no others. Raises InputError."""
+    def taken(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
+        """Tensors by name, and no others: uint8 those `of_bytes`, else float32. Raises InputError."""
         names = list(names)
         if set(names) != set(self.tensors):
             found = ", ".join(sorted(self.tensors))[:200]
             raise InputError(f"what was handed over is damaged: expected {', '.join(names)}, found {found}")
+        wanted = {name: torch.uint8 if name in of_bytes else torch.float32 for name in names}
+        if wrong := [name for name in names if self.tensors[name].dtype != wanted[name]]:
+            raise InputError(f"what was handed over is damaged: numbers of another kind in {wrong[0]}")
         return [self.tensors[name] for name in names]
 
     def digest(self) -> str:

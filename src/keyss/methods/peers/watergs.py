@@ -253,12 +253,12 @@ class WaterGsMethod(JointPeer):
     def open(self, handed: HandedTensors) -> HandedSecret:
         mapping = OpacityMapping().requires_grad_(False)
         names = [f"mapping.{name}" for name in mapping.state_dict()]
-        *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"])
+        *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
         try:
             mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
         except RuntimeError as error:
             raise InputError("what was handed over is damaged: no such autoencoder") from error
-        if numbers.dtype != torch.uint8 or numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
+        if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
             raise InputError("what was handed over is damaged: no such cipher")
         cipher = bytes(numbers.tolist())
 
