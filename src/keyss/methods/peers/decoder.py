@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
@@ -47,7 +48,9 @@ class DecoderRun(PeerRun):
 
 @dataclass(frozen=True, kw_only=True)
 class DecoderOptions(PeerOptions):
-    """See `PeerOptions`."""
+    """The Gaussians show the cover only, so they start from its points."""
+
+    points: Literal["both", "cover"] = "cover"
 
 
 class DecoderMethod(JointPeer):

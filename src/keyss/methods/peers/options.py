@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import MethodOptions
+from keyss.methods.base import CommandLineOption, MethodOptions
 
 
 @dataclass(frozen=True, kw_only=True)
 class PeerOptions(MethodOptions):
     """The joint training from sparse points, as long and with as many Gaussians as plain models (`fit`)."""
 
+    # Whose sparse points it starts from: KeySS's combined ones, where one geometry shows both scenes.
+    points: Literal["both", "cover"] = "both"
     cover_weight: float = 0.5
     secret_weight: float = 0.5
     # Share of the steps at which both scenes are drawn from one pose, as the papers do, and compared with a
     # photo or the plain model's render; at the others each from a pose of its own, compared with its photo.
-    common_poses: float = 1.0
+    common_poses: Annotated[
+        float,
+        CommandLineOption(
+            "Share of steps at which both scenes are drawn from one pose, 0 to 1; the papers': 1.",
+            metavar="SHARE",
+        ),
+    ] = 1.0
     network_rate: float = 1e-3  # of Adam, decays to 5 % of it
 
     def __post_init__(self) -> None:

@@ -51,7 +51,8 @@ class PeerRun:
         self.shuffles = [Shuffle(len(placed.scene.train), self.generator) for placed in scenes]
         self.extent = scenes[0].scene.extent
 
-        start = combined_points([placed.scene for placed in scenes], fit, self.generator)
+        sources = scenes if options.points == "both" else scenes[:1]
+        start = combined_points([placed.scene for placed in sources], fit, self.generator)
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, fit, self.extent)
         self.networks = torch.nn.ModuleList()
