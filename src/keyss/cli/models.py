@@ -184,7 +184,7 @@ def convert(
             "FILE", "File with a key whose secret must not be lost, once for each.", "none is looked for"
         ),
     ] = (),
-    force: Annotated[bool, arg(help="Write it even if what a key opens is lost.")] = False,
+    force: Annotated[bool, arg(help="Write it even if a secret is lost.")] = False,
     dry_run: Annotated[bool, arg(help="Say what it costs, and write nothing.")] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",

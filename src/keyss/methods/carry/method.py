@@ -24,8 +24,7 @@ from keyss.methods.base import (
     advising,
 )
 from keyss.methods.carry.options import PRESETS, CarryOptions
-from keyss.methods.dither import cost, dither, sampled
-from keyss.methods.records import whole
+from keyss.methods.dither import dither, sampled
 from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
 from keyss.methods.records.encoding import (
     CarriedSecret,
@@ -34,7 +33,9 @@ from keyss.methods.records.encoding import (
     record_requests,
     subsampled_counts,
 )
+from keyss.methods.records.precision import check_fits
 from keyss.methods.records.prospect import outlook_whole
+from keyss.rendering.difference import Viewpoints, cost
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `publish="any"` has room'
 _ANY = '`publish="any"` needs no low bits of the cover'
@@ -118,7 +119,8 @@ class CarryMethod:
         if options.publish != "ply":
             room = room_in(cover.model, options.publish, options.channel)
             with advising(UsageError, _PRUNE_OR_PLY):
-                written = embed_whole(room, keys, models, prune=options.prune_to_fit)
+                views = [Viewpoints.of(each.source.scene) for each in secrets]
+                written = embed_whole(room, keys, models, views, prune=options.prune_to_fit)
             seconds = time.monotonic() - start
             return Stego(written.stego, written.opened, seconds, details=written.details)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
@@ -144,7 +146,7 @@ def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> C
     with advising(UsageError, _PRUNE_OR_PLY):
         if not options.prune_to_fit:
             for model, share in zip(secrets, shares_of(room, secrets), strict=True):
-                whole.fitted(model, share, prune=False, short=room.grows)
+                check_fits(model, share)
     return options
 
 

@@ -25,8 +25,16 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.base import Capabilities, Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego
-from keyss.methods.dither import cost
+from keyss.methods.base import (
+    Capabilities,
+    Context,
+    KeyedSource,
+    Opened,
+    Outlook,
+    SceneInput,
+    Source,
+    Stego,
+)
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, sized, training_options
@@ -43,6 +51,7 @@ from keyss.methods.points import divided
 from keyss.methods.poses import PlacedScene
 from keyss.methods.records.embedding import unpack_records
 from keyss.methods.records.prospect import outlook_whole
+from keyss.rendering.difference import cost
 
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 
