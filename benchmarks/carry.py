@@ -31,9 +31,9 @@ from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.methods.dither import cost
 from keyss.methods.records.encoding import record_request
 from keyss.rendering import render
+from keyss.rendering.difference import cost
 from methods.carry.carried import embed, extract
 
 KEY = "the key of the benchmark"

@@ -37,10 +37,11 @@ from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.measure.images import psnr
-from keyss.methods.dither import cost
 from keyss.methods.records import whole
 from keyss.methods.records.encoding import most_visible
+from keyss.methods.records.precision import fitted
 from keyss.rendering import render
+from keyss.rendering.difference import cost
 from keyss.rendering.orbit import scene_of_model
 
 FORMATS: dict[str, ModuleType] = {"spz": spz, "sog": sog, "compressed-ply": compressed_ply}
@@ -82,7 +83,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         untouched = format_.dequantise(format_.quantise(model))
         start = time.monotonic()
         room: CodesCover = prepare(cover[1], name)
-        kept, encoded = whole.fitted(own, room.capacity * 1023 // 1024 - 128, prune=True)
+        kept, encoded = fitted(own, room.capacity * 1023 // 1024 - 128, prune=True)
         stego = coded(room.embed([(KEY, Payload("carry", encoded))]))
         file = format_.serialise(stego.codes)
         hiding = time.monotonic() - start

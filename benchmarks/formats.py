@@ -26,7 +26,7 @@ from keyss.core import BackendError, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
 from keyss.measure.robustness.conversions import find_package, transform
-from keyss.methods.dither import cost
+from keyss.rendering.difference import cost
 
 VISIBLE = 0.05
 Writer = Callable[[Path, Path], object]  # from a .ply to a file

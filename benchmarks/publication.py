@@ -1,6 +1,6 @@
 """What a hiding is worth after other people's programs converted it: the table of docs/appended.md.
 
-    python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10]
+    python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10] [--only NAME ...]
 
 RUN: a folder of `keyss hide --publish any` with one secret. For each program and format the published model
 is converted, and so is the cover's plain model; the secret is revealed from the converted file alone. PSNR in
@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--key-file", type=Path, required=True)
     parser.add_argument("--sog-iterations", type=int, default=1)
+    parser.add_argument("--only", nargs="*", metavar="NAME", help='such as ".spz by gsply" (default: all)')
     asked = parser.parse_args()
     run = open_run(asked.run, [asked.key_file.read_text().strip()])
     plain = [len(each) for each in run.plain_models() if each is not None]
@@ -54,10 +55,13 @@ def main() -> None:
     print("| --- | --- | --- | --- |")
     print(row(run, "`.ply`, as published", None), flush=True)
     for converter in converters(asked.sog_iterations):
+        name = f"{converter.format} by {converter.tool}"
+        if asked.only and name not in asked.only:
+            continue
         try:
-            print(row(run, f"{converter.format} by {converter.tool}", converter), flush=True)
+            print(row(run, name, converter), flush=True)
         except BackendError as error:
-            print(f"| {converter.format} by {converter.tool} | not measured: {error} | | |", flush=True)
+            print(f"| {name} | not measured: {error} | | |", flush=True)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ from channels.low_bits.trained_like import keys, trained_like
 from files.test_ply import assert_same_bits
 from keyss.channels.low_bits import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians, InputError
-from keyss.methods.dither import cost, dither
+from keyss.methods.dither import dither
+from keyss.rendering.difference import cost
 from methods.carry.carried import embed_derived, extract_derived
 
 ENTROPY = bytes(32)

@@ -19,8 +19,8 @@ from keyss.files.models import (
     model_of_bytes,
 )
 from keyss.files.streams import StandardOutput, is_standard
-from keyss.methods.dither import cost
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.difference import cost
 from keyss.runs.config import PathLike
 from keyss.runs.folder import check_not_published
 from keyss.runs.opening import as_model
@@ -123,7 +123,7 @@ def _left(model: Gaussians, key: str, device: torch.device) -> int:
 def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
     """Why nothing was written."""
     first = result.secrets[lost[0] - 1]
-    which = "the secret that the key opens" if len(result.secrets) == 1 else f"what key {lost[0]} opens"
+    which = "the secret that the key opens" if len(result.secrets) == 1 else f"the secret of key {lost[0]}"
     left = f"{first.after:,} of its {first.before:,} {first.unit} would open from {path}"
     why = (
         ""

@@ -19,8 +19,8 @@ from keyss.files.models import read_model
 from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.reading import read_file
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
-from keyss.methods.dither import cost
 from keyss.methods.hidden_file import HiddenFile
+from keyss.rendering.difference import cost
 from keyss.runs.config import PathLike
 from keyss.runs.files import STEGOS, stego_name, writers
 from keyss.runs.folder import RunFolder, check_not_published

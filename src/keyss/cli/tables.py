@@ -159,7 +159,7 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
         f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {pictures}", file=file
     )
     for number, secret in enumerate(found.secrets, 1):
-        which = "what the key opens" if len(found.secrets) == 1 else f"what key {number} opens"
+        which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
         state = "opens as before" if secret.kept else f"is lost: {secret.after:,} {secret.unit} of it open"
         print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
     if not found.secrets and not found.keeps_low_bits:

@@ -18,9 +18,6 @@ import torch
 from keyss.channels.low_bits.usable import chance_of_bits, is_uniform
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
-from keyss.rendering.difference import cost
-
-__all__ = ["cost", "dither", "raised", "sampled"]
 
 _BITS, _CHANCE = 9, 1e-6  # low bits that depend on each other are not random
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95

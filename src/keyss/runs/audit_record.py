@@ -40,6 +40,7 @@ class AuditedRun:
     photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
+    up: str = "-y"  # the way up in the cover: "-y", "z" or "y"
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ _WATCHED = 8  # views that a training looks at every `evaluate_every` steps
 _KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and opening it again
 _CODING_SECONDS = 2e-5  # for each Gaussian of the published model: finding carriers, encrypting, writing
 _STATE_COPIES = 3  # numbers that a checkpoint has for one of a model: itself and two moments
+_APPENDED = 7  # Gaussians that one of a secret of SH degree 3 becomes, at most, where they are appended
 _OTHER_BYTES = 4 << 20  # records in JSON, locks, and what a file system adds
 
 
@@ -155,10 +156,13 @@ def disk_bytes(method: Method, options: MethodOptions, inputs: Sequence[SceneInp
     degrees = [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
     plain = [_file_bytes(*each) for each in zip(sizes, degrees, strict=True)]
     fitted = [size for size, each in zip(plain, inputs, strict=True) if each.model is None]
+    appends = options.publish == "any" and options.channel == "appended"
+    published = _file_bytes(sizes[0] + _APPENDED * sum(sizes[1:]), degrees[0]) if appends else plain[0]
     if not method.trains:
-        return sum(plain) + plain[0] + _STATE_COPIES * (sum(fitted) + max(fitted, default=0)) + _OTHER_BYTES
-    published = min(_file_bytes(sum(sizes), options.fit.sh_degree), sum(plain) + max(plain))
-    checkpoints = _STATE_COPIES * (2 * published + sum(fitted))
+        return sum(plain) + published + _STATE_COPIES * (sum(fitted) + max(fitted, default=0)) + _OTHER_BYTES
+    trained = min(_file_bytes(sum(sizes), options.fit.sh_degree), sum(plain) + max(plain))
+    published = max(trained, published)
+    checkpoints = _STATE_COPIES * (2 * trained + sum(fitted))
     return sum(plain) + published + checkpoints + _OTHER_BYTES
 
 

@@ -19,6 +19,7 @@ from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.methods import registry
 from keyss.methods.records.embedding import embed_whole
+from keyss.rendering.difference import Viewpoints
 
 EVERY = pytest.mark.parametrize("name", SUFFIXES)
 # How far two files may be apart: positions in sizes of the Gaussian (the middle one of its scales), half of
@@ -85,7 +86,7 @@ def test_splat_transform_reads_it(
 def test_it_opens_from_the_very_file_and_from_no_other(name: str, tmp_path: Path) -> None:
     room, secret = room_in(model_of(), name, "appended"), model_of(200, seed=3)  # type: ignore[arg-type]
     _, stego = files(name, tmp_path)
-    made = embed_whole(room, ["key"], [secret], prune=False)
+    made = embed_whole(room, ["key"], [secret], [Viewpoints.around(secret)], prune=False)
     write_model(stego, made.stego)
     again = read_model(stego)
     found = registry.open_model(again, "key").reveal(again)

@@ -12,11 +12,8 @@ from channels.codes.published import model_of
 from keyss import CarryOptions, api
 from keyss.channels.codes.order import Counted
 from keyss.channels.codes.published import SUFFIXES, prepare
-from keyss.core import InputError, UsageError
+from keyss.core import UsageError
 from keyss.files import read_model, write_model
-from keyss.methods.dither import cost
-from keyss.methods.records import whole
-from keyss.methods.records.table import Table
 
 EVERY = pytest.mark.parametrize("publish", SUFFIXES)
 
@@ -69,41 +66,6 @@ def test_too_large_secrets_are_refused_or_pruned(publish: str) -> None:
         min_psnr=0,
     )
     assert 250 < hidden.metrics.secret_gaussians[0] < 1000
-
-
-def test_a_whole_model_comes_back_as_its_records_would() -> None:
-    model = model_of(3000, sh_degree=2)
-    sizes, costs = [], []
-    for bits in (97, whole.USUAL_BITS, 123, whole.MOST_BITS):
-        data = whole.encode(model, whole.Precision.of_size(bits))
-        opened = whole.decode(data)
-        assert opened.count == len(opened.gaussians) == 3000
-        sizes.append(len(data))
-        costs.append(cost(model, opened.gaussians))
-    assert sizes == sorted(sizes)
-    assert costs == sorted(costs)
-    assert costs[0] > 34
-    assert costs[1] > 40
-    assert sizes[1] * 8 < 3000 * Table.floor(2).total
-
-
-def test_damaged_encodings_end_in_an_input_error() -> None:
-    data = whole.encode(model_of(500))
-    generator = torch.Generator().manual_seed(0)
-    for cut in (0, 3, 50, 200, len(data) - 1):
-        with pytest.raises(InputError):
-            whole.decode(data[:cut])
-    with pytest.raises(InputError, match="announces"):
-        whole.decode(b"\xff\xff\xff\x7f" + data[4:])
-    for _ in range(200):
-        changed = bytearray(data)
-        at = int(torch.randint(len(data), (), generator=generator))
-        changed[at] ^= 1 << int(torch.randint(8, (), generator=generator))
-        try:
-            found = whole.decode(bytes(changed)).gaussians
-        except InputError:
-            continue
-        assert all(bool(getattr(found, name).isfinite().all()) for name in ("means", "quats", "sh"))
 
 
 @EVERY

@@ -15,8 +15,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
 from keyss.methods.carry.options import PRESETS, CarryOptions
-from keyss.methods.dither import cost, dither, sampled
-from keyss.methods.records import whole
+from keyss.methods.dither import dither, sampled
 from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
 from keyss.methods.records.encoding import (
     CarriedSecret,
@@ -25,7 +24,9 @@ from keyss.methods.records.encoding import (
     record_requests,
     subsampled_counts,
 )
+from keyss.methods.records.precision import check_fits
 from keyss.methods.records.prospect import outlook_whole
+from keyss.rendering.difference import Viewpoints, cost
 
 _PRUNE = '`prune_to_fit=True` leaves out the least visible, `publish="any"` has room'
 _ANY = '`publish="any"` needs no low bits of the cover'
@@ -108,16 +109,17 @@ class CarryMethod:
         if options.publish != "ply":
             room = room_in(cover.model, options.publish, options.channel)
             with advising(UsageError, _PRUNE_OR_PLY):
-                written = embed_whole(room, keys, models, prune=options.prune_to_fit)
+                views = [Viewpoints.of(each.source.scene) for each in secrets]
+                written = embed_whole(room, keys, models, views, prune=options.prune_to_fit)
             seconds = time.monotonic() - start
-            return Stego(written.stego, written.opened, seconds, details=written.details)
+            return Stego(written.stego, written.opened, seconds, details=written.details, verified=True)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
         with advising(InputError, _ANY if options.dither else _DITHER):
             prepared = _prepared(cover.model, options)
         counts = _counts(prepared, models, options)
         found = embed_models(prepared, keys, models, counts, NAME)
         seconds = time.monotonic() - start
-        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model))
+        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model), verified=True)
 
     def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""
@@ -134,7 +136,7 @@ def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> C
     with advising(UsageError, _PRUNE_OR_PLY):
         if not options.prune_to_fit:
             for model, share in zip(secrets, shares_of(room, secrets), strict=True):
-                whole.fitted(model, share, prune=False, short=room.grows)
+                check_fits(model, share)
     return options
 
 

@@ -26,7 +26,6 @@ from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
 from keyss.methods.base import Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego
-from keyss.methods.dither import cost
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, sized, training_options
@@ -43,6 +42,7 @@ from keyss.methods.learned.room import (
 from keyss.methods.learned.targets import PlacedScene
 from keyss.methods.records.embedding import unpack_records
 from keyss.methods.records.prospect import outlook_whole
+from keyss.rendering.difference import cost
 
 _clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
 

@@ -17,12 +17,12 @@ from keyss.channels.rooms import Room, room_in
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.loop import of_secret
 from keyss.fitting.plain import refit_model
 from keyss.keys import DerivedKey
 from keyss.methods.base import Context, KeyedSource, Source, Stego
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.room import of_degree, prepared_cover, record_degree, secret_sizes
-from keyss.methods.records import whole
 from keyss.methods.records.embedding import (
     Embedded,
     EmbeddedWhole,
@@ -31,7 +31,9 @@ from keyss.methods.records.embedding import (
     shares_of,
 )
 from keyss.methods.records.encoding import subsampled_counts
+from keyss.methods.records.precision import pruned
 from keyss.rendering.contributions import contributions
+from keyss.rendering.difference import Viewpoints
 
 SELECTION_VIEWS = 64
 _FITTING = 0.97  # of the Gaussians that fit before they are trained on: packed, they get longer or shorter
@@ -57,7 +59,8 @@ def hide_refitted(
         place = _InRecords.of(cover.model, options, _entropy(b"cover", secret_of_writer), name)
     else:
         model = cover.model.with_sh_degree(min(cover.model.sh_degree, fit.sh_degree))
-        place = _Whole(room_in(model, options.publish, options.channel))
+        views = [Viewpoints.of(each.source.scene) for each in secrets]
+        place = _Whole(room_in(model, options.publish, options.channel), views)
     sizes = place.sizes([each.source.model for each in secrets])
     models, seconds = [], 0.0
     for index, (secret, (size, degree)) in enumerate(zip(secrets, sizes, strict=True), start=1):
@@ -72,7 +75,7 @@ def hide_refitted(
             title="refit of the secret" if len(secrets) == 1 else f"refit of secret {index}",
             checkpoint=context.checkpoints / f"secret-{index}.safetensors" if context.checkpoints else None,
             resume=context.resume,
-            reporter=context.reporter,
+            reporter=of_secret(context.reporter),
         )
         models.append(found.gaussians)
         seconds += found.seconds
@@ -117,12 +120,13 @@ class _Whole:
     """Each as one string of bytes."""
 
     room: Room
+    viewpoints: Sequence[Viewpoints]
 
     def sizes(self, plain: Sequence[Gaussians]) -> list[tuple[int, int]]:
         """Gaussians and SH degree that each secret is trained with: a few fewer than would fit untrained."""
         found = []
-        for model, share in zip(plain, shares_of(self.room, plain), strict=True):
-            kept, _ = whole.fitted(model, share, prune=True, short=self.room.grows)
+        for model, share, views in zip(plain, shares_of(self.room, plain), self.viewpoints, strict=True):
+            kept = pruned(model, share, views)
             count = len(kept) if len(kept) == len(model) else max(1, int(_FITTING * len(kept)))
             found.append((count, kept.sh_degree))
         return found
@@ -130,7 +134,7 @@ class _Whole:
     def embed(
         self, keys: Sequence[str], models: Sequence[Gaussians], entropy: bytes
     ) -> tuple[EmbeddedWhole, dict[str, Any]]:
-        found = embed_whole(self.room, keys, models, prune=True, entropy=entropy)
+        found = embed_whole(self.room, keys, models, self.viewpoints, prune=True, entropy=entropy)
         return found, found.details
 
 

@@ -12,10 +12,10 @@ from keyss.channels.opening import open_content
 from keyss.channels.rooms import Room
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.dither import cost
-from keyss.methods.records import whole
+from keyss.methods.records import precision, whole
 from keyss.methods.records.encoding import CarriedSecret, decode, encode_all, most_visible, record_requests
 from keyss.methods.records.quantise import out_of_range
+from keyss.rendering.difference import Viewpoints, cost
 
 OPENED_BY = "carry"  # the method that opens what is embedded whole, whoever trained it
 
@@ -86,18 +86,20 @@ def embed_whole(
     room: Room,
     keys: Sequence[str],
     models: Sequence[Gaussians],
+    viewpoints: Sequence[Viewpoints],
     *,
     prune: bool,
     entropy: bytes | None = None,
 ) -> EmbeddedWhole:
     """All of each model, or with `prune` what fits, under its key, opened again; see `shares_of`.
 
-    Raises UsageError if they do not fit.
+    `viewpoints`: from where each is looked at, which tells how precise it has to be. Raises UsageError if
+    they do not fit.
     """
     shares = shares_of(room, models)
     fitted = [
-        whole.fitted(model, share, prune=prune, short=room.grows)
-        for model, share in zip(models, shares, strict=True)
+        precision.fitted(model, share, prune=prune, short=room.grows, viewpoints=views)
+        for model, share, views in zip(models, shares, viewpoints, strict=True)
     ]
     payloads = [Payload(OPENED_BY, data) for _, data in fitted]
     stego = room.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
@@ -125,7 +127,7 @@ def shares_of(room: Room, models: Sequence[Gaussians]) -> list[int]:
     capacity, overhead = room.capacity, room.overhead
     if len(models) == 1 and room.grows:
         return [capacity - overhead]
-    parts = [_parts_alone(whole.least_bytes(model), capacity, overhead) for model in models]
+    parts = [_parts_alone(precision.least_bytes(model), capacity, overhead) for model in models]
     if sum(1 / each for each in parts) > 1:
         parts = [len(models)] * len(models)
     return [max(0, capacity // each - overhead) for each in parts]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from keyss.channels.appended import appended_for
 from keyss.channels.rooms import room_in
 from keyss.methods.base import MethodOptions, Outlook, SceneInput
-from keyss.methods.records.whole import least_bytes
+from keyss.methods.records.precision import least_bytes
 
 # Of a Gaussian that is not there yet: room in codes or colours, and what one of a secret takes.
 _BITS_IN_COLOURS, _BITS_IN_CODES, _BITS_OF_SECRETS = 1, 18, 130

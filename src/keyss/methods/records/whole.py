@@ -5,8 +5,13 @@
 
 Gaussians are sorted along a Z-order curve, so that positions differ little from one to the next. Everything
 but the harmonics above degree 0 is coded as in records. Of these most are next to nothing: in brightness and
-two differences of colours they are divided by the step, what is below 0.6 of it becomes 0, and LZMA makes
-little of the zeros (a uniform quantiser with a dead zone; Sullivan 1996).
+two differences of colours they are divided by a step and rounded, and LZMA makes little of the zeros.
+
+What an error of a Gaussian's harmonics costs grows with how much of a picture it covers, so the step is
+smaller for large and opaque ones: by a quarter of an octave for each octave that area times opacity squared
+is above that of the middle one. (Equal errors in a picture would take half an octave, but small Gaussians are
+looked at from nearer; measured, a quarter takes the fewest bytes.) Both sides know it from the other numbers.
+Gaussians with equal steps lie together, because they pack better.
 """
 
 from __future__ import annotations
@@ -15,18 +20,17 @@ import lzma
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from keyss.core.colour import OPPONENT
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.dither import cost
-from keyss.methods.records.encoding import CarriedSecret, most_visible
+from keyss.methods.records.encoding import CarriedSecret
 from keyss.methods.records.packing import Bytes, Codes, codes_of_records, records_of_codes
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
@@ -34,15 +38,10 @@ from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
 MOST_GAUSSIANS = 1 << 22
 USUAL_BITS, MOST_BITS = 110, 143  # of all but harmonics: about 48 and 60 dB
 _HEAD = struct.Struct("<IBf")
-_STEP, _HALVED = 0.05, 20  # of harmonics at the usual bits; with so many more bits it is half as large
-_DEAD_ZONE = 0.6  # of a step
+_STEP, _HALVED = 0.06, 20  # of harmonics at the usual bits; with so many more bits it is half as large
 _LARGEST = 127  # code of a harmonic
-_GOOD_ENOUGH = 44.0  # dB of pictures against those of the model: of photos at 30 dB it takes 0.2
-# Of each attribute alone, until they are good enough together; shares of opacities, of which there are fewer
-# than of others, and of harmonics, of which more numbers than three become longer.
-_GOALS, _BIT = range(47, 61), 6.02  # dB
-_ATTRIBUTES, _SHARES = ("means", "log_scales", "quats", "opacity_logits"), (0, 0, 0, 4.8, 0, -8)
-_FEWEST = (8, 4, 4, 4, 4)  # bits
+_PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
+_FINER = 6  # half octaves by which a step is finer or coarser, at most
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
 _POSITIONS = range(3, 6)  # among the columns of a layout
 
@@ -65,12 +64,15 @@ class Precision(NamedTuple):
 def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     """`model` with the usual precision, or another."""
     table, step = precision or Precision.of_size(USUAL_BITS)
+    step = float(np.float32(step))
     model = in_morton_order(model)
     plain = model.with_sh_degree(0)
     codec = Codec.fit(plain, table)
-    columns = codes_of_records(codec.encode(plain), _layout(table))
+    records = codec.encode(plain)
+    columns = codes_of_records(records, _layout(table))
     planes = [plane for i, each in enumerate(columns) for plane in _planes(each, _layout(table)[i][1], i)]
-    packed = lzma.compress(b"".join(planes) + _harmonics(model, step), lzma.FORMAT_RAW, filters=_FILTERS)
+    planes.append(_harmonics(model, codec.decode(records), step))
+    packed = lzma.compress(b"".join(planes), lzma.FORMAT_RAW, filters=_FILTERS)
     return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + packed
 
 
@@ -102,95 +104,56 @@ def decode(data: bytes) -> CarriedSecret:
         found.append(_from_planes(part.reshape(columns, -1, count), bits, index))
         at += width
     plain = codec.decode(records_of_codes(found, layout))
-    codes = np.frombuffer(planes, np.int8, offset=own).reshape(harmonics // 3, 3, count).transpose(2, 0, 1)
-    numbers = torch.from_numpy((codes * float(step)) @ OPPONENT).float()
+    codes = np.frombuffer(planes, np.int8, offset=own).reshape(harmonics // 3, 3, count)
+    numbers = _from_harmonics(codes, plain, step)
     gaussians = Gaussians(
         plain.means, plain.quats, plain.log_scales, plain.opacity_logits, torch.cat([plain.sh, numbers], 1)
     )
     return CarriedSecret(gaussians, count, round(8 * len(data) / count))
 
 
-def good_enough(model: Gaussians) -> Precision:
-    """The coarsest precision of which the pictures are good enough, as far as few tries tell.
+def _harmonics(model: Gaussians, plain: Gaussians, step: float) -> bytes:
+    """Of each coefficient above degree 0 the codes of brightness and two differences, a byte each.
 
-    What an attribute costs alone is measured once, and 6 dB are a bit. The fewest bits in all are those with
-    which the squared error of each is in proportion to the numbers that a bit more is spent on.
+    `plain`: `model` as it will be decoded, but for these.
     """
-    table, step = Precision.of_size(Table.short().total)
-    rough = decode(encode(model, Precision(table, step))).gaussians
-    model = in_morton_order(model)
-    constant = replace(model, sh=torch.cat([rough.sh[:, :1], model.sh[:, 1:]], 1))
-    harmonics = replace(model, sh=torch.cat([model.sh[:, :1], rough.sh[:, 1:]], 1))
-    changed = [replace(model, **{name: getattr(rough, name)}) for name in _ATTRIBUTES]
-    costs = [cost(model, each) for each in (*changed, constant, harmonics)]
-    for goal in _GOALS:
-        missing = [goal + more - each for more, each in zip(_SHARES, costs, strict=True)]
-        bits = (each + math.ceil(dB / _BIT) for each, dB in zip(table.bits, missing, strict=False))
-        found = Table(tuple(min(max(each, least), 20) for each, least in zip(bits, _FEWEST, strict=True)))
-        precision = Precision(found, min(0.9, step * 10 ** (-missing[-1] / 20)))
-        if cost(model, decode(encode(model, precision)).gaussians) >= _GOOD_ENOUGH:
-            break
-    return precision
+    numbers = model.sh[:, 1:].detach().cpu().numpy().astype(np.float64) @ OPPONENT.T
+    finer = _finer(plain)
+    codes = np.rint(numbers / _steps(step, finer)[:, None, None]).clip(-_LARGEST, _LARGEST)
+    return codes[np.argsort(finer, kind="stable")].astype(np.int8).transpose(1, 2, 0).tobytes()
 
 
-def least_bytes(model: Gaussians) -> int:
-    """Of the encoding below which a secret is rather pruned."""
-    return len(encode(model))
+def _from_harmonics(codes: npt.NDArray[np.int8], plain: Gaussians, step: float) -> torch.Tensor:
+    """[N, coefficients, 3] harmonics of the codes [coefficients, 3, N]; the inverse of `_harmonics`."""
+    finer = _finer(plain)
+    steps = _steps(step, finer)[np.argsort(finer, kind="stable")]
+    # One product and one sum after the other: every reader gets the same float32 numbers.
+    parts = codes * steps
+    rows = np.empty((len(plain), len(codes), 3), np.float32)
+    for channel in range(3):
+        sums = parts[:, 0] * OPPONENT[0, channel]
+        for row in (1, 2):
+            sums = sums + parts[:, row] * OPPONENT[row, channel]
+        rows[np.argsort(finer, kind="stable"), :, channel] = sums.T
+    return torch.from_numpy(rows)
 
 
-def fitted(model: Gaussians, room: int, *, prune: bool, short: bool = False) -> tuple[Gaussians, bytes]:
-    """What of `model` is encoded, and it in at most `room` bytes, as precise as it fits.
-
-    `short`: no more precise than is hard to see. If all of it does not fit, `prune` takes the most visible
-    Gaussians, of the SH degree that renders most like the model. Raises UsageError without `prune`, or where
-    nothing fits.
-    """
-    least = encode(model, good_enough(model) if short else None)
-    if len(least) <= room:
-        return model, least if short else _most_precise(model, least, room)
-    if not prune:
-        raise UsageError(
-            f"the secret of {len(model):,} Gaussians takes {len(least):,} bytes, and there is room for "
-            f"{room:,}: about {max(0, len(model) * room // len(least)):,} of its Gaussians"
-        )
-    candidates = []
-    for degree in range(model.sh_degree + 1):
-        found = _pruned(model.with_sh_degree(degree), room)
-        if found is not None:
-            candidates.append(found)
-    if not candidates:
-        raise UsageError(f"nothing of a secret fits into {room:,} bytes")
-    kept, data = max(candidates, key=lambda each: cost(model, each[0]))
-    return kept, _most_precise(kept, data, room)
+def _finer(plain: Gaussians) -> npt.NDArray[np.int64]:
+    """[N] half octaves by which each Gaussian's steps are finer than those of the middle one."""
+    scales = np.sort(plain.log_scales.numpy().astype(np.float64), axis=1)
+    logits = plain.opacity_logits.numpy().astype(np.float64)
+    seen = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)  # nearly the logarithm of the opacity
+    middle = np.sort(seen)[(len(seen) - 1) // 2]
+    found: npt.NDArray[np.int64] = np.floor((seen - middle) * _PER_OCTAVE + 0.5).astype(np.int64)
+    return found.clip(-_FINER, _FINER)
 
 
-def _pruned(model: Gaussians, room: int) -> tuple[Gaussians, bytes] | None:
-    """The most visible Gaussians that fit into `room` bytes; None if not even one does."""
-    count = len(model)
-    while count > 0:
-        kept = most_visible(model, count)
-        data = encode(kept)
-        if len(data) <= room:
-            return kept, data
-        count = min(count - 1, int(0.995 * count * room / len(data)))
-    return None
-
-
-def _most_precise(model: Gaussians, usual: bytes, room: int) -> bytes:
-    """The longest encoding that fits, `usual` being that of the usual bits."""
-    more = 8 * (room - len(usual)) // len(model)
-    for bits in range(min(MOST_BITS, USUAL_BITS + more), USUAL_BITS, -2):
-        data = encode(model, Precision.of_size(bits))
-        if len(data) <= room:
-            return data
-    return usual
-
-
-def _harmonics(model: Gaussians, step: float) -> bytes:
-    """Of each coefficient above degree 0 the codes of brightness and two differences, a byte each."""
-    numbers = model.sh[:, 1:].detach().cpu().numpy().astype(np.float64) @ OPPONENT.T / step
-    codes = np.floor(np.abs(numbers) + 1 - _DEAD_ZONE).clip(0, _LARGEST) * np.sign(numbers)
-    return codes.astype(np.int8).transpose(1, 2, 0).tobytes()
+def _steps(step: float, finer: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """[N] steps, exact products of `step`, a power of two and the square root of two or one."""
+    steps: npt.NDArray[np.float64] = (
+        step * np.where(finer % 2, math.sqrt(2), 1.0) * 2.0 ** -((finer + 1) // 2)
+    )
+    return steps
 
 
 def _layout(table: Table) -> list[tuple[int, int]]:

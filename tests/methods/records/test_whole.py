@@ -1,0 +1,112 @@
+"""Models encoded whole, and how precisely."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from channels.codes.published import model_of
+from keyss.core import InputError
+from keyss.core.colour import OPPONENT
+from keyss.core.scene import Scene, View
+from keyss.methods.records import whole
+from keyss.methods.records.precision import fitted, good_enough, pruned
+from keyss.methods.records.table import Table
+from keyss.rendering.difference import Viewpoints, cost
+from keyss.rendering.orbit import orbit
+
+
+def test_a_whole_model_comes_back_as_its_records_would() -> None:
+    model = model_of(3000, sh_degree=2)
+    sizes, costs = [], []
+    for bits in (97, whole.USUAL_BITS, 123, whole.MOST_BITS):
+        data = whole.encode(model, whole.Precision.of_size(bits))
+        opened = whole.decode(data)
+        assert opened.count == len(opened.gaussians) == 3000
+        sizes.append(len(data))
+        costs.append(cost(model, opened.gaussians))
+    assert sizes == sorted(sizes)
+    assert costs == sorted(costs)
+    assert costs[0] > 34
+    assert costs[1] > 40
+    assert sizes[1] * 8 < 3000 * Table.floor(2).total
+
+
+def test_damaged_encodings_end_in_an_input_error() -> None:
+    data = whole.encode(model_of(500))
+    generator = torch.Generator().manual_seed(0)
+    for cut in (0, 3, 50, 200, len(data) - 1):
+        with pytest.raises(InputError):
+            whole.decode(data[:cut])
+    with pytest.raises(InputError, match="announces"):
+        whole.decode(b"\xff\xff\xff\x7f" + data[4:])
+    for _ in range(200):
+        changed = bytearray(data)
+        at = int(torch.randint(len(data), (), generator=generator))
+        changed[at] ^= 1 << int(torch.randint(8, (), generator=generator))
+        try:
+            found = whole.decode(bytes(changed)).gaussians
+        except InputError:
+            continue
+        assert all(bool(getattr(found, name).isfinite().all()) for name in ("means", "quats", "sh"))
+
+
+def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() -> None:
+    model = model_of(2000, sh_degree=3)
+    small = model.opacity_logits < model.opacity_logits.median()
+    scales = model.log_scales - 2.0 * small[:, None]
+    model = replace(model, log_scales=scales)
+    step = 0.03
+    found = whole.decode(whole.encode(model, whole.Precision(whole.Precision.of_size(110).table, step)))
+    error = (found.gaussians.sh - model.sh)[:, 1:].double().numpy() @ OPPONENT.T
+    largest = np.abs(error).reshape(2000, -1).max(axis=1)
+    seen = (scales.sort(dim=1).values[:, 1:].sum(1) + 2 * model.opacity_logits.clamp(max=0)).double().numpy()
+    octaves = (seen - np.median(seen)) / np.log(2)
+    steps = step * 2.0 ** -(octaves / 4).clip(-3, 3)
+    # A quarter of an octave for rounding what is known of the Gaussian, and some for how precisely it is.
+    assert (largest < steps / 2 * 2**0.5).all()
+    assert largest[small.numpy()].mean() > 1.5 * largest[~small.numpy()].mean()
+
+
+def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
+    model = model_of(1500, sh_degree=2)
+    cameras = orbit(model, 64, 12)
+    views = tuple(View(camera, torch.zeros(64, 64, 3, dtype=torch.uint8)) for camera in cameras)
+    scene = Scene("scene", views, (), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8), torch.ones(3))
+    viewpoints = Viewpoints.of(scene)
+    assert 4 <= len(viewpoints.cameras) <= 8
+    assert torch.equal(viewpoints.background, torch.ones(3))
+    found = good_enough(model, viewpoints)
+    opened = whole.decode(whole.encode(model, found)).gaussians
+    assert 44 <= cost(model, opened, viewpoints) < 48
+    kept, data = fitted(model, 1 << 20, prune=False, short=True, viewpoints=viewpoints)
+    assert kept is model
+    assert data == whole.encode(model, found)
+
+
+def test_large_pictures_are_compared_at_a_smaller_size() -> None:
+    model = model_of(50)
+    camera = orbit(model, 1000, 1)[0]
+    scene = Scene(
+        "scene",
+        (View(camera, torch.zeros(0, 0, 3)),),
+        (),
+        torch.zeros(0, 3),
+        torch.zeros(0, 3),
+        torch.zeros(3),
+    )
+    (small,) = Viewpoints.of(scene).cameras
+    assert (small.width, small.height) == (256, 256)
+    assert torch.allclose(small.K[:2] / 256, camera.K[:2] / 1000)
+
+
+def test_what_is_seen_least_is_left_out_until_it_fits() -> None:
+    model = model_of(800, sh_degree=1)
+    kept, data = fitted(model, 4000, prune=True)
+    assert len(data) <= 4000
+    assert 200 < len(kept) < 800
+    assert len(pruned(model, 4000)) == len(kept)
+    assert pruned(model, 1 << 20) is model
