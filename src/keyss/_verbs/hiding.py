@@ -13,14 +13,14 @@ import torch
 from keyss._verbs.asking import Secret, inputs_of, method_for
 from keyss.channels.base import Payload
 from keyss.core.errors import QualityError, UsageError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene
 from keyss.files.models import is_model_path, read_model
 from keyss.fitting.loop import Reporter
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, measure_hiding, render_fidelity
-from keyss.methods.base import Context, KeyedSource, Method, MethodOptions, Source, Stego
+from keyss.methods.base import Context, KeyedSource, Method, MethodOptions, Opened, Source, Stego
 from keyss.methods.handed import pack
 from keyss.methods.plain_models import plain_models
 from keyss.methods.registry import open_handed
@@ -175,8 +175,11 @@ def _as_read(
     if folder:
         name = stego_name(model)
         model = read_model(folder.write(writers({name: model, **handed})) / name)
+    opened: Sequence[Opened]
     if handed:
         opened = [open_handed(data, key or None) for data, key in zip(handed.values(), keys, strict=True)]
+    elif stego.verified and same_bits(model, stego.gaussians):
+        opened = stego.opened  # to open the same bits once more would show nothing new
     else:
         opened = [open_in(model, key) for key in keys]
     return [model, *(each.reveal(model) for each in opened)]

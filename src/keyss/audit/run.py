@@ -15,6 +15,7 @@ from keyss.audit.parts import OF_3DGS_MODELS, PARTS
 from keyss.audit.progress import FinishedParts, PartProgress
 from keyss.audit.subject import AuditSubject, subject_of
 from keyss.core.errors import Interrupted, UsageError, signal_of
+from keyss.files.layout import usual_up
 from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
@@ -29,7 +30,7 @@ from keyss.runs.audit_record import (
     WrongKeyResult,
 )
 from keyss.runs.config import PathLike
-from keyss.runs.files import REPORT, writers
+from keyss.runs.files import REPORT, stego_in, writers
 from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun, open_run
 
@@ -112,7 +113,7 @@ def audit(
         )
         files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
         there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": found, **files}))
-        folder.write(writers({REPORT: report_bytes(found, there)}))
+        folder.write(writers({REPORT: report_bytes(found, there, stego_in(opened.folder))}))
     return found
 
 
@@ -140,5 +141,6 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         photos=run.metrics.photos,
         standard=registry.get(run.config.method).capabilities.standard,
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as it will be read again
+        up=usual_up(cover),
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

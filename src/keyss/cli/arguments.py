@@ -46,6 +46,7 @@ MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model."
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
 TensorBoard = Annotated[bool, arg(help="Write losses to private/tensorboard in the results as it trains.")]
+Live = Annotated[bool, arg(help="Show the model as it trains, on a page of this machine.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
 
 

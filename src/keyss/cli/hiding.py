@@ -19,6 +19,7 @@ from keyss.cli.arguments import (
     Device,
     Iterations,
     KeyFiles,
+    Live,
     MaxGaussians,
     OutFolder,
     Overwrite,
@@ -94,6 +95,7 @@ def hide(
     resume: Resume = False,
     overwrite: Overwrite = False,
     tensorboard: TensorBoard = False,
+    live: Live = False,
     device: Device = "auto",
     seed: Seed = None,
     **own: Any,
@@ -110,6 +112,7 @@ def hide(
     """
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
+    from keyss.cli.live import watched
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.cli.tensorboard import reporter
     from keyss.core.errors import UsageError
@@ -124,7 +127,7 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
-        unused |= {"--tensorboard": tensorboard}
+        unused |= {"--tensorboard": tensorboard, "--live": live}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         _hide_files(cover, secret_file, publish, channel or "colours", key_file, out, overwrite)
@@ -153,6 +156,7 @@ def hide(
             "--preset": preset != next(iter(chosen.presets)),
             "--iterations": iterations is not None,
             "--max-gaussians": max_gaussians is not None,
+            "--live": live,
         }
         if idle := [flag for flag, is_given in training.items() if is_given]:
             raise UsageError(
@@ -182,21 +186,22 @@ def hide(
         )
         print_plan(planned)
         return
-    result = api.hide(
-        cover,
-        secrets,
-        method=options,
-        width=width,
-        background=background,
-        skip_missing=skip_missing,
-        cover_model=cover_model,
-        min_psnr=min_psnr,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-        resume=resume,
-        reporter=reporter(out, tensorboard=tensorboard),
-    )
+    with watched(reporter(out, tensorboard=tensorboard), cover, live=live) as told:
+        result = api.hide(
+            cover,
+            secrets,
+            method=options,
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            cover_model=cover_model,
+            min_psnr=min_psnr,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=told,
+        )
     print_hiding(result.metrics)
     how = _HOW[publish == "any"]
     what = "the cover, with the secret in it" if chosen.trains or chosen.capabilities.keys else "the cover"

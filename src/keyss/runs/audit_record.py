@@ -41,6 +41,7 @@ class AuditedRun:
     standard: bool = True  # whether what is published is a 3DGS model
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
+    up: str = "-y"  # the way up in the cover: "-y", "z" or "y"
 
 
 @dataclass(frozen=True)
