@@ -236,22 +236,24 @@ def _sheet(runs: Sequence[tuple[str, HidingRun]], device: Backend) -> Image.Imag
     return _drawn(rows)
 
 
-def _drawn(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], cell: int = 240) -> Image.Image:
-    """Rows of pictures [H, W, 3], each scaled to `cell` pixels' width, beside their names."""
-    gap, label = cell // 40, cell // 2
-    heights = [max(round(each.shape[0] * cell / each.shape[1]) for each in pictures) for _, pictures in rows]
-    columns = max((len(pictures) for _, pictures in rows), default=0)
-    size = label + columns * (cell + gap) + gap, cell // 8 + sum(heights) + gap * (len(rows) + 1)
+def _drawn(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], cell: int = 200) -> Image.Image:
+    """Rows of pictures [H, W, 3], each `cell` pixels high, beside their names."""
+    gap, label, head = cell // 40, cell // 2, cell // 8
+    pictures = [[Image.fromarray(each) for each in own] for _, own in rows]
+    scaled = [
+        [each.resize((max(1, round(each.width * cell / each.height)), cell)) for each in own]
+        for own in pictures
+    ]
+    widths = [max(each.width for each in column) for column in zip(*scaled, strict=True)]
+    size = label + sum(widths) + gap * (len(widths) + 1), head + (cell + gap) * len(rows) + gap
     sheet = Image.new("RGB", size, "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(cell // 17)
-    for index, head in enumerate(("cover", "secret", "error of the secret, x4")[:columns]):
-        draw.text((label + index * (cell + gap), gap), head, fill=(20, 20, 20), font=font)
-    y = cell // 8
-    for (name, pictures), height in zip(rows, heights, strict=True):
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(cell // 14)
+    starts = [label + sum(widths[:index]) + gap * index for index in range(len(widths))]
+    for x, text in zip(starts, ("cover", "secret", "error of the secret, x4"), strict=False):
+        draw.text((x, gap), text, fill=(20, 20, 20), font=font)
+    for number, ((name, _), own) in enumerate(zip(rows, scaled, strict=True)):
+        y = head + (cell + gap) * number
         draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
-        for index, each in enumerate(pictures):
-            picture = Image.fromarray(each)
-            scaled = picture.resize((cell, round(each.shape[0] * cell / each.shape[1])))
-            sheet.paste(scaled, (label + index * (cell + gap), y))
-        y += height + gap
+        for x, each in zip(starts, own, strict=True):
+            sheet.paste(each, (x, y))
     return sheet

@@ -131,19 +131,16 @@ def print_steganalysis(found: Steganalysis) -> None:
 
 
 def print_comparison(found: Comparison) -> None:
-    """A block for each method: the table of `comparison.md` is wider than terminals."""
+    """The table of `comparison.md` in three parts."""
     from keyss.runs.comparison import table
 
     heads, *rows = table(found)
-    quality = _table(*heads[:7], texts=1)
-    rest = _table(heads[0], *heads[7:], texts=1)
-    for row in rows:
-        if len(row[1]) > 20:  # why it is not possible
-            continue
-        quality.add_row(*row[:7])
-        rest.add_row(row[0], *row[7:])
-    Console().print(quality)
-    Console().print(rest)
+    for columns in (slice(1, 7), slice(8, 13), [7, *range(13, 16)]):  # as wide as terminals are
+        part = _table(heads[0], *_chosen(heads, columns), texts=1)
+        for row, each in zip(rows, found.methods, strict=True):
+            if each.error is None:
+                part.add_row(row[0], *_chosen(row, columns))
+        Console().print(part)
     for each in found.methods:
         if each.error is not None:
             print(f"{each.name}: not possible: {each.error}")
@@ -151,6 +148,10 @@ def print_comparison(found: Comparison) -> None:
         "Test views: photos that were not trained on. All methods had the same plain models, as many steps "
         "in each training, and at most as many Gaussians."
     )
+
+
+def _chosen(row: Sequence[str], columns: slice | Sequence[int]) -> list[str]:
+    return list(row[columns]) if isinstance(columns, slice) else [row[index] for index in columns]
 
 
 def print_verdicts(run: Path) -> None:

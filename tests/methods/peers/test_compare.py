@@ -57,7 +57,7 @@ def test_a_table_a_picture_and_a_second_start(
     assert len(lines) == 2 + len(rows)
     assert len({line.count("|") for line in lines}) == 1
     with Image.open(out / "comparison.png") as picture:
-        assert picture.height > 4 * 240 * 30 / 40  # photos and three methods
+        assert picture.height > 4 * 200  # photos and three methods
     assert (out / "key.txt").stat().st_mode & 0o77 == 0
 
 
