@@ -55,14 +55,15 @@ class How:
     jobs: int | None = None  # at once; None: as many as cores and memory allow
     ray: str | None = None  # address of a cluster, or "local"
     retries: int = RETRIES
-    command: Sequence[str] = WORKER
+    command: Sequence[str] | None = None  # of the process that does a job; None: `keyss.sweeps.worker`
 
     def engine(self, planned: Sequence[Planned]) -> Engine:
         """Raises UsageError."""
         resources = Resources.divided(self.jobs, max((each.memory for each in planned), default=1))
+        command = WORKER if self.command is None else self.command
         if self.ray is not None:
-            return RayEngine(self.ray, resources, self.retries, self.command)
-        return LocalEngine(resources, self.retries, self.command)
+            return RayEngine(self.ray, resources, self.retries, command)
+        return LocalEngine(resources, self.retries, command)
 
 
 def run_all(out: Path, title: str, planned: Sequence[Planned], how: How) -> list[Ended]:
