@@ -25,7 +25,7 @@ from typing import Any
 
 import msgspec
 
-import keyss
+from keyss import _version
 from keyss._version import __version__
 from keyss.core.errors import InputError
 from keyss.runs.records import read_record
@@ -160,7 +160,7 @@ def checksum(path: str) -> str:
 @cache
 def code_version() -> str:
     """The version of keyss, and a digest of all of its code that a result can depend on."""
-    root = Path(next(iter(keyss.__path__)))
+    root = Path(_version.__file__).parent
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         name = path.relative_to(root)
