@@ -18,9 +18,9 @@ from keyss.sweeps import worker
 from keyss.sweeps.job import Result
 
 def perform(job, folder):
-    if "broken" in job.cover:
+    if "broken" in Path(job.cover).name:
         raise InputError(f"{job.cover}: nothing of it can be read")
-    if "mortal" in job.cover:
+    if "mortal" in Path(job.cover).name:
         deaths = folder / "deaths"
         count = len(deaths.read_text()) if deaths.exists() else 0
         if count < 2:
