@@ -20,16 +20,21 @@ if TYPE_CHECKING:
     from keyss._verbs.planning import plan
     from keyss.audit.run import audit
     from keyss.report.page import write_report
+    from keyss.sweeps.batch import BatchResult, hide_batch
+    from keyss.sweeps.sweep import SweepResult, sweep
 
 __all__ = ["Conversion", "HideResult", "Secret", "audit", "convert", "evaluate", "fit", "hide", "plan"]
 __all__ += ["render", "render_video", "reveal", "reveal_counted", "verify", "write_report"]
 __all__ += ["compare"]
 __all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
+__all__ += ["BatchResult", "SweepResult", "hide_batch", "sweep"]
 
 _HOMES = {
+    "BatchResult": "sweeps.batch",
     "Conversion": "_verbs.converting",
     "HideFilesResult": "_verbs.filing",
     "HideResult": "_verbs.hiding",
+    "SweepResult": "sweeps.sweep",
     "Secret": "_verbs.asking",
     "SecretFile": "_verbs.filing",
     "audit": "audit.run",
@@ -38,6 +43,7 @@ _HOMES = {
     "evaluate": "_verbs.looking",
     "fit": "_verbs.fitting",
     "hide": "_verbs.hiding",
+    "hide_batch": "sweeps.batch",
     "hide_files": "_verbs.filing",
     "plan": "_verbs.planning",
     "render": "_verbs.looking",
@@ -45,6 +51,7 @@ _HOMES = {
     "reveal": "_verbs.opening",
     "reveal_counted": "_verbs.opening",
     "reveal_file": "_verbs.filing",
+    "sweep": "sweeps.sweep",
     "verify": "_verbs.opening",
     "write_report": "report.page",
 }

@@ -68,7 +68,7 @@ def hide(
     scenes come first unless they are given. `method`: a name for default options, or a method's own options
     (`LearnedOptions`, `CarryOptions`). `width`, `background`, `skip_missing`: see `load_scene`.
     Without a seed in the options' `fit` the run draws one from the system, and `config.json` records it; to
-    be resumed it needs none.
+    be resumed it needs none. With one, the same arguments give the same bytes on a CPU with as many threads.
 
     The secrets lie encrypted in `stego.ply`, or what the options' `publish` says. `out` (a folder) gets it in
     `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`, and with what methods
@@ -85,6 +85,7 @@ def hide(
             'lie, or with `method="carry"` what its `publish` says'
         )
     chosen, options = method_for(method, secrets)
+    repeatable = options.fit.seed is not None
     recorded = recorded_seed(Path(out), "options", "fit", "seed") if resume and out is not None else None
     options = replace(options, fit=options.fit.seeded(recorded))
     keys = [secret.key for secret in secrets]
@@ -135,6 +136,8 @@ def hide(
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
         own, *others = map(Source, scenes, plain)
+        if repeatable:
+            context = replace(context, entropy=_entropy(keys, options, plain))
         stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
         handed = _handed_files(stego.handed, keys)
         against_plain = tuple(
@@ -159,6 +162,15 @@ def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list
     salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
     derivation = KeyDerivation(salt=salt)
     return [DerivedKey(key, derivation).verifier().hex() for key in keys if key]
+
+
+def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
+    """32 bytes that nobody knows without the keys; other inputs or options have others."""
+    seed = options.fit.known_seed
+    salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
+    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys]
+    parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
+    return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 
 def _handed_files(payloads: Sequence[Payload], keys: Sequence[str]) -> dict[str, bytes]:

@@ -47,6 +47,18 @@ Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
 TensorBoard = Annotated[bool, arg(help="Write losses to private/tensorboard in the results as it trains.")]
 Live = Annotated[bool, arg(help="Show the model as it trains, on a page of this machine.")]
+MasterKeyFile = Annotated[
+    Path | None,
+    optional("FILE", "File with a key from which each gets its own (`keyss key-of`).", "none"),
+]
+Jobs = Annotated[
+    int | None,
+    optional("N", "How many at once; the cores are divided among them.", "as cores and memory allow"),
+]
+Ray = Annotated[
+    str | None,
+    optional("ADDRESS", "Run on the Ray cluster at this address, or on a `local` one.", "processes here"),
+]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
 
 

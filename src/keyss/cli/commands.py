@@ -18,6 +18,7 @@ from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
 from keyss.cli.models import convert, fit, info, render
 from keyss.cli.revealing import reveal, verify
+from keyss.cli.sweeping import key_of, sweep
 from keyss.cli.viewing import export_html, view
 
 
@@ -114,6 +115,6 @@ def version() -> None:
 
 
 ALL = (
-    *(keygen, fit, hide, reveal, verify, render, convert, view, export_html),
-    *(evaluate, audit, report, compare, steganalyze, info, demo, doctor, completion, version),
+    *(keygen, key_of, fit, hide, reveal, verify, render, convert, view, export_html),
+    *(sweep, evaluate, audit, report, compare, steganalyze, info, demo, doctor, completion, version),
 )

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 EXTRAS = {
     "clip": ("transformers", "the paper's key encoder"),
     "metrics": ("flip-evaluator", "FLIP in audits"),
+    "sweep": ("ray", "sweeps on a cluster"),
     "tensorboard": ("tensorboard", "losses of a training, as it runs"),
     "video": ("av", "films by keyss render --video"),
     "steganalysis": ("sealwatch", "detectors in audits"),

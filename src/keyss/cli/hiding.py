@@ -18,11 +18,14 @@ from keyss.cli.arguments import (
     Background,
     Device,
     Iterations,
+    Jobs,
     KeyFiles,
     Live,
+    MasterKeyFile,
     MaxGaussians,
     OutFolder,
     Overwrite,
+    Ray,
     Resume,
     Seed,
     SkipMissing,
@@ -32,6 +35,7 @@ from keyss.cli.arguments import (
     preset_sizes,
     schedule,
 )
+from keyss.cli.sweeping import hide_assets
 
 if TYPE_CHECKING:
     from keyss.channels.rooms import AnyChannel, Publish
@@ -44,8 +48,9 @@ _HOW = ("byte for byte as it is", "as it is, or converted")  # to publish
 def hide(
     *,
     cover: Annotated[
-        Path, arg(metavar="SCENE", help="Scene that everybody may see, or a model (.ply, .spz, ...).")
-    ],
+        Path | None,
+        optional("SCENE", "Scene that everybody may see, or a model (.ply, .spz, ...).", "those of --batch"),
+    ] = None,
     secret: Annotated[
         UseAppendAction[tuple[Path, ...]],
         optional("SCENE", "Scene or model to hide in it, once for each secret.", "files are hidden"),
@@ -72,6 +77,18 @@ def hide(
     ] = None,
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
+    batch: Annotated[
+        Path | None,
+        optional(
+            "CSV",
+            "Table of assets, each hidden by itself: columns cover, secret or secret_file, out (a folder in "
+            "that of -o) and key_file.",
+            "one hiding",
+        ),
+    ] = None,
+    master_key_file: MasterKeyFile = None,
+    jobs: Jobs = None,
+    ray: Ray = None,
     out: OutFolder,
     preset: str = "best",
     iterations: Iterations = None,
@@ -109,6 +126,8 @@ def hide(
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
+
+    example: keyss hide --batch assets.csv --method carry --master-key-file master.txt -o runs/assets
     """
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
@@ -120,7 +139,12 @@ def hide(
     from keyss.rendering.orbit import is_model
     from keyss.runs.files import HANDED, STEGOS
 
-    if secret_file:
+    if cover is None and batch is None:
+        raise UsageError("nothing to hide in: give --cover SCENE, or --batch CSV for many")
+    for flag, value in (("--master-key-file", master_key_file), ("--jobs", jobs), ("--ray", ray)):
+        if batch is None and value is not None:
+            raise UsageError(f"{flag} is for many hidings: give --batch CSV, or leave it out")
+    if secret_file and cover is not None and batch is None:
         unused: dict[str, object] = {
             "--secret": secret,
             "--secret-model": secret_model,
@@ -132,7 +156,7 @@ def hide(
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         _hide_files(cover, secret_file, publish, channel or "colours", key_file, out, overwrite)
         return
-    if not secret:
+    if not secret and batch is None:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
     if secret_model and len(secret_model) != len(secret):
         raise UsageError(
@@ -150,6 +174,31 @@ def hide(
         changes["channel"] = channel
     options = chosen.presets[preset].adapted(**changes)
     options = options.with_fit(**schedule(iterations, max_gaussians, seed))
+    if batch is not None:
+        one: dict[str, object] = {"--cover": cover, "--secret": secret, "--secret-file": secret_file}
+        one |= {"--key-file": key_file, "--cover-model": cover_model, "--secret-model": secret_model}
+        one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--resume": resume}
+        if given_too := [flag for flag, value in one.items() if value]:
+            raise UsageError(
+                f"--batch: {given_too[0]} is for a single hiding; a batch that was interrupted goes on "
+                "with the same command"
+            )
+        hide_assets(
+            batch,
+            out,
+            method=options,
+            master_key_file=master_key_file,
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            min_psnr=min_psnr,
+            device=device,
+            jobs=jobs,
+            ray=ray,
+            overwrite=overwrite,
+        )
+        return
+    assert cover is not None
     given = [cover_model or cover, *(secret_model or secret)]
     if not chosen.trains and all(map(is_model, given)):
         training = {

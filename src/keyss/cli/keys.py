@@ -10,10 +10,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from keyss.core.errors import InputError, OutputError, UsageError, WrongKeyError
+from keyss.core.errors import UsageError, WrongKeyError
+from keyss.keys.key_file import read_key_file
+from keyss.keys.key_file import write_new_key as write_new_key
 
 VARIABLE = "KEYSS_KEY"
-MAX_FILE_BYTES = 4096
 
 
 def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[str]:
@@ -82,52 +83,17 @@ def _white_space(key: str) -> str | None:
     return f"the key {end} with {kind}, which is a part of it"
 
 
-def write_new_key(path: Path, key: str) -> None:
-    """Write a key file that only its owner can read. Raises OutputError where there is anything already."""
-    try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError as error:
-        raise OutputError(f"{path} exists, and a key is never replaced: choose another name") from error
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            os.fchmod(descriptor, 0o600)  # whatever the umask
-            file.write(f"{key}\n")
-            file.flush()
-            os.fsync(descriptor)
-    except BaseException as error:
-        path.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"cannot write {path}: {error.strerror}") from error
-        raise
-
-
 def key_of_file(path: Path) -> str:
     """The text of a key file without one newline at its end; warns of one that others may read.
 
     Raises InputError for a file that holds no key.
     """
-    try:
-        with path.open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
-                print(
-                    f"keyss: warning: {path}: others can read this key file; `chmod 600` keeps it to you",
-                    file=sys.stderr,
-                )
-            data = file.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: the key file cannot be read: {error.strerror}") from error
-    if len(data) > MAX_FILE_BYTES:
-        raise InputError(f"{path}: expected a key file of at most {MAX_FILE_BYTES} bytes, found more")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a key in UTF-8, found other bytes") from error
-    key = text.removesuffix("\n").removesuffix("\r")
-    if not key:
-        raise InputError(f"{path}: the key file is empty; `keyss keygen -o FILE` writes a key")
+    key, mode = read_key_file(path)
+    if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
+        print(
+            f"keyss: warning: {path}: others can read this key file; `chmod 600` keeps it to you",
+            file=sys.stderr,
+        )
     return key
 
 

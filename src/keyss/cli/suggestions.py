@@ -5,23 +5,23 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
-from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from keyss.core.nearest import nearest
+
 _MOST_NAMES = 10_000  # of a folder that are compared, so that an error comes at once
-_LONGEST = 100  # characters of a word that is compared
 
 
 def meant(arguments: Sequence[str], commands: Collection[str], options: Collection[str]) -> str | None:
     """What the arguments of a wrong call should perhaps have been, in a few words; None without an idea."""
     command, *others = arguments
     if command not in commands:
-        near = _nearest(command.lower(), commands)
+        near = nearest(command.lower(), commands)
         return near and f"`keyss {near}`"
     flags = {word.partition("=")[0] for word in others if word.startswith("--")} - {"--help"}
-    found = {flag: _nearest(flag, options) for flag in sorted(flags - set(options))}
+    found = {flag: nearest(flag, options) for flag in sorted(flags - set(options))}
     return ", ".join(f"{near} instead of {flag}" for flag, near in found.items() if near) or None
 
 
@@ -56,7 +56,7 @@ def _near_path(path: Path) -> Path | None:
     found = Path(path.anchor)
     for part in path.relative_to(path.anchor).parts:
         if not (found / part).exists():
-            near = _nearest(part, list(_names(found)))
+            near = nearest(part, list(_names(found)))
             if near is None:
                 return None
             part = near
@@ -67,10 +67,3 @@ def _near_path(path: Path) -> Path | None:
 def _names(folder: Path) -> Iterator[str]:
     with os.scandir(folder) as entries:
         yield from (entry.name for entry in islice(entries, _MOST_NAMES))
-
-
-def _nearest(word: str, known: Collection[str]) -> str | None:
-    """The one of `known` that is most like `word`, if any is like it; the same for the same names."""
-    short = [each for each in sorted(known) if len(each) <= _LONGEST]
-    found = get_close_matches(word, short, n=1, cutoff=0.7) if len(word) <= _LONGEST else []
-    return found[0] if found else None

@@ -72,6 +72,8 @@ class Context:
     checkpoints: Path | None = None  # folder for the state of what is interrupted
     resume: bool = False
     reporter: Reporter | None = None
+    # 32 bytes that nobody else can know, for a run that is to be repeated to the byte; None: the system's.
+    entropy: bytes | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)

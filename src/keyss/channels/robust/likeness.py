@@ -15,6 +15,7 @@ that such differences have.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -123,7 +124,8 @@ class Likeness:
         around: list[tuple[Rows, Rows]],
     ) -> Doubles:
         """[R, F] of rows whose number in this column is `values` [R]."""
-        another, found = 3 - column, []
+        another = 3 - column
+        found: list[npt.NDArray[Any]] = []
         for which, other in around:
             apart = values[which] - colours[other, column]
             own = rows[which]

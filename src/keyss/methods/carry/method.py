@@ -13,6 +13,7 @@ from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.channels.rooms import room_in
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
+from keyss.keys.derivation import expand
 from keyss.methods.base import (
     Capabilities,
     Context,
@@ -120,14 +121,16 @@ class CarryMethod:
             room = room_in(cover.model, options.publish, options.channel)
             with advising(UsageError, _PRUNE_OR_PLY):
                 views = [Viewpoints.of(each.source.scene) for each in secrets]
-                written = embed_whole(room, keys, models, views, prune=options.prune_to_fit)
+                written = embed_whole(
+                    room, keys, models, views, prune=options.prune_to_fit, entropy=context.entropy
+                )
             seconds = time.monotonic() - start
             return Stego(written.stego, written.opened, seconds, details=written.details, verified=True)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
         with advising(InputError, _ANY if options.dither else _DITHER):
-            prepared = _prepared(cover.model, options)
+            prepared = _prepared(cover.model, options, context.entropy)
         counts = _counts(prepared, models, options)
-        found = embed_models(prepared, keys, models, counts, NAME)
+        found = embed_models(prepared, keys, models, counts, NAME, entropy=context.entropy)
         seconds = time.monotonic() - start
         return Stego(found.stego, found.opened, seconds, details=found.details(cover.model), verified=True)
 
@@ -155,7 +158,7 @@ def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
     return [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
 
 
-def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
+def _prepared(cover: Gaussians, options: CarryOptions, entropy: bytes | None = None) -> LowBitsCover:
     """The cover as it is, if that will do."""
     try:
         LOW_BITS.prepare(sampled(cover))
@@ -163,7 +166,8 @@ def _prepared(cover: Gaussians, options: CarryOptions) -> LowBitsCover:
     except InputError:
         if not options.dither:
             raise
-    return LOW_BITS.prepare(dither(cover, os.urandom(32)))
+    random = os.urandom(32) if entropy is None else expand(entropy, "carry/dither", 32)
+    return LOW_BITS.prepare(dither(cover, random))
 
 
 def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:

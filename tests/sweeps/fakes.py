@@ -1,0 +1,84 @@
+"""Workers that do next to nothing, and small sweeps for them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+TESTS = str(Path(__file__).parents[1])
+
+# Takes a moment, and publishes what follows from the job alone. A job whose cover has "broken" in its name is
+# refused; one with "mortal" dies in its first two attempts.
+PROGRAM = """
+import hashlib, os, signal, sys, threading, time
+from dataclasses import dataclass
+from pathlib import Path
+from keyss.core.errors import InputError
+from keyss.sweeps import worker
+from keyss.sweeps.job import Result
+
+def perform(job, folder):
+    if "broken" in Path(job.cover).name:
+        raise InputError(f"{job.cover}: nothing of it can be read")
+    if "mortal" in Path(job.cover).name:
+        deaths = folder / "deaths"
+        count = len(deaths.read_text()) if deaths.exists() else 0
+        if count < 2:
+            deaths.write_text("x" * (count + 1))
+            os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(SECONDS)
+    run = Path(os.path.normpath(folder.absolute() / job.run))
+    (run / "publish").mkdir(parents=True, exist_ok=True)
+    seed = job.options["fit"]["seed"] or 0
+    data = f"{Path(job.cover).name} {seed}".encode()
+    (run / "publish" / "stego.ply").write_bytes(data)
+    published = os.path.relpath(run / "publish" / "stego.ply", folder.absolute())
+    digest = hashlib.sha256(data).hexdigest()
+    numbers = {"cover.psnr": 30.0 + seed}
+    return Result(name=job.name, seconds=0.1, published=published, sha256=digest, numbers=numbers)
+
+threading.Thread(target=worker._end_with_parent, daemon=True).start()
+sys.exit(worker.attempt(Path(sys.argv[1]), perform))
+"""
+
+
+def fake(seconds: float = 0.0) -> tuple[str, ...]:
+    """The command of such a worker."""
+    return (sys.executable, "-c", PROGRAM.replace("SECONDS", repr(seconds)))
+
+
+# The real one, with keys at almost no cost.
+REAL = (
+    sys.executable,
+    "-c",
+    f"import sys; sys.path.append({TESTS!r}); import argon2.low_level, cheap_keys; "
+    "argon2.low_level.hash_secret_raw = cheap_keys.hash_secret_raw; "
+    "from keyss.sweeps.worker import main; sys.exit(main(sys.argv[1:]))",
+)
+
+# A driver, to be killed: `python -c DRIVER SPEC OUT`.
+DRIVER = f"""
+import sys
+sys.path[:0] = [{TESTS!r}]
+import argon2.low_level, cheap_keys
+argon2.low_level.hash_secret_raw = cheap_keys.hash_secret_raw
+from sweeps.fakes import REAL, fake
+from keyss import api
+from keyss.sweeps.running import How
+command = REAL if sys.argv[4] == "real" else fake(0.15)
+api.sweep(sys.argv[1], sys.argv[2], master_key_file=sys.argv[3], how=How(2, command=command))
+"""
+
+
+def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> Path:
+    """A sweep of files that need not be models."""
+    for name in (*covers, "secret.ply"):
+        if not (folder / name).exists():
+            (folder / name).write_text(name)
+    pairs = "\n".join(f"  - {{cover: {name}, secrets: [secret.ply]}}" for name in covers)
+    (folder / "sweep.yaml").write_text(
+        f"pairs:\n{pairs}\nmethods:\n  - {{method: carry, options: {{publish: any}}}}\n"
+        f"seeds: {list(range(seeds))}\n{more}"
+    )
+    (folder / "master.txt").write_text("q7Rv2LxT9bWm4KzDq7Rv2L\n")
+    return folder / "sweep.yaml"

@@ -1,0 +1,50 @@
+"""Ray as the engine: the same cells, the same bytes, and another attempt where a worker is lost."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from keyss import api
+from keyss.core import BackendError
+from keyss.sweeps.running import How
+from sweeps.fakes import fake, write_spec
+
+
+# Ray warns of its own sockets and of forks.
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_a_local_cluster_does_the_same_cells_with_the_same_bytes(tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="ray is not installed")
+    spec, master = (
+        write_spec(tmp_path, ["a.ply", "mortal.ply", "broken.ply"], seeds=2),
+        tmp_path / "master.txt",
+    )
+    here = api.sweep(spec, tmp_path / "here", master_key_file=master, how=How(1, command=fake()))
+    there = api.sweep(
+        spec, tmp_path / "there", master_key_file=master, how=How(1, ray="local", command=fake())
+    )
+    assert [each.result for each in there.ended] == [each.result for each in here.ended]
+    assert [each.failure for each in there.ended] == [each.failure for each in here.ended]
+    for name in here.tables:
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
+
+
+def test_without_ray_one_sentence_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    spec = write_spec(tmp_path, ["a.ply"], seeds=1)
+    with pytest.raises(BackendError, match=r"pip install 'keyss\[sweep\]'"):
+        api.sweep(spec, tmp_path / "out", how=How(1, ray="local", command=fake()))
+
+
+def test_without_yaml_one_sentence_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    spec = write_spec(tmp_path, ["a.ply"], seeds=1)
+    with pytest.raises(BackendError, match=r"pip install 'keyss\[sweep\]'"):
+        api.sweep(spec, tmp_path / "out", how=How(1, command=fake()))

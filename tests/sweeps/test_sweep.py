@@ -1,0 +1,291 @@
+"""A sweep: what it refuses, what it does once, and what is left after its processes were killed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import keyss
+from keyss import api
+from keyss.core import InputError, OutputError
+from keyss.sweeps.job import checksum
+from keyss.sweeps.running import How
+from keyss.sweeps.spec import read_spec, variants
+from keyss.sweeps.sweep import estimates
+from keyss.sweeps.tables import CellNumbers, half_interval, summaries, write_tables
+from sweeps.fakes import DRIVER, REAL, fake, write_spec
+from tiny_scenes import random_gaussians
+
+GOOD = """
+pairs:
+  - {cover: a.ply, secrets: [b.ply]}
+methods:
+  - {method: learned, preset: quick, grid: {sh_degree: [1, 3], fit.iterations: [10, 20]}}
+"""
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    for name in ("a.ply", "b.ply"):
+        (tmp_path / name).write_text(name)
+    return tmp_path
+
+
+def spec_of(folder: Path, text: str) -> Path:
+    path = folder / "spec.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_grid_is_every_choice_with_every_other(files: Path) -> None:
+    path = spec_of(files, GOOD)
+    found = list(variants(path, read_spec(path)))
+    chosen = [(each.options.sh_degree, each.options.fit.iterations) for each in found]  # type: ignore[attr-defined]
+    assert chosen == [(1, 10), (1, 20), (3, 10), (3, 20)]
+    assert all(each.options.fit.max_gaussians == 10_000 for each in found)  # of the preset
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("pairs:", "piars:", "did you mean pairs"),
+        ("cover: a.ply", "covr: a.ply", "did you mean cover"),
+        ("cover: a.ply", "cover: c.ply", "pairs[0].cover: there is no c.ply"),
+        ("cover: a.ply", "cover: 7", "Expected `str`, got `int`"),
+        ("sh_degree:", "sh_degre:", "did you mean sh_degree"),
+        ("fit.iterations:", "fit.iteration:", "did you mean iterations"),
+        ("[1, 3]", "[1, many]", "Expected `int | null`, got `str`"),
+        ("[10, 20]", "[10, 0]", "expected 1 to 10000000, got 0"),
+        ("[1, 3]", "[]", "grid.sh_degree: expected at least one value"),
+        ("method: learned", "method: leanred", "did you mean learned"),
+        ("preset: quick", "preset: quik", "did you mean quick"),
+        ("secrets: [b.ply]", "secrets: []", "expected 1 to"),
+        ("methods:", "seeds: [1, 1]\nmethods:", "the same one is there twice"),
+        ("methods:", "evaluate: [stelth]\nmethods:", "did you mean stealth"),
+        ("methods:", "width: &x 3\nseeds: [*x]\nmethods:", "aliases"),
+        ("methods:", "width: !!python/object/apply:os.system [ls]\nmethods:", "expected YAML"),
+        ("{cover", "{{{cover", "expected YAML"),
+    ],
+)
+def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
+    files: Path, old: str, new: str, words: str
+) -> None:
+    assert old in GOOD
+    path = spec_of(files, GOOD.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        api.sweep(path, files / "out")
+    assert words in str(caught.value)
+    assert not (files / "out").exists()
+
+
+def test_deeply_nested_yaml_is_refused(files: Path) -> None:
+    with pytest.raises(InputError):
+        read_spec(spec_of(files, "pairs: " + "[" * 100_000))
+
+
+def test_every_cell_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path) -> None:
+    spec, how = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=3), How(2, command=fake())
+    first = api.sweep(spec, tmp_path / "out", how=how)
+    assert first.tables[:2] == ("results.csv", "cells.csv")
+    assert [each.skipped for each in first.ended] == [False] * 6
+    again = api.sweep(spec, tmp_path / "out", how=How(2, command=("false",)))  # nothing is left to do
+    assert [each.skipped for each in again.ended] == [True] * 6
+    other = api.sweep(spec, tmp_path / "other", how=How(1, command=fake()))
+    assert not other.failed
+    for name in first.tables:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+    with (tmp_path / "out" / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    # Numbers of the fake are 30, 31 and 32: t(0.975, 2) / sqrt(3) = 4.30265 / 1.73205.
+    assert [(row["pair"], row["seeds"], row["mean"]) for row in rows] == [
+        ("a-secret", "3", "31.0"),
+        ("b-secret", "3", "31.0"),
+    ]
+    assert float(rows[0]["ci95_high"]) == pytest.approx(31 + 2.484138, abs=1e-5)
+
+
+def test_a_cell_runs_again_when_its_data_options_or_result_changed(tmp_path: Path) -> None:
+    spec, how = write_spec(tmp_path, ["a.ply"], seeds=2), How(1, command=fake())
+    out = tmp_path / "out"
+    cells = [each.folder for each in api.sweep(spec, out, how=how).ended]
+    (cells[0] / "run" / "publish" / "stego.ply").unlink()
+    assert [each.skipped for each in api.sweep(spec, out, how=how).ended] == [False, True]
+    spec.write_text(spec.read_text().replace("publish: any", "publish: any, prune_to_fit: true"))
+    assert [each.skipped for each in api.sweep(spec, out, how=how).ended] == [False, False]
+    (tmp_path / "a.ply").write_text("other content")
+    checksum.cache_clear()  # a process reads data once
+    assert [each.skipped for each in api.sweep(spec, out, how=how).ended] == [False, False]
+    assert len(list((out / "cells").iterdir())) == 6
+
+
+def test_what_dies_is_tried_again_and_what_is_refused_is_not(tmp_path: Path) -> None:
+    spec = write_spec(tmp_path, ["mortal.ply", "broken.ply", "a.ply"], seeds=1)
+    result = api.sweep(spec, tmp_path / "out", how=How(1, retries=2, command=fake()))
+    mortal, broken, good = result.ended
+    assert mortal.result is not None
+    assert good.result is not None
+    assert (mortal.folder / "log.txt").read_text().count("begins") == 3
+    assert (broken.folder / "log.txt").read_text().count("begins") == 1
+    assert broken.failure is not None
+    assert "nothing of it can be read" in broken.failure.message
+    few = api.sweep(spec, tmp_path / "few", how=How(1, retries=1, command=fake()))
+    assert [each.result is None for each in few.ended] == [True, True, False]
+
+
+def test_keys_follow_from_one_master_key_and_stay_private(tmp_path: Path) -> None:
+    spec, how = write_spec(tmp_path, ["a.ply"], seeds=1), How(1, command=fake())
+    out = tmp_path / "out"
+    (cell,) = api.sweep(spec, out, how=how).ended
+    key_file = out / "private" / "master-key.txt"
+    assert out.stat().st_mode & 0o077 == 0
+    assert key_file.stat().st_mode & 0o077 == 0
+    key = key_file.read_text().strip()
+    others = [path for path in out.rglob("*") if path.is_file() and path != key_file]
+    assert not any(key.encode() in path.read_bytes() for path in others)
+    with pytest.raises(OutputError, match="another master key"):
+        api.sweep(spec, out, how=how, master_key_file=tmp_path / "master.txt")
+    assert json.loads((cell.folder / "job.json").read_text())["key_names"] == [f"cell/{cell.folder.name}/1"]
+
+
+def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path) -> None:
+    spec = write_spec(tmp_path, ["a.ply"], seeds=1)
+    out = tmp_path / "out"
+    program = [sys.executable, "-c", DRIVER.replace("fake(0.15)", "fake(30)")]
+    with subprocess.Popen([*program, spec, out, tmp_path / "master.txt", "fake"]) as driver:
+        until(lambda: any(out.glob("cells/*/log.txt")))
+        with pytest.raises(OutputError, match=f"process {driver.pid} is at work"):
+            api.sweep(spec, out, how=How(1, command=fake()), master_key_file=tmp_path / "master.txt")
+        driver.kill()
+
+
+def until(there: object, seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not there():  # type: ignore[operator]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def children(pid: int) -> list[int]:
+    """Processes that this one has started."""
+    found = Path(f"/proc/{pid}/task/{pid}/children")
+    return list(map(int, found.read_text().split())) if found.exists() else []
+
+
+def results(out: Path) -> dict[str, tuple[int, int]]:
+    """Of each finished cell which file that is, and when it was written."""
+    found = {path.parent.name: path.stat() for path in out.glob("cells/*/result.json")}
+    return {name: (each.st_ino, each.st_mtime_ns) for name, each in found.items()}
+
+
+def kill_until_done(spec: Path, out: Path, kind: str, kills: int, seed: int, longest: float) -> None:
+    """Runs a sweep of which so many processes are killed; no result may change once it is there."""
+    rng = random.Random(seed)
+    command = [sys.executable, "-c", DRIVER, spec, out, spec.parent / "master.txt", kind]
+    seen: dict[str, tuple[int, int]] = {}
+    while True:
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as driver:
+            while kills and driver.poll() is None:
+                # The first moments are those of Python's imports: some kills come before anything runs.
+                if rng.random() < 0.8:
+                    until(lambda driver=driver: children(driver.pid) or driver.poll() is not None)
+                time.sleep(rng.uniform(0, longest))
+                workers = children(driver.pid)
+                victim = rng.choice([driver.pid, *workers])
+                try:
+                    os.kill(victim, signal.SIGKILL)
+                except ProcessLookupError:
+                    continue
+                kills -= 1
+                if victim == driver.pid:
+                    break
+            _, said = driver.communicate()
+        now = results(out)
+        assert seen.items() <= now.items()
+        seen = now
+        if driver.returncode == 0 and not kills:
+            return
+        assert driver.returncode in (0, -signal.SIGKILL), said
+        assert "Traceback" not in said
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks at /proc")
+@pytest.mark.parametrize("kills", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_killed_at_any_moments_it_ends_as_if_nothing_had_happened(tmp_path: Path, kills: int) -> None:
+    spec = write_spec(tmp_path, ["a.ply", "b.ply", "c.ply"], seeds=8)
+    calm = api.sweep(
+        spec, tmp_path / "calm", how=How(4, command=fake()), master_key_file=tmp_path / "master.txt"
+    )
+    kill_until_done(spec, tmp_path / "out", "fake", kills, seed=kills, longest=0.6)
+    for name in calm.tables:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+    assert len(results(tmp_path / "out")) == 24
+    assert list((tmp_path / "out").rglob("*.unfinished")) == []
+
+
+def real_spec(folder: Path, seeds: int) -> Path:
+    keyss.write_model(folder / "a.ply", random_gaussians(300, seed=0))
+    keyss.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
+    return write_spec(folder, ["a.ply"], seeds, "width: 32\n")
+
+
+def test_real_cells_that_were_killed_have_the_bytes_of_undisturbed_ones(tmp_path: Path) -> None:
+    spec, master = real_spec(tmp_path, 2), tmp_path / "master.txt"
+    calm = api.sweep(spec, tmp_path / "calm", how=How(1, command=REAL), master_key_file=master)
+    assert not calm.failed
+    kill_until_done(spec, tmp_path / "out", "real", 2, seed=1, longest=6)
+    for one, other in zip(
+        sorted((tmp_path / "calm").glob("cells/*/run/publish/stego.ply")),
+        sorted((tmp_path / "out").glob("cells/*/run/publish/stego.ply")),
+        strict=True,
+    ):
+        assert one.read_bytes() == other.read_bytes()
+    for name in calm.tables:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+
+
+def test_estimates_write_nothing_and_name_what_cannot_work(tmp_path: Path) -> None:
+    spec = real_spec(tmp_path, 2)
+    (tmp_path / "none.ply").write_text("no model")
+    found = list(estimates(spec, tmp_path / "out"))
+    assert [(each.done, each.refused) for each in found] == [(False, None)] * 2
+    assert all(each.seconds > 0 and each.memory > 10**8 for each in found)
+    (tmp_path / "a.ply").write_text("no model")
+    checksum.cache_clear()
+    assert all(each.refused for each in estimates(spec, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("count", [2, 3, 10])
+def test_intervals_are_scipy_s(count: int) -> None:
+    values = np.random.default_rng(count).normal(30, 2, count)
+    low, high = scipy.stats.t.interval(0.95, count - 1, values.mean(), scipy.stats.sem(values))
+    assert half_interval(list(values)) == pytest.approx((high - low) / 2, rel=1e-12)
+    assert math.isnan(half_interval([1.0]))
+
+
+def test_tables_read_back_the_same_from_csv_and_parquet(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    cells = [
+        CellNumbers("a,b", "carry", {"mask": ["op", "ro"]}, seed, f"{seed}", {"x": seed / 3, "y": 1e-300})
+        for seed in range(4)
+    ]
+    names = write_tables(tmp_path, cells)
+    assert "results.parquet" in names
+    one = pandas.read_csv(tmp_path / "results.csv")
+    two = pandas.read_parquet(tmp_path / "results.parquet")
+    assert one.to_dict() == two.to_dict()
+    assert list(one["mean"]) == [0.5, 1e-300]
+    assert [each.seeds for each in summaries(cells)] == [4, 4]
