@@ -12,7 +12,7 @@ import torch
 
 from keyss._verbs.asking import Secret, inputs_of, method_for
 from keyss.core.errors import QualityError, UsageError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene
 from keyss.files.models import is_model_path, read_model
 from keyss.fitting.loop import Reporter
@@ -160,7 +160,10 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
     if folder:
         name = stego_name(model)
         model = read_model(folder.write(writers({name: model})) / name)
-    return [model, *(open_in(model, key).reveal(model) for key in keys)]
+    # To open the same bits once more would show nothing new.
+    opened = stego.opened if stego.verified and same_bits(model, stego.gaussians) else None
+    opened = opened or tuple(open_in(model, key) for key in keys)
+    return [model, *(each.reveal(model) for each in opened)]
 
 
 def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:

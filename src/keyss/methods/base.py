@@ -131,6 +131,7 @@ class Stego:
     seconds: float  # of hiding alone, without plain models
     iterations: int = 0  # of the method's own training
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of its own, for metrics.json
+    verified: bool = False  # whether `opened` was read from `gaussians` with the keys
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ export function wordsOf(bytes: Uint8Array): Words {
 /** The order [N] that sorts words ascending; equal ones stay in theirs (radix sort, 16 bits at a time). */
 export function sortingOrder(words: Words): Uint32Array {
   const count = words.length >> 1;
-  let order = Uint32Array.from({ length: count }, (_, row) => row);
-  let sorted = new Uint32Array(count);
+  let [order, sorted] = [new Uint32Array(count), new Uint32Array(count)];
+  for (let row = 0; row < count; row++) order[row] = row;
   for (let digit = 0; digit < 4; digit++) {
     const [half, shift] = [digit >> 1, 16 * (digit & 1)];
     const ends = new Uint32Array((1 << 16) + 1);

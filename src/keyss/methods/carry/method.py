@@ -112,14 +112,14 @@ class CarryMethod:
                 views = [Viewpoints.of(each.source.scene) for each in secrets]
                 written = embed_whole(room, keys, models, views, prune=options.prune_to_fit)
             seconds = time.monotonic() - start
-            return Stego(written.stego, written.opened, seconds, details=written.details)
+            return Stego(written.stego, written.opened, seconds, details=written.details, verified=True)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
         with advising(InputError, _ANY if options.dither else _DITHER):
             prepared = _prepared(cover.model, options)
         counts = _counts(prepared, models, options)
         found = embed_models(prepared, keys, models, counts, NAME)
         seconds = time.monotonic() - start
-        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model))
+        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model), verified=True)
 
     def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""

@@ -42,14 +42,19 @@ export class Index {
   constructor(private readonly carriers: Carriers) {
     const { lattice } = KINDS[KINDS.length - 1];
     const bits = bitsOf(lattice, carriers);
-    const fine = Uint32Array.from(bits.keys()).filter((row) => bits[row] === lattice.depth); // all but impossible sizes
-    const hashes = rank(PUBLIC, 'places', chosen(carriers, fine).names);
-    const order = sortingOrder(hashes);
-    const firsts = Uint32Array.from(order.keys()).filter((at) => at === 0 || !same(hashes, order[at], order[at - 1]));
-    this.first = firsts.map((at) => fine[order[at]]);
-    this.alike = firsts.map((at, index) => (firsts[index + 1] ?? order.length) - at);
-    this.hashes = new Uint32Array(2 * firsts.length);
-    firsts.forEach((at, index) => this.hashes.set(hashes.subarray(2 * order[at], 2 * order[at] + 2), 2 * index));
+    const hashes = rank(PUBLIC, 'places', carriers.names);
+    const order = sortingOrder(hashes).filter((row) => bits[row] === lattice.depth); // all but impossible sizes
+    const [first, alike] = [new Uint32Array(order.length), new Uint32Array(order.length)];
+    let size = 0;
+    for (let at = 0; at < order.length; at++) {
+      if (at === 0 || !same(hashes, order[at], order[at - 1])) first[size++] = order[at];
+      alike[size - 1]++;
+    }
+    [this.first, this.alike, this.hashes] = [first.subarray(0, size), alike, new Uint32Array(2 * size)];
+    for (let at = 0; at < size; at++) {
+      this.hashes[2 * at] = hashes[2 * first[at]];
+      this.hashes[2 * at + 1] = hashes[2 * first[at] + 1];
+    }
   }
 
   get size(): number {
