@@ -42,7 +42,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> PUBLISHED:
 
 @pytest.mark.parametrize("suffix", SUFFIXES.values())
 def test_two_keys_open_two_secrets_and_a_wrong_one_nothing(
-    tab: Visit, published: PUBLISHED, suffix: str
+    tab: Visit, published: PUBLISHED, suffix: str, tmp_path: Path
 ) -> None:
     page, secrets = published[suffix]
     tab.goto(page.as_uri() + POSE)
@@ -57,24 +57,15 @@ def test_two_keys_open_two_secrets_and_a_wrong_one_nothing(
         tab.at(POSE)
         shown = tab.picture()
         assert psnr(shown, drawn(secret, POSE)) > CLOSE > psnr(shown, cover)
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES.values())
-def test_what_is_saved_is_what_keyss_reveals(
-    tab: Visit, published: PUBLISHED, suffix: str, tmp_path: Path
-) -> None:
-    page, secrets = published[suffix]
-    tab.goto(page.as_uri())
-    tab.try_key(KEYS[1])
-    with tab.page.expect_download() as download:
-        tab.page.click("#download")
-    download.value.save_as(tmp_path / "secret.ply")
-    assert read_model(tmp_path / "secret.ply").digest() == secrets[1].digest()
+        with tab.page.expect_download() as download:
+            tab.page.click("#download")
+        download.value.save_as(tmp_path / "secret.ply")
+        assert read_model(tmp_path / "secret.ply").digest() == secret.digest()
 
 
 @pytest.mark.alone
 def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, published: PUBLISHED) -> None:
     tab.goto(published[".spz"][0].as_uri())
     # Each as long as those before it or longer; other work on the machine makes single ones longer.
-    times = [tab.try_key(key) for key in ("wrong", KEYS[0], "wrong again", KEYS[1], "and again", KEYS[0])]
+    times = [tab.try_key(key) for key in ("wrong", KEYS[0], "wrong again", KEYS[1])]
     assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
