@@ -2,6 +2,7 @@
 
 python benchmarks/robust.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
                                 [--only FORMAT]
+python benchmarks/robust.py MODEL.ply ... --payloads N --log FILE [--gaussians N] [--foreign-each M]
 python benchmarks/robust.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
 python benchmarks/robust.py MODEL.ply --speed [--gaussians N]
 
@@ -9,6 +10,10 @@ For each model and strength: net bits per Gaussian and the cost of a full model,
 each with a new key and new entropy, do not come back from each format, alone and with a quarter of the
 Gaussians removed at random on top. With --changes also other changes, at full capacity and at a fifth of it.
 Keys skip Argon2id, which has nothing to do with what is measured.
+
+With --log, N payloads in all, spread over the models, each through the formats that this library writes,
+and each M-th through other people's programs as well: one line of JSON for each payload, appended; what is in
+the file already is not done again.
 
 With --pairs nothing is measured: each model, and each with a payload of so much of its capacity, is written
 as it comes back from each format, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` names them for
@@ -30,6 +35,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +51,7 @@ from keyss.keys import DerivedKey
 from keyss.measure.robustness import changes
 from keyss.measure.robustness.conversions import converters
 from keyss.rendering.difference import cost
+from robust_payloads import run_payloads
 
 Change = Callable[[Gaussians], Gaussians]
 FIFTH = 0.2
@@ -55,6 +62,8 @@ def main() -> None:
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--gaussians", type=int)
     parser.add_argument("--payloads", type=int, default=5)
+    parser.add_argument("--log", type=Path, metavar="FILE")
+    parser.add_argument("--foreign-each", type=int, default=10)
     parser.add_argument("--strengths", type=float, nargs="+", default=[45.0])
     parser.add_argument("--seed", type=int, default=0, help="of keys, payloads and what is removed")
     parser.add_argument("--changes", action="store_true")
@@ -70,6 +79,18 @@ def main() -> None:
     if asked.speed:
         _measure_speed(asked.models, asked.gaussians)
         return
+    if asked.log:
+        run_payloads(
+            [(path.stem, partial(_of_file, path, asked.gaussians)) for path in asked.models],
+            asked.payloads,
+            asked.log,
+            strength=asked.strengths[0],
+            foreign={what: change for what, change in _BY_TOOL.items() if asked.only in what},
+            each=asked.foreign_each,
+            embed=_embedded,
+            opens=_opens,
+        )
+        return
     print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for path in asked.models:
@@ -81,6 +102,16 @@ def main() -> None:
             if asked.changes:
                 _measure(prepared, strength, name, OTHERS, asked.payloads, asked.seed)
                 _measure(prepared, strength, name, OTHERS, asked.payloads, asked.seed, FIFTH)
+
+
+def _of_file(path: Path, gaussians: int | None) -> Gaussians:
+    """As many as asked for, or all where there are fewer."""
+    model = read_model(path)
+    return _drawn(model, gaussians) if gaussians is not None and gaussians < len(model) else model
+
+
+def _embedded(prepared: RobustCover, strength: float, number: int, data: bytes) -> Gaussians:
+    return prepared.embed([(_key(number), data)], strength=strength, entropy=number.to_bytes(32, "big"))
 
 
 def _measure(
@@ -98,7 +129,7 @@ def _measure(
     missing: set[str] = set()
     for seed in range(first, first + payloads):
         data = np.random.default_rng(seed).bytes(size)
-        stego = prepared.embed([(_key(seed), data)], strength=strength, entropy=seed.to_bytes(32, "big"))
+        stego = _embedded(prepared, strength, seed, data)
         costs.append(cost(prepared.model, stego))
         for what, change in wanted.items():
             try:
@@ -131,10 +162,8 @@ def _write_pairs(
         made = {"plain": prepared.model}
         for share in shares:
             size = int(share * prepared.capacity(strength))
-            data, entropy = np.random.default_rng(number).bytes(size), number.to_bytes(32, "big")
-            stego = made[f"{share:g}"] = prepared.embed(
-                [(_key(number), data)], strength=strength, entropy=entropy
-            )
+            data = np.random.default_rng(number).bytes(size)
+            stego = made[f"{share:g}"] = _embedded(prepared, strength, number, data)
             print(f"{path.stem} {share:g}: {size:,} bytes, {cost(prepared.model, stego):.1f} dB", flush=True)
         for what, change in wanted.items():
             own = folder / f"{strength:g}-{re.sub('[^a-z]+', '-', what).strip('-')}"

@@ -90,6 +90,11 @@ def test_the_first_compilation_is_announced(
     message = capsys.readouterr().err
     assert "compiling the CPU rasterizer" in message
     assert message.count("\n") == 1
-    (tmp_path / "kernel.nbi").write_text("")
+    (tmp_path / "low_bits_1f").mkdir()
+    (tmp_path / "low_bits_1f" / "kernel.nbi").write_text("")  # of something else than the rasterizer
+    jit.announce_compilation.__wrapped__()
+    assert "compiling the CPU rasterizer" in capsys.readouterr().err
+    (tmp_path / "cpu_1f").mkdir()
+    (tmp_path / "cpu_1f" / "kernel.nbi").write_text("")
     jit.announce_compilation.__wrapped__()
     assert capsys.readouterr().err == ""

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from keyss._verbs.converting import Conversion
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
+    from keyss.runs.comparison import Comparison
     from keyss.runs.metrics import FitMetrics, HideMetrics
     from keyss.runs.planning import Plan
 
@@ -127,6 +128,30 @@ def print_steganalysis(found: Steganalysis) -> None:
     flagged = sum(row.flagged for row in found.rows)
     table.add_row(f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
     Console().print(table)
+
+
+def print_comparison(found: Comparison) -> None:
+    """The table of `comparison.md` in three parts."""
+    from keyss.runs.comparison import table
+
+    heads, *rows = table(found)
+    for columns in (slice(1, 7), slice(8, 13), [7, *range(13, 16)]):  # as wide as terminals are
+        part = _table(heads[0], *_chosen(heads, columns), texts=1)
+        for row, each in zip(rows, found.methods, strict=True):
+            if each.error is None:
+                part.add_row(row[0], *_chosen(row, columns))
+        Console().print(part)
+    for each in found.methods:
+        if each.error is not None:
+            print(f"{each.name}: not possible: {each.error}")
+    print(
+        "Test views: photos that were not trained on. All methods had the same plain models, as many steps "
+        "in each training, and at most as many Gaussians."
+    )
+
+
+def _chosen(row: Sequence[str], columns: slice | Sequence[int]) -> list[str]:
+    return list(row[columns]) if isinstance(columns, slice) else [row[index] for index in columns]
 
 
 def print_verdicts(run: Path) -> None:

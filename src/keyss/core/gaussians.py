@@ -69,6 +69,10 @@ class Gaussians:
     def device(self) -> torch.device:
         return self.means.device
 
+    def like(self, changed: Gaussians) -> Gaussians:
+        """`changed`, made of these one by one, with what else belongs to them: nothing but in subclasses."""
+        return changed
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """The Gaussians with `function` applied to each of the five tensors."""
         return Gaussians(*(function(getattr(self, f.name)) for f in fields(self)))

@@ -126,11 +126,8 @@ def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
     assert len(set(one.salts) & set(other.salts)) <= 2
     kept = np.random.default_rng(3).random(len(first.rows)) < 0.75
     rounded = Numbers(
-        first.rows[kept],
-        (first.log_scales[kept] * 16).round() / 16,
-        (first.opacities[kept] * 255).round() / 255,
-        ((first.colours[kept] * 38.25 + 127.5).round() - 127.5) / 38.25,
-    )
+        first.rows[kept], first.log_scales[kept], first.opacities[kept], first.colours[kept]
+    ).rounded()
     assert len(set(Salts.of(rounded).salts[:SALTS]) & set(one.salts[:SALTS])) >= 3
 
 

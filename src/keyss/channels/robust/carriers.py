@@ -52,6 +52,15 @@ class Numbers:
         rows = np.flatnonzero(fine & (opacities > _LEAST_OPACITY))
         return Numbers(rows, log_scales[rows], opacities[rows], colours[rows])
 
+    def rounded(self) -> Numbers:
+        """As `.spz` leaves them."""
+        return Numbers(
+            self.rows,
+            np.round(self.log_scales / SCALE_STEP) * SCALE_STEP,
+            np.round(self.opacities / OPACITY_STEP) * OPACITY_STEP,
+            (np.round(self.colours / COLOUR_STEP + 127.5) - 127.5) * COLOUR_STEP,
+        )
+
     @property
     def size(self) -> float:
         """The median log scale: it tells by how much a model was scaled."""

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from keyss.channels.robust.carriers import Doubles, Numbers
@@ -30,10 +31,11 @@ from keyss.channels.robust.header import (
     check_secret,
     written_header,
 )
-from keyss.channels.robust.lattice import SPACINGS, Lattice
+from keyss.channels.robust.lattice import SPACINGS
+from keyss.channels.robust.likeness import Likeness
 from keyss.channels.robust.payload import OVERHEAD, encrypt_payload
 from keyss.channels.robust.room import Layout, Room, bucket_of
-from keyss.channels.robust.salts import SALTS, Salts, renewed
+from keyss.channels.robust.salts import SALTS, Salts, moved, renewed, steady
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
@@ -44,6 +46,7 @@ Key = str | Callable[[bytes], DerivedKey]  # text, or what it becomes with a sal
 
 _LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
 _STATIC_SALT = hashlib.sha256(b"keyss/v1/robust-static").digest()[:SALT_BYTES]
+_TOO_FEW = "this model has too few Gaussians to hide anything that survives other formats"
 _NOTICED = (
     "the secrets are too large, or too many, to lie in this model as each would alone: who holds one of the "
     "keys can notice that there are other secrets"
@@ -98,8 +101,12 @@ class RobustCover:
         return self.room.capacity(strength)
 
     def quiet_capacity(self, strength: float = STRENGTH) -> int:
-        """Bytes that go into one bit of each number; a part of it is hard to tell (see docs/robust.md)."""
+        """Bytes that go into one bit of each number."""
         return self.room.quiet_capacity(strength)
+
+    def likely_capacity(self, strength: float = STRENGTH) -> int:
+        """Bytes that leave all numbers as likely as they were, and are hard to tell (see docs/robust.md)."""
+        return self.room.likely_capacity(strength)
 
     def embed(
         self,
@@ -116,30 +123,41 @@ class RobustCover:
             raise UsageError("expected at least one secret, got none")
         secret = mixed.digest()
         random = np.random.default_rng(np.frombuffer(stream(secret, "robust/random", 32), np.uint32))
-        numbers = renewed(self.room.numbers, random)
-        salts = Salts.of(numbers)
-        if len(salts.salts) < SALTS:
-            raise InputError("this model has too few Gaussians to hide anything that survives other formats")
+        if len(Salts.of(self.room.numbers).salts) < SALTS:
+            raise InputError(_TOO_FEW)
         sizes = [len(payload) + OVERHEAD for _, payload in contents]
         layouts = self._layouts(sizes, strength)
+        jumps = self._jumps(random) if layouts[0].likely else None
+        numbers = renewed(self.room.numbers, random, jumps)
+        salts = Salts.of(numbers)
+        if len(salts.salts) < SALTS:  # two are equal now, which hardly ever happens
+            raise InputError(_TOO_FEW)
         writings = [_Writing.of(key, payload, salts) for key, payload in contents]
         if len({each.check for each in writings}) != len(writings):
             raise UsageError("two secrets have the same key: expected each with its own")
-        if layouts[0][0].depth == 1:  # else there is no room for another secret that would not be noticed
+        if (
+            layouts[0].lattice.depth == 1
+        ):  # else there is no room for another secret that would not be noticed
             writings += [_Writing.of_nobody(secret, index) for index in range(len(contents), UNNOTICED)]
         for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
             headers = self._headers(layouts, sizes, secret, lower)[: len(writings)]
-            stego = self._written(numbers, salts, writings, headers)
+            likely = [layouts[min(index, len(layouts) - 1)].likely for index in range(len(writings))]
+            stego = self._written(numbers, salts, writings, headers, likely, random)
             if cost(self.model, stego) >= strength:
                 break
         return stego
 
-    def _layouts(self, sizes: Sequence[int], strength: float) -> list[tuple[Lattice, int]]:
-        """Of each payload the lattice, and how many of SHARES it has."""
+    def _jumps(self, random: np.random.Generator) -> Likeness:
+        """What is usual in colours, for moves of salts."""
+        colours = self.room.numbers.colours
+        return self.room.likeness.learned(colours, moved(colours, random))
+
+    def _layouts(self, sizes: Sequence[int], strength: float) -> list[Layout]:
+        """Of each payload."""
         each = [self.room.layout([size], strength) for size in sizes]
-        found = [(own.lattice, own.shares[0]) for own in each if own is not None]
+        found = [own for own in each if own is not None]
         noticed = len(sizes) > UNNOTICED
-        if len(found) < len(sizes) or sum(share for _, share in found) > SHARES:
+        if len(found) < len(sizes) or sum(own.shares[0] for own in found) > SHARES:
             together: Layout | None = self.room.layout(sizes, strength)
             if together is None:
                 room = self.room.capacity(strength)
@@ -147,27 +165,28 @@ class RobustCover:
                     f"expected payloads of {room:,} bytes in all, as this model holds at this `strength`, "
                     f"got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
                 )
-            found = [(together.lattice, share) for share in together.shares]
+            found = [replace(together, shares=(share,)) for share in together.shares]
             noticed = len(sizes) > 1
         if noticed:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
         return found
 
     def _headers(
-        self, layouts: Sequence[tuple[Lattice, int]], sizes: Sequence[int], secret: bytes, lower: int
+        self, layouts: Sequence[Layout], sizes: Sequence[int], secret: bytes, lower: int
     ) -> list[Header]:
         """Of each payload, and of those that nobody has: these differ in nothing but what is in them."""
         partition = expand(secret, "robust/partition", 2)
         headers, first = [], 0
         for index in range(max(len(layouts), UNNOTICED)):
-            lattice, share = layouts[min(index, len(layouts) - 1)]
+            layout = layouts[min(index, len(layouts) - 1)]
+            (share,) = layout.shares
             own = index < len(layouts)
             header = Header(
                 file_key=expand(secret, f"robust/file-key/{index}", FILE_KEY_BYTES),
                 partition=partition,
-                level=max(0, lattice.level - lower),
+                level=max(0, layout.lattice.level - lower),
                 spacing=self.room.spacing,
-                depth=lattice.depth,
+                depth=layout.lattice.depth,
                 first=first if own else 0,
                 last=first + share - 1 if own else 0,
                 bucket=bucket_of(sizes[index]) if own else 0,
@@ -178,50 +197,74 @@ class RobustCover:
         return headers
 
     def _written(
-        self, numbers: Numbers, salts: Salts, writings: Sequence[_Writing], headers: list[Header]
+        self,
+        numbers: Numbers,
+        salts: Salts,
+        writings: Sequence[_Writing],
+        headers: list[Header],
+        likely: Sequence[bool],
+        random: np.random.Generator,
     ) -> Gaussians:
-        """The model with new salts, headers for all `writings`, and payloads of those that have one."""
+        """The model with new salts, headers for all `writings`, and payloads of those that have one.
+
+        Of those that are `likely` only as much as leaves the model as likely as it was; all of a header
+        where salts are so few after rounding that it would be lost with gaps.
+        """
         carriers = replace(self.room.carriers, values=numbers.colours[:, 1:])
         values = carriers.values.copy()
         free = np.zeros(len(carriers), bool)
         free[self.room.own_rows] = True
         free[salts.rows] = False
         free &= ~self.room.alone
+        gaps = steady(numbers)
         index, own = Index(carriers), [header.own(carriers) for header in headers]
-        holds = free.copy()
+        holds, chosen = free.copy(), np.zeros(len(carriers), bool)  # written where that is likely
         for header, writing in zip(headers, writings, strict=True):
             for secret in writing.secrets:
                 holds[index.rows(index.places(secret, header.kind.places))] = False
-        idle = [1 - float(holds[each].mean()) if each.any() else 0.0 for each in own]
+        admission = [self.room.admission if each else 1.0 for each in likely]
+        idle = [
+            1 - share * float(holds[each].mean()) if each.any() else 0.0
+            for each, share in zip(own, admission, strict=True)
+        ]
         headers = [
             replace(header, idle=min(31, round(share / IDLE)))
             for header, share in zip(headers, idle, strict=True)
         ]
         for salt in range(SALTS):  # a salt of every secret at a time: later ones find places taken
-            for header, writing in zip(headers, writings, strict=True):
+            for header, writing, some in zip(headers, writings, likely, strict=True):
                 secret = writing.secrets[salt]
                 rows, new = written_header(header, writing.check, secret, index, carriers, free)
-                values[rows] = new
-                free[rows] = False
-        for header, writing, mine in zip(headers, writings, own, strict=True):
+                values[rows], chosen[rows], free[rows] = new, some and gaps, False
+        for header, writing, mine, some in zip(headers, writings, own, likely, strict=True):
             if writing.payload is not None:
                 rows, key = np.flatnonzero(free & mine), data_key(writing.static, header)
                 encrypted = encrypt_payload(key, writing.payload, bucket_bytes(header.bucket))
                 code, lattice = Fountain.of(8 * len(encrypted)), header.lattice
                 seeds = lattice.seeds(key, carriers[rows])
                 bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), seeds)
-                values[rows] = lattice.write(key, carriers[rows], bits)
-        return self._with_colours(values)
+                values[rows], chosen[rows] = lattice.write(key, carriers[rows], bits), some
+        return self._with_colours(values, chosen, random)
 
-    def _with_colours(self, values: Doubles) -> Gaussians:
-        """The model with another green and blue [C, 2] of its carriers; those that are equal stay."""
-        sh = self.model.sh.detach().clone()
-        for column in range(values.shape[1]):
-            changed = values[:, column] != self.room.numbers.colours[:, 1 + column]
+    def _with_colours(
+        self, values: Doubles, chosen: npt.NDArray[np.bool_], random: np.random.Generator
+    ) -> Gaussians:
+        """The model with another green and blue [C, 2] of its carriers; those that are equal stay.
+
+        `chosen` [C]: of which only those change that are as likely as before.
+        """
+        before = self.room.numbers.colours
+        new, most = before.copy(), SPACINGS[self.room.spacing] / 2
+        for column in range(1, 3):
+            changed = np.flatnonzero(values[:, column - 1] != before[:, column])
             rows = self.room.numbers.rows[changed]
-            most = SPACINGS[self.room.spacing] / 2
-            fitted = self.room.quiet.fitted(rows, 1 + column, values[changed, column], most)
-            sh[torch.from_numpy(rows).to(sh.device), 0, 1 + column] = torch.from_numpy(fitted).to(sh)
+            new[changed, column] = self.room.quiet.fitted(rows, column, values[changed, column - 1], most)
+        if chosen.any():
+            base = np.where(chosen[:, None], before, new)
+            new[:, 1:] = np.where(self.room.likeness.admitted(base, new, random), new[:, 1:], base[:, 1:])
+        sh = self.model.sh.detach().clone()
+        own = torch.from_numpy(self.room.numbers.rows).to(sh.device)
+        sh[own, 0, 1:] = torch.from_numpy(new[:, 1:]).to(sh)
         return replace(self.model.detach(), sh=sh)
 
 

@@ -22,7 +22,7 @@ def encrypt_payload(data_key: bytes, payload: bytes, size: int) -> bytes:
 
 
 def decrypt_payload(data_key: bytes, encrypted: bytes) -> bytes | None:
-    """The payload; None when anything at all is not as it was (but for a chance of 2^-100)."""
+    """The payload; None when anything at all is not as it was (but for a chance of 2^-86 at most)."""
     try:
         plain = _cipher(data_key).decrypt(_NONCE, encrypted, None)
     except InvalidTag:

@@ -3,6 +3,8 @@
 What gives a payload away is the variance that writing adds, and that is least for each byte with one bit in
 each number (`depth` 1). So a payload gets a share of the carriers at that depth, as large as it needs; one
 that needs more gets all carriers, and the least depth and level that hold it.
+
+A payload that is small enough is written only where that leaves the model as likely as it was (`likeness`).
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy.typing as npt
 from keyss.channels.robust.carriers import CELL, Carriers, Doubles, Numbers
 from keyss.channels.robust.header import SHARES, UNNOTICED, Kind, bucket_bytes
 from keyss.channels.robust.lattice import COLUMNS, LEVELS, MOST_BITS, SPACINGS, Lattice
+from keyss.channels.robust.likeness import Likeness
 from keyss.channels.robust.payload import OVERHEAD
 from keyss.channels.robust.quiet import Quiet
 from keyss.core.errors import UsageError
@@ -37,6 +40,7 @@ class Layout:
 
     lattice: Lattice
     shares: tuple[int, ...]
+    likely: bool = False  # numbers keep their values where others would be less likely
 
 
 @dataclass(frozen=True)
@@ -60,13 +64,20 @@ class Room:
             return 0
         return max(0, self._bytes(self._within(1, strength)) - OVERHEAD)
 
+    def likely_capacity(self, strength: float) -> int:
+        """The same where that leaves a number as likely as it was."""
+        if not len(self.own):
+            return 0
+        return max(0, self._bytes(self._within(1, strength), likely=True) - OVERHEAD)
+
     def layout(self, sizes: Sequence[int], strength: float) -> Layout | None:
         """For payloads of these sizes in bytes with all that belongs to them; None where they do not fit."""
         quiet = self._within(1, strength)
-        for comfort in (_COMFORTABLE, 1.0):
-            shares = self._shares(sizes, quiet, comfort)
-            if sum(shares) <= SHARES:
-                return Layout(quiet, shares)
+        for likely in (True, False):
+            for comfort in (_COMFORTABLE, 1.0):
+                shares = self._shares(sizes, quiet, comfort, likely)
+                if sum(shares) <= SHARES:
+                    return Layout(quiet, shares, likely)
         for comfort in (_ROBUST, 1.0):
             for depth in range(2, MOST_BITS + 1):
                 lattice, shares = self._least(sizes, depth, comfort)
@@ -99,8 +110,10 @@ class Room:
             self.measured[lattice] = cost(self.model, replace(self.model.detach(), sh=sh))
         return self.measured[lattice]
 
-    def _shares(self, sizes: Sequence[int], lattice: Lattice, comfort: float) -> tuple[int, ...]:
-        room = comfort * self._room(lattice)
+    def _shares(
+        self, sizes: Sequence[int], lattice: Lattice, comfort: float, likely: bool = False
+    ) -> tuple[int, ...]:
+        room = comfort * self._room(lattice, likely)
         buckets = [bucket_bytes(bucket_of(size)) for size in sizes]
         return tuple(max(1, math.ceil(SHARES * min(1e6, size / max(room, 1e-3)))) for size in buckets)
 
@@ -122,14 +135,15 @@ class Room:
             least, beyond = (middle, beyond) if fits else (least, middle)
         return every[least]
 
-    def _bytes(self, lattice: Lattice) -> int:
+    def _bytes(self, lattice: Lattice, likely: bool = False) -> int:
         """Of the largest bucket that fits."""
-        room = self._room(lattice)
+        room = self._room(lattice, likely)
         return max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
 
-    def _room(self, lattice: Lattice) -> float:
+    def _room(self, lattice: Lattice, likely: bool = False) -> float:
         """Bytes that all carriers hold."""
-        bits = COLUMNS * float((lattice.bits(self.own) * self._information).sum())
+        information = self._information(self.admission if likely else 1.0)
+        bits = COLUMNS * float((lattice.bits(self.own) * information).sum())
         return _RATE * (1 - self._headers(lattice.depth)) * bits / 8
 
     @cached_property
@@ -159,10 +173,40 @@ class Room:
         return 1 - (1 - Kind.of(depth).share(len(self.own))) ** (UNNOTICED if depth == 1 else 1)
 
     @cached_property
-    def _information(self) -> Doubles:
+    def likeness(self) -> Likeness:
+        """Of the C carriers, for changes as one bit in a number makes them."""
+        return Likeness.of(self.numbers.colours, self._positions, self._example)
+
+    @cached_property
+    def admission(self) -> float:
+        """Share of the numbers of one bit that get another value where only likely ones do."""
+        changed = self.numbers.colours.copy()
+        rows = self.own_rows[~self.alone[self.own_rows]]
+        changed[rows] = self._example[rows]
+        admitted = self.likeness.admitted(self.numbers.colours, changed, np.random.default_rng(2))
+        return float(admitted[rows].mean()) if len(rows) else 0.0
+
+    @cached_property
+    def _positions(self) -> Doubles:
+        """[C, 3], whatever is in the model."""
+        means = self.model.means.detach().cpu().double().numpy()[self.numbers.rows]
+        result: Doubles = np.nan_to_num(means).clip(-1e15, 1e15)
+        return result
+
+    @cached_property
+    def _example(self) -> Doubles:
+        """[C, 3] colours with noise in green and blue as one bit in each makes it."""
+        colours, most = self.numbers.colours.copy(), SPACINGS[self.spacing]
+        noise = np.random.default_rng(1).uniform(-most, most, (len(colours), COLUMNS))
+        for column in range(1, 1 + COLUMNS):
+            new = colours[:, column] + noise[:, column - 1]
+            colours[:, column] = self.quiet.fitted(self.numbers.rows, column, new, most / 2)
+        return colours
+
+    def _information(self, admission: float) -> Doubles:
         """[D] bits that a reader is expected to have of each bit that one of them carries."""
         namesakes = self.carriers.namesakes()[self.own_rows]
-        garbage = 1 - (1 - _GARBAGE) * (1 - self.own.doubt) / namesakes
+        garbage = 1 - admission * (1 - _GARBAGE) * (1 - self.own.doubt) / namesakes
         result: Doubles = ~self.alone[self.own_rows] * (1 - _entropy(garbage / 2))
         return result
 

@@ -13,7 +13,16 @@ from keyss.channels.low_bits.layout import plan_records, record_capacity
 from keyss.channels.rooms import room_in
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
+from keyss.methods.base import (
+    Capabilities,
+    Context,
+    KeyedSource,
+    Outlook,
+    SceneInput,
+    Source,
+    Stego,
+    advising,
+)
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import dither, sampled
 from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
@@ -46,6 +55,7 @@ class CarryMethod:
     summary = "carry models in the low bits of the cover's"
     trains = False
     most_secrets = 256
+    capabilities = Capabilities()
     options = CarryOptions
     presets: Mapping[str, CarryOptions] = PRESETS
 

@@ -118,5 +118,6 @@ def _cache_parents() -> list[Path]:
 def announce_compilation() -> None:
     """Say on stderr that the first render takes a while, if nothing is compiled yet. Says it once."""
     folder = cache_folder()
-    if folder is None or next(folder.rglob("*.nbi"), None) is None:
+    own = f"{Path(__file__).parent.name}_*"  # as numba calls the folder of kernels that lie beside this file
+    if folder is None or next(folder.glob(f"{own}/*.nbi"), None) is None:
         print("keyss: compiling the CPU rasterizer, 10 to 20 s, once", file=sys.stderr, flush=True)
