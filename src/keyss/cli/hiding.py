@@ -118,7 +118,7 @@ def hide(
     from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.rendering.orbit import is_model
-    from keyss.runs.files import STEGOS
+    from keyss.runs.files import HANDED, STEGOS
 
     if secret_file:
         unused: dict[str, object] = {
@@ -164,8 +164,11 @@ def hide(
                 f"leave {'it' if len(idle) == 1 else 'them'} out"
             )
     models = secret_model or (None,) * len(secret)
-    opening = keys(key_file, len(secret), confirm=True)
-    warn_of_doubtful_keys(opening)
+    if chosen.capabilities.keys or key_file:
+        opening = keys(key_file, len(secret), confirm=True)
+        warn_of_doubtful_keys(opening)
+    else:
+        opening = [""] * len(secret)
     secrets = [
         api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)
     ]
@@ -201,16 +204,22 @@ def hide(
         )
     print_hiding(result.metrics)
     how = _HOW[publish == "any"]
+    what = "the cover, with the secret in it" if chosen.trains or chosen.capabilities.keys else "the cover"
     print_files(
         out,
         {
-            **dict.fromkeys(STEGOS, f"publish this, {how}: the cover, with the secret in it"),
+            **dict.fromkeys(STEGOS, f"publish this, {how}: {what}"),
+            HANDED: "hand this over to who may see the secret: `keyss reveal --handed`",
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
     )
+    if not chosen.capabilities.keys:
+        print(f"The method {method} has no keys: whoever has both files sees the secret.")
+        return
+    files = "both files" if chosen.capabilities.hands_over else "file"
     print(
         "The key: send it over another channel than the file, and keep a copy: without it nothing is opened. "
-        "Whoever has file and key runs `keyss reveal`."
+        f"Whoever has {files} and key runs `keyss reveal`."
     )
 
 

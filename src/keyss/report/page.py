@@ -27,6 +27,8 @@ from keyss.viewer.page import embedding_rules
 
 _STYLES = ("page.css", "pictures.css", "print.css")
 _HOW = "`keyss audit RUN --key-file KEY` measures it"
+_NO_MODEL = "what this method publishes is no 3DGS model"
+_OF_3DGS_MODELS = ("Leaks without the key", "The file by itself", "Statistics of the model", "Robustness")
 _EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and audits after it have it"
 
 
@@ -182,8 +184,9 @@ def _not_measured(audit: Audit) -> list[str]:
         "Speed, files and readers": audit.speed,
     }
     notes = [
-        f"{name}: {_EVALUATE if name == 'Wrong keys' else _HOW}."
+        f"{name}: {_NO_MODEL if name in _OF_3DGS_MODELS and not audit.run.standard else how}."
         for name, found in parts.items()
+        for how in (_EVALUATE if name == "Wrong keys" else _HOW,)
         if not found
     ]
     if audit.stegexpose and audit.stegexpose.sealwatch_missing:
