@@ -39,7 +39,7 @@ from keyss.methods import registry
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.method import training_salt
 from keyss.methods.learned.options import PRESETS, LearnedOptions
-from keyss.methods.learned.targets import PlacedScene
+from keyss.methods.poses import PlacedScene
 from keyss.progress import reporter
 
 START, END = "<!-- measured by `make benchmark-fidelity` -->", "<!-- end of what was measured -->"

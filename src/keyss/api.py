@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from keyss._verbs.asking import Secret
+    from keyss._verbs.comparing import compare
     from keyss._verbs.converting import Conversion, convert
     from keyss._verbs.filing import HideFilesResult, SecretFile, hide_files, reveal_file
     from keyss._verbs.filming import render_video
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Conversion", "HideResult", "Secret", "audit", "convert", "evaluate", "fit", "hide", "plan"]
 __all__ += ["render", "render_video", "reveal", "reveal_counted", "verify", "write_report"]
+__all__ += ["compare"]
 __all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
 __all__ += ["BatchResult", "SweepResult", "hide_batch", "sweep"]
 
@@ -36,6 +38,7 @@ _HOMES = {
     "Secret": "_verbs.asking",
     "SecretFile": "_verbs.filing",
     "audit": "audit.run",
+    "compare": "_verbs.comparing",
     "convert": "_verbs.converting",
     "evaluate": "_verbs.looking",
     "fit": "_verbs.fitting",

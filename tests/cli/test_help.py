@@ -41,7 +41,7 @@ class TestHelp:
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
         making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert", "view", "export-html"]
-        judging = ["evaluate", "audit", "report", "steganalyze", "info", "demo", "doctor"]
+        judging = ["evaluate", "audit", "report", "compare", "steganalyze", "info", "demo", "doctor"]
         assert [*making, *judging, "completion", "version"] == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)
@@ -54,9 +54,9 @@ class TestHelp:
     @pytest.mark.parametrize("command", COMMANDS)
     def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
         out = keyss(command, "--help").out
-        assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "demo"})
+        assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "compare", "demo"})
         computing = {"fit", "hide", "reveal", "verify", "render", "convert", "evaluate", "audit", "demo"}
-        computing.add("doctor")
+        computing |= {"doctor", "compare"}
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 

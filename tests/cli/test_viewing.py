@@ -2,20 +2,57 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from cli.said import Said, assert_refused
+from keyss.core.gaussians import Gaussians
+from keyss.files.models import read_model, write_model
 from keyss.files.ply import write_ply
 from tiny_scenes import random_gaussians
 
 
-def test_what_the_page_cannot_show_is_refused(keyss: Callable[..., Said], tmp_path: Path) -> None:
-    (tmp_path / "model.glb").write_bytes(b"glTF")
+def test_what_is_no_model_is_refused(keyss: Callable[..., Said], tmp_path: Path) -> None:
+    (tmp_path / "model.txt").write_text("not a model")
+    (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n")
     for command in (["view"], ["export-html", "-o", str(tmp_path / "page.html")]):
-        assert_refused(keyss(*command, str(tmp_path / "model.glb")), 2, "keyss convert")
-        assert_refused(keyss(*command, str(tmp_path / "nowhere.ply")), 4, "found nothing")
-    assert_refused(keyss("view", str(tmp_path / "model.glb"), "--port", "70000"), 2, "--port")
+        assert_refused(keyss(*command, str(tmp_path / "model.txt")), 4, "expected a 3DGS model")
+        assert_refused(keyss(*command, str(tmp_path / "text.ply")), 4, "not a 3DGS model")
+        assert_refused(keyss(*command, str(tmp_path / "nowhere.ply")), 4, "no such file")
+        assert_refused(keyss(*command, str(tmp_path)), 4, "found a folder")
+    assert_refused(keyss("view", str(tmp_path / "model.txt"), "--port", "70000"), 2, "--port")
+
+
+def test_what_the_page_does_not_read_is_converted_and_said(
+    keyss: Callable[..., Said], tmp_path: Path
+) -> None:
+    text = write_in_text(tmp_path / "text.ply", random_gaussians(5))
+    folder = write_sog_folder(tmp_path / "scene", random_gaussians(5))
+    for model, name in ((text, "text.ply"), (folder, "scene.sog")):
+        out = tmp_path / f"{name}-page"
+        said = keyss("export-html", model, "-o", out)
+        assert said.status == 0, said.err
+        assert f"the page does not read {'a .ply in text' if model == text else 'a SOG'}" in said.err
+        assert read_model(out / name).digest() == read_model(model).digest()
+
+
+def write_in_text(path: Path, model: Gaussians) -> Path:
+    write_ply(path, model)
+    header, _, rows = path.read_bytes().partition(b"end_header\n")
+    values = np.frombuffer(rows, "<f4").reshape(len(model), -1)
+    lines = "\n".join(" ".join(f"{each:.9g}" for each in row) for row in values)
+    path.write_bytes(header.replace(b"binary_little_endian", b"ascii") + f"end_header\n{lines}\n".encode())
+    return path
+
+
+def write_sog_folder(folder: Path, model: Gaussians) -> Path:
+    write_model(folder.with_suffix(".sog"), model)
+    with zipfile.ZipFile(folder.with_suffix(".sog")) as archive:
+        archive.extractall(folder)
+    return folder / "meta.json"
 
 
 def test_a_page_is_written_and_not_over_another(keyss: Callable[..., Said], tmp_path: Path) -> None:

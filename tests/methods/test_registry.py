@@ -22,6 +22,7 @@ from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import registry
 from keyss.methods.base import (
+    Capabilities,
     CommandLineOption,
     Context,
     Frame,
@@ -72,6 +73,7 @@ class WholeMethod:
     summary = "embed the floats themselves"
     trains = False
     most_secrets = 1
+    capabilities = Capabilities()
     options = WholeOptions
     presets: Mapping[str, WholeOptions] = {"small": WholeOptions(), "large": WholeOptions(most=1000)}
 

@@ -73,8 +73,10 @@ def found_in(run: Path) -> dict[str, Any]:
     return data
 
 
-def run_with(run: Path, folder: Path, data: object) -> Path:
-    """A copy of a run's audit in a new folder, with other JSON."""
+def run_with(run: Path, folder: Path, data: object, *, published: bool = False) -> Path:
+    """A copy of a run's audit in a new folder, with other JSON; `published`: of what is published, too."""
+    if published:
+        shutil.copytree(run / "publish", folder / "publish")
     shutil.copytree(run / "private" / "audit", folder / "private" / "audit", dirs_exist_ok=True)
     (folder / "private" / "audit" / "audit.json").write_text(json.dumps(data))
     return folder

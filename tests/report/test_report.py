@@ -18,13 +18,16 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 
 from keyss.core.errors import InputError, OutputError
-from keyss.report import figures, write_report
+from keyss.files.layout import usual_up
+from keyss.report import figures, published, write_report
+from keyss.viewer.page import embedding_rules, page_with
 from report.audited import found_in, run_with, with_all_texts
 from report.pages import Parsed
 
 SECTIONS = [
     "verdict",
     "pictures",
+    "published",
     "images",
     "wrong-keys",
     "leaks",
@@ -127,7 +130,7 @@ def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]
 
 def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> None:
     assert page.loads() == []
-    html = (run_folder / "private" / "report.html").read_text()
+    html = without_viewer((run_folder / "private" / "report.html").read_text())
     assert "@import" not in html
     assert all(url.startswith("#") for url in re.findall(r"url\(([^)]*)\)", html))
     assert set(re.findall(r"https?://[^\"' <]*", html)) == {
@@ -140,13 +143,49 @@ def test_the_policy_allows_the_one_script_and_nothing_else(page: Parsed) -> None
     (policy,) = (value for value in page.values("content") if "default-src" in value)
     (script,) = page.scripts
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    assert f"script-src 'sha256-{digest}';" in policy
-    assert policy.startswith("default-src 'none'; img-src data:;")
+    viewer = embedding_rules()
+    assert f"script-src 'sha256-{digest}' {viewer['script-src']};" in policy
+    assert policy.startswith("default-src 'none'; img-src blob: data:;")
+    assert "connect-src" not in policy  # what is in the page, the viewer included, can ask nobody
     assert page.handlers() == []
 
 
+def without_viewer(html: str) -> str:
+    return re.sub(r'srcdoc="[^"]*"', "", html)
+
+
+def test_the_viewer_is_in_it_with_the_published_model(page: Parsed, run_folder: Path) -> None:
+    (viewer,) = page.values("srcdoc")
+    stego = run_folder / "publish" / "stego.ply"
+    assert viewer.encode() == page_with(
+        stego.read_bytes(), stego.name, usual_up(found_in(run_folder)["run"]["cover"])
+    )
+    assert page.values("sandbox") == ["allow-scripts allow-downloads"]
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_models_that_are_too_large_or_elsewhere_are_not_in_it(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_with(run_folder, tmp_path, data, published=True)
+    stego = run / "publish" / "stego.ply"
+    monkeypatch.setattr(published, "MOST_EMBEDDED", stego.stat().st_size - 1)
+    page = parsed(run)
+    assert "keyss view RUN/publish/stego.ply shows it." in page.text
+    harmless(page)
+    (policy,) = (value for value in page.values("content") if "default-src" in value)
+    assert "wasm" not in policy
+    monkeypatch.undo()
+    stego.unlink()
+    stego.symlink_to(run_folder / "publish" / "stego.ply")
+    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Markup(""))
+    page = parsed(run)
+    assert "It was not in RUN/publish" in page.text
+    harmless(page)
+
+
 def test_the_same_audit_gives_the_same_bytes(run_folder: Path, tmp_path: Path) -> None:
-    again = run_with(run_folder, tmp_path, found_in(run_folder))
+    again = run_with(run_folder, tmp_path, found_in(run_folder), published=True)
     assert write_report(again).read_bytes() == write_report(run_folder).read_bytes()
 
 
@@ -164,8 +203,8 @@ def test_a_part_that_did_not_run_is_left_out(
 @pytest.mark.usefixtures("without_drawing")
 def test_an_empty_audit_says_how_to_fill_it(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     page = parsed(run_with(run_folder, tmp_path, {k: v for k, v in data.items() if k not in PARTS}))
-    assert sections_of(page) == ["not-measured", "configuration"]
-    assert page.tags.count("li") == 2 + len(PARTS)  # links to the sections, and every measure
+    assert sections_of(page) == ["published", "not-measured", "configuration"]
+    assert page.tags.count("li") == 3 + len(PARTS)  # links to the sections, and every measure
     assert "keyss audit RUN --key-file KEY measures it" in page.text
 
 

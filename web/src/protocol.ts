@@ -1,11 +1,13 @@
 /** What the page and its worker tell each other. */
 import type { Gaussians } from './core/gaussians.ts';
 
-/** The port of the worker that derives keys; bytes of a file to be read; or a key to be tried on the one before. */
+/** Ports of the workers that derive keys; bytes of a file to be read; or a key to be tried on the one before. */
 export interface Question {
   readonly id: number;
-  readonly port?: MessagePort;
+  readonly ports?: readonly MessagePort[];
   readonly bytes?: Uint8Array;
+  readonly name?: string; // of the file; some formats are known by it only
+  readonly keyless?: boolean; // no key will be tried on these bytes
   readonly key?: string;
 }
 
@@ -14,4 +16,5 @@ export interface Answer {
   readonly model?: Gaussians;
   readonly file?: { readonly name: string; readonly data: Uint8Array };
   readonly error?: string; // one sentence
+  readonly progress?: number; // 0 to 1: not the answer yet, and the same for every key
 }

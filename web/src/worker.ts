@@ -2,42 +2,55 @@
 import type { Content, Reader } from './channels/content.ts';
 import { readerOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
-import { buffersOf } from './core/gaussians.ts';
-import { readModel } from './files/models.ts';
+import { buffersOf, type Gaussians } from './core/gaussians.ts';
+import { readModel, type ReadModel } from './files/models.ts';
+import type { Derive } from './keys/derivation.ts';
+import { derivedBy, here, inTurn } from './keys/pool.ts';
 import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
-let port: MessagePort | null = null;
+let derive: Derive = here;
+let stego: Gaussians | null = null;
 let prepared: Promise<Reader | null> = Promise.resolve(null);
 
 function answer(message: Answer, moved: Transferable[] = []): void {
   (self as unknown as Worker).postMessage(message, moved);
 }
 
-async function load(id: number, bytes: Uint8Array): Promise<void> {
-  const model = await readModel(bytes);
-  answer({ id, model });
+async function load({ id, name, keyless }: Question, bytes: Uint8Array): Promise<void> {
+  const read = await readModel(bytes, name);
+  const { codes, ...model } = read;
+  answer({ id, model }, keyless ? buffersOf(model) : []);
+  if (keyless) return;
+  stego = model;
   // Afterwards: the picture comes first.
-  prepared = new Promise((resolve) => setTimeout(() => resolve(readerOf(model)), 0));
+  prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
 }
 
-/** What a key becomes with a salt, by the worker at the other end of the port that the page gave. */
-const derive = (key: string, salt: Uint8Array): Promise<Uint8Array> =>
-  new Promise((resolve, reject) => {
-    if (port === null) throw new Error('no port');
-    port.onmessage = ({ data }: MessageEvent<Uint8Array | null>) =>
-      data === null ? reject(new Error('no memory')) : resolve(data);
-    port.postMessage({ key, salt });
-  });
+function readerWhereThereIsMemory(model: ReadModel): Reader | null {
+  try {
+    return readerOf(model);
+  } catch {
+    return null; // it opens nothing, and the page goes on
+  }
+}
 
 async function unlock(id: number, key: string): Promise<void> {
   const reader = await prepared;
-  const content = reader === null ? null : await reader.open(key, derive);
-  if (content === null) answer({ id });
-  else if (content.service === 'records') {
-    const model = secretOf(content).gaussians;
-    answer({ id, model }, buffersOf(model));
-  } else answer({ id, file: fileOf(content) });
+  const content = reader === null ? null : await reader.open(key, counted(id, reader.derivations));
+  const model = content && stego && secretOf(content, stego)?.gaussians;
+  if (model) answer({ id, model }, buffersOf(model));
+  else answer({ id, file: content ? fileOf(content) : undefined });
+}
+
+/** `derive`, telling the page how many of so many keys have been derived. */
+function counted(id: number, all: number): Derive {
+  let done = 0;
+  return async (key, salt) => {
+    const found = await derive(key, salt);
+    answer({ id, progress: ++done / (all + 1) }); // what comes after takes as long as one more
+    return found;
+  };
 }
 
 /** A hidden file: its name, which is to be shown and never to be taken as a path, and its bytes. */
@@ -49,12 +62,12 @@ function fileOf(content: Content): { name: string; data: Uint8Array } | undefine
 }
 
 self.onmessage = async ({ data }: MessageEvent<Question>) => {
-  if (data.port) {
-    port = data.port;
+  if (data.ports) {
+    derive = inTurn(data.ports.map(derivedBy));
     return;
   }
   try {
-    if (data.bytes) await load(data.id, data.bytes);
+    if (data.bytes) await load(data, data.bytes);
     else await unlock(data.id, data.key ?? '');
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';

@@ -1,6 +1,10 @@
 /** The frozen vectors that Python's tests use too. */
 import { createHash } from 'node:crypto';
 import { readFileSync } from 'node:fs';
+import { WebPCodec } from '@playcanvas/splat-transform';
+import type { Gaussians } from '../src/core/gaussians.ts';
+import { readModel, type ReadModel } from '../src/files/models.ts';
+import { readSog } from '../src/files/sog.ts';
 
 const FOLDER = new URL('../../tests/vectors/', import.meta.url);
 
@@ -12,8 +16,21 @@ export function jsonVector<T>(name: string): T {
   return JSON.parse(new TextDecoder().decode(vector(name))) as T;
 }
 
+/** The model in a file; the images of a .sog, which browsers decode otherwise, by another program's decoder. */
+export async function modelOf(name: string): Promise<ReadModel> {
+  if (!name.endsWith('.sog')) return readModel(vector(name), name);
+  const codec = await WebPCodec.create();
+  return readSog(vector(name), async (data, count) => codec.decodeRGBA(data).rgba.slice(0, 4 * count));
+}
+
 export function digest(values: Float32Array | Uint8Array): string {
   return createHash('sha256').update(new Uint8Array(values.buffer, values.byteOffset, values.byteLength)).digest('hex');
+}
+
+/** SHA-256 of the float32 columns, by the names that they have in Python. */
+export function columns({ means, quats, logScales, opacityLogits, sh }: Gaussians): Record<string, string> {
+  const found = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
+  return Object.fromEntries(Object.entries(found).map(([name, values]) => [name, digest(values)]));
 }
 
 export function hex(text: string): Uint8Array {

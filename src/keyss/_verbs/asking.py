@@ -14,15 +14,15 @@ from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, SceneInput
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import PathLike, path_of
-from keyss.runs.opening import as_model
+from keyss.runs.opening import as_3dgs_model
 
 
 @dataclass(frozen=True)
 class Secret:
-    """A scene, a model or the file of one to hide, and the key that is to open it."""
+    """A scene, a model or the file of one to hide, and the key to it where the method has keys."""
 
     scene: PathLike | Scene | Gaussians
-    key: str = field(repr=False)
+    key: str = field(default="", repr=False)
     model: PathLike | Gaussians | None = None  # a plain 3DGS model of it, if there is one already
 
 
@@ -37,7 +37,13 @@ def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[
         raise UsageError(
             f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
         )
-    check_keys([secret.key for secret in secrets])
+    keys = [secret.key for secret in secrets]
+    if method.capabilities.keys:
+        check_keys(keys)
+    elif any(keys):
+        raise UsageError(
+            f"the method {method.name} has no keys: whoever has what it hands over sees the secret; give none"
+        )
     return method, options
 
 
@@ -54,7 +60,7 @@ def inputs_of(
                 what = "a source in memory" if isinstance(source, Gaussians) else source
                 raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
             model = source  # type: ignore[assignment]
-        found = None if model is None else as_model(model)
+        found = None if model is None else as_3dgs_model(model, "the secret" if index else "the cover")
         if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
             what = "the secret" if index else "the cover"
             raise UsageError(f"nothing of {what}'s model can be seen: all of its Gaussians are transparent")

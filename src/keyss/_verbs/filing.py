@@ -24,7 +24,7 @@ from keyss.rendering.difference import cost
 from keyss.runs.config import PathLike
 from keyss.runs.files import STEGOS, stego_name, writers
 from keyss.runs.folder import RunFolder, check_not_published
-from keyss.runs.opening import as_model, naming_what_opens_nothing
+from keyss.runs.opening import as_3dgs_model, as_model, naming_what_opens_nothing
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def hide_files(
         read = [cover, *(each.file for each in files)]
         inputs = [Path(each) for each in read if isinstance(each, str | Path)]
         folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
-    hidden, model = [each.read() for each in files], as_model(cover)
+    hidden, model = [each.read() for each in files], as_3dgs_model(cover, "the cover")
     keys = [each.key for each in files]
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
     if publish == "ply":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,20 +11,23 @@ from pathlib import Path
 import torch
 
 from keyss._verbs.asking import Secret, inputs_of, method_for
+from keyss.channels.base import Payload
 from keyss.core.errors import QualityError, UsageError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene
 from keyss.files.models import is_model_path, read_model
 from keyss.fitting.loop import Reporter
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, measure_hiding, render_fidelity
-from keyss.methods.base import Context, KeyedSource, Method, MethodOptions, Source, Stego
+from keyss.methods.base import Context, KeyedSource, Method, MethodOptions, Opened, Source, Stego
+from keyss.methods.handed import pack
 from keyss.methods.plain_models import plain_models
+from keyss.methods.registry import open_handed
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import Background, PathLike, RunConfig, colour_of, path_of, secret_ids
-from keyss.runs.files import CONFIG, METRICS, STEGOS, plain_names, stego_name, writers
+from keyss.runs.files import CONFIG, METRICS, STEGOS, handed_names, plain_names, stego_name, writers
 from keyss.runs.folder import RunFolder, recorded_seed
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.opening import as_scene, open_in
@@ -68,8 +71,9 @@ def hide(
     be resumed it needs none. With one, the same arguments give the same bytes on a CPU with as many threads.
 
     The secrets lie encrypted in `stego.ply`, or what the options' `publish` says. `out` (a folder) gets it in
-    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`; while it runs,
-    checkpoints from which `resume` goes on.
+    `publish/`, and `private/` with the plain models, `config.json` and `metrics.json`, and with what methods
+    hand over that need more than the published file (`keyss.methods.handed`); while it runs, checkpoints from
+    which `resume` goes on.
 
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
@@ -135,9 +139,12 @@ def hide(
         if repeatable:
             context = replace(context, entropy=_entropy(keys, options, plain))
         stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
+        handed = _handed_files(stego.handed, keys)
         against_plain = tuple(
             render_fidelity(model.to(target), original.to(target), scene)
-            for model, original, scene in zip(_as_read(stego, keys, folder), plain, scenes, strict=True)
+            for model, original, scene in zip(
+                _as_read(stego, keys, handed, folder), plain, scenes, strict=True
+            )
         )
         _check_quality(against_plain, min_psnr)
         photos = tuple(each.photos for each in inputs)
@@ -154,25 +161,40 @@ def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list
     """By what a resumed run knows its keys: to guess one from it takes as long as from what is published."""
     salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
     derivation = KeyDerivation(salt=salt)
-    return [DerivedKey(key, derivation).verifier().hex() for key in keys]
+    return [DerivedKey(key, derivation).verifier().hex() for key in keys if key]
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
     """32 bytes that nobody knows without the keys; other inputs or options have others."""
     seed = options.fit.known_seed
     salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
-    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys]
+    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys if key]
     parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 
-def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
-    """The stego model and the secrets as a reader gets them, from the files that are to be published."""
+def _handed_files(payloads: Sequence[Payload], keys: Sequence[str]) -> dict[str, bytes]:
+    """What is handed over, by the names of files in the run's folder."""
+    packed = [pack(payload, key or None) for payload, key in zip(payloads, keys, strict=bool(payloads))]
+    return dict(zip(handed_names(len(packed)), packed, strict=True))
+
+
+def _as_read(
+    stego: Stego, keys: Sequence[str], handed: Mapping[str, bytes], folder: RunFolder | None
+) -> list[Gaussians]:
+    """The stego model and the secrets as a reader gets them, from the files that are to be given away."""
     model = stego.gaussians
     if folder:
         name = stego_name(model)
-        model = read_model(folder.write(writers({name: model})) / name)
-    return [model, *(open_in(model, key).reveal(model) for key in keys)]
+        model = read_model(folder.write(writers({name: model, **handed})) / name)
+    opened: Sequence[Opened]
+    if handed:
+        opened = [open_handed(data, key or None) for data, key in zip(handed.values(), keys, strict=True)]
+    elif stego.verified and same_bits(model, stego.gaussians):
+        opened = stego.opened  # to open the same bits once more would show nothing new
+    else:
+        opened = [open_in(model, key) for key in keys]
+    return [model, *(each.reveal(model) for each in opened)]
 
 
 def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:

@@ -21,8 +21,9 @@ from keyss.runs.verifying import Verification, check_model, check_secret
 
 def reveal(
     stego: PathLike | Gaussians,
-    key: str,
+    key: str | None = None,
     *,
+    handed: PathLike | None = None,
     frame: Frame = "secret",
     decoy: bool = False,
     force: bool = False,
@@ -36,7 +37,9 @@ def reveal(
     "cover" leaves it where it was hidden, which a carried one never was. If Gaussians were lost, the others
     make up for them (`keyss.core.pruning_compensation`). `force` is for models that were quantised or pruned:
     it skips the check that a decoder is used with the model it was trained with, and takes as little of the
-    secret as there is.
+    secret as there is. `handed`: the file that was handed over for this secret, for methods that do so
+    (`keyss.methods.handed`); some of them have no keys, and some give what a network decodes
+    (`keyss.core.decoded`), which is no 3DGS model.
 
     `out` (a file) gets the revealed model. Raises WrongKeyError for a key that opens nothing (with `decoy`
     the cover comes instead, see `keyss.methods.decoy`), InputError for a file that is not what it should
@@ -46,6 +49,7 @@ def reveal(
     found = reveal_counted(
         stego,
         key,
+        handed=handed,
         frame=frame,
         decoy=decoy,
         force=force,
@@ -58,7 +62,7 @@ def reveal(
 
 def reveal_counted(
     stego: PathLike | Gaussians,
-    key: str,
+    key: str | None = None,
     *,
     device: Backend = "auto",
     out: PathLike | None = None,

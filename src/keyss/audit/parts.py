@@ -187,6 +187,9 @@ def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResul
     return PartResult(result)
 
 
+# What these look at, or do to it, only 3DGS models have.
+OF_3DGS_MODELS = frozenset({"parameters", "stealth", "leaks", "robustness"})
+
 # By the names of their fields in `Audit`.
 PARTS: dict[str, AuditPart] = {
     part.__name__: part for part in (images, parameters, stealth, stegexpose, leaks, robustness, speed)

@@ -11,11 +11,13 @@ from importlib.metadata import version as version_of
 import msgspec
 
 from keyss._version import __version__
-from keyss.audit.parts import PARTS
+from keyss.audit.parts import OF_3DGS_MODELS, PARTS
 from keyss.audit.progress import FinishedParts, PartProgress
 from keyss.audit.subject import AuditSubject, subject_of
 from keyss.core.errors import Interrupted, UsageError, signal_of
+from keyss.files.layout import usual_up
 from keyss.fitting.loop import Reporter, SilentReporter
+from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
 from keyss.report.page import report_bytes
 from keyss.runs.audit_record import (
@@ -28,7 +30,7 @@ from keyss.runs.audit_record import (
     WrongKeyResult,
 )
 from keyss.runs.config import PathLike
-from keyss.runs.files import REPORT, writers
+from keyss.runs.files import REPORT, stego_in, writers
 from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun, open_run
 
@@ -64,6 +66,12 @@ def audit(
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
     started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)
+    standard = registry.get(opened.config.method).capabilities.standard
+    if impossible := sorted(set(only) & OF_3DGS_MODELS) if not standard else []:
+        raise UsageError(
+            f"what the method {opened.config.method} publishes is no 3DGS model: there is nothing for "
+            f"{' and '.join(impossible)} to look at; leave out `only`, or name other parts"
+        )
     target = resolve_device(device)
     asked = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
     folder = RunFolder(
@@ -80,7 +88,8 @@ def audit(
         finished = FinishedParts(folder.checkpoints, _inputs(subject, seed))
         sections = {}
         pictures: dict[str, bytes] = {}
-        chosen = [name for name in PARTS if not only or name in only]
+        possible = [name for name in PARTS if standard or name not in OF_3DGS_MODELS]
+        chosen = [name for name in possible if not only or name in only]
         for index, name in enumerate(chosen):
             if not finished.has(name):
                 progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
@@ -104,7 +113,7 @@ def audit(
         )
         files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
         there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": found, **files}))
-        folder.write(writers({REPORT: report_bytes(found, there)}))
+        folder.write(writers({REPORT: report_bytes(found, there, stego_in(opened.folder))}))
     return found
 
 
@@ -130,6 +139,8 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         width=run.config.width,
         gaussians=len(run.stego),
         photos=run.metrics.photos,
+        standard=registry.get(run.config.method).capabilities.standard,
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as it will be read again
+        up=usual_up(cover),
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

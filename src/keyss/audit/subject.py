@@ -20,7 +20,6 @@ from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import frame_of
 from keyss.measure.robustness.survival import Reopener
-from keyss.methods import registry
 from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun, as_model
@@ -53,7 +52,7 @@ class AuditSubject:
     @property
     def reopeners(self) -> list[Reopener]:
         """What opens the secrets in a changed model."""
-        return [Reopener(key, registry.open_model) for key in self.run.keys]
+        return self.run.reopeners
 
     @property
     def secrets(self) -> tuple[Scene, ...]:

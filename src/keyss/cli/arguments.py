@@ -58,6 +58,7 @@ Ray = Annotated[
     str | None,
     optional("ADDRESS", "Run on the Ray cluster at this address, or on a `local` one.", "processes here"),
 ]
+Live = Annotated[bool, arg(help="Show the model as it trains, on a page of this machine.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
 
 

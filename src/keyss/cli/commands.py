@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from keyss import __version__
 from keyss.cli.arguments import Device, OutFolder, Overwrite, checked_seed, optional
+from keyss.cli.comparing import compare
 from keyss.cli.doctor import doctor
 from keyss.cli.hiding import hide
 from keyss.cli.measuring import audit, evaluate, report, steganalyze
@@ -115,5 +116,5 @@ def version() -> None:
 
 ALL = (
     *(keygen, key_of, fit, hide, reveal, verify, render, convert, view, export_html),
-    *(sweep, evaluate, audit, report, steganalyze, info, demo, doctor, completion, version),
+    *(sweep, evaluate, audit, report, compare, steganalyze, info, demo, doctor, completion, version),
 )

@@ -20,6 +20,7 @@ from keyss.cli.arguments import (
     Iterations,
     Jobs,
     KeyFiles,
+    Live,
     MasterKeyFile,
     MaxGaussians,
     OutFolder,
@@ -111,6 +112,7 @@ def hide(
     resume: Resume = False,
     overwrite: Overwrite = False,
     tensorboard: TensorBoard = False,
+    live: Live = False,
     device: Device = "auto",
     seed: Seed = None,
     **own: Any,
@@ -129,12 +131,13 @@ def hide(
     """
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
+    from keyss.cli.live import watched
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.cli.tensorboard import reporter
     from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.rendering.orbit import is_model
-    from keyss.runs.files import STEGOS
+    from keyss.runs.files import HANDED, STEGOS
 
     if cover is None and batch is None:
         raise UsageError("nothing to hide in: give --cover SCENE, or --batch CSV for many")
@@ -148,7 +151,7 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
-        unused |= {"--tensorboard": tensorboard}
+        unused |= {"--tensorboard": tensorboard, "--live": live}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         _hide_files(cover, secret_file, publish, channel or "colours", key_file, out, overwrite)
@@ -174,7 +177,7 @@ def hide(
     if batch is not None:
         one: dict[str, object] = {"--cover": cover, "--secret": secret, "--secret-file": secret_file}
         one |= {"--key-file": key_file, "--cover-model": cover_model, "--secret-model": secret_model}
-        one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--resume": resume}
+        one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--live": live, "--resume": resume}
         if given_too := [flag for flag, value in one.items() if value]:
             raise UsageError(
                 f"--batch: {given_too[0]} is for a single hiding; a batch that was interrupted goes on "
@@ -202,6 +205,7 @@ def hide(
             "--preset": preset != next(iter(chosen.presets)),
             "--iterations": iterations is not None,
             "--max-gaussians": max_gaussians is not None,
+            "--live": live,
         }
         if idle := [flag for flag, is_given in training.items() if is_given]:
             raise UsageError(
@@ -209,8 +213,11 @@ def hide(
                 f"leave {'it' if len(idle) == 1 else 'them'} out"
             )
     models = secret_model or (None,) * len(secret)
-    opening = keys(key_file, len(secret), confirm=True)
-    warn_of_doubtful_keys(opening)
+    if chosen.capabilities.keys or key_file:
+        opening = keys(key_file, len(secret), confirm=True)
+        warn_of_doubtful_keys(opening)
+    else:
+        opening = [""] * len(secret)
     secrets = [
         api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)
     ]
@@ -228,33 +235,40 @@ def hide(
         )
         print_plan(planned)
         return
-    result = api.hide(
-        cover,
-        secrets,
-        method=options,
-        width=width,
-        background=background,
-        skip_missing=skip_missing,
-        cover_model=cover_model,
-        min_psnr=min_psnr,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-        resume=resume,
-        reporter=reporter(out, tensorboard=tensorboard),
-    )
+    with watched(reporter(out, tensorboard=tensorboard), cover, live=live) as told:
+        result = api.hide(
+            cover,
+            secrets,
+            method=options,
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            cover_model=cover_model,
+            min_psnr=min_psnr,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=told,
+        )
     print_hiding(result.metrics)
     how = _HOW[publish == "any"]
+    what = "the cover, with the secret in it" if chosen.trains or chosen.capabilities.keys else "the cover"
     print_files(
         out,
         {
-            **dict.fromkeys(STEGOS, f"publish this, {how}: the cover, with the secret in it"),
+            **dict.fromkeys(STEGOS, f"publish this, {how}: {what}"),
+            HANDED: "hand this over to who may see the secret: `keyss reveal --handed`",
             "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
         },
     )
+    if not chosen.capabilities.keys:
+        print(f"The method {method} has no keys: whoever has both files sees the secret.")
+        return
+    files = "both files" if chosen.capabilities.hands_over else "file"
     print(
         "The key: send it over another channel than the file, and keep a copy: without it nothing is opened. "
-        "Whoever has file and key runs `keyss reveal`."
+        f"Whoever has {files} and key runs `keyss reveal`."
     )
 
 

@@ -39,6 +39,17 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 
 
+def keys_of_run(run: Path, files: Sequence[Path]) -> list[str]:
+    """The keys of a run's secrets: as many as there are files, or one; none where its method has none."""
+    from keyss.methods import registry
+    from keyss.runs.config import read_config
+    from keyss.runs.files import CONFIG, is_run
+
+    if not files and is_run(run) and not registry.get(read_config(run / CONFIG).method).capabilities.keys:
+        return []
+    return keys(files, len(files) or 1)
+
+
 def warn_of_doubtful_keys(chosen: Sequence[str]) -> None:
     """Say on the standard error stream which of the keys can be guessed or were hardly meant like that.
 

@@ -35,10 +35,10 @@ def evaluate(
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     from keyss import api
-    from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.cli.keys import hinting_at_white_space, keys_of_run
     from keyss.cli.tables import print_files, print_hiding
 
-    chosen = keys(key_file, len(key_file) or 1)
+    chosen = keys_of_run(run, key_file)
     with hinting_at_white_space(chosen):
         metrics = api.evaluate(
             run,
@@ -111,11 +111,11 @@ def audit(
     example: keyss audit runs/hidden --key-file key.txt
     """
     from keyss import api
-    from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.cli.keys import hinting_at_white_space, keys_of_run
     from keyss.cli.tables import print_files, print_verdicts
     from keyss.progress import reporter
 
-    chosen = keys(key_file, len(key_file) or 1)
+    chosen = keys_of_run(run, key_file)
     with hinting_at_white_space(chosen):
         api.audit(
             run,

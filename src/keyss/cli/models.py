@@ -16,6 +16,7 @@ from keyss.cli.arguments import (
     Background,
     Device,
     Iterations,
+    Live,
     MaxGaussians,
     OutFolder,
     Overwrite,
@@ -43,6 +44,7 @@ def fit(
     resume: Resume = False,
     overwrite: Overwrite = False,
     tensorboard: TensorBoard = False,
+    live: Live = False,
     device: Device = "auto",
     seed: Seed = None,
 ) -> None:
@@ -50,11 +52,12 @@ def fit(
 
     example: keyss fit SCENE -o runs/cover
 
-    example: keyss fit SCENE -o runs/cover --tensorboard
+    example: keyss fit SCENE -o runs/cover --live
     """
     from dataclasses import replace
 
     from keyss import api
+    from keyss.cli.live import watched
     from keyss.cli.tables import print_files, print_fit
     from keyss.cli.tensorboard import reporter
     from keyss.fitting.config import PRESETS
@@ -62,18 +65,19 @@ def fit(
     from keyss.runs.metrics import FitMetrics
     from keyss.runs.records import read_record
 
-    api.fit(
-        scene,
-        config=replace(PRESETS[preset], **schedule(iterations, max_gaussians, seed)),
-        width=width,
-        background=background,
-        skip_missing=skip_missing,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-        resume=resume,
-        reporter=reporter(out, tensorboard=tensorboard),
-    )
+    with watched(reporter(out, tensorboard=tensorboard), scene, live=live) as told:
+        api.fit(
+            scene,
+            config=replace(PRESETS[preset], **schedule(iterations, max_gaussians, seed)),
+            width=width,
+            background=background,
+            skip_missing=skip_missing,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=told,
+        )
     print_fit(read_record(out / METRICS, FitMetrics))
     print_files(out, {"model.ply": "the model", "private": "its numbers, and what ran"})
 

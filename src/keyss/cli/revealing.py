@@ -29,6 +29,10 @@ def reveal(
             help="The model to write (.ply, .spz, ...), or - for stdout; a hidden file gets any other name.",
         ),
     ],
+    handed: Annotated[
+        Path | None,
+        optional("FILE", "What was handed over beside the model, for methods that do so.", "there is none"),
+    ] = None,
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Whose coordinates: the secret's own, or where it was hidden.")
     ] = "secret",
@@ -54,22 +58,26 @@ def reveal(
     from keyss.core.errors import UsageError
     from keyss.files.models import is_model_path
     from keyss.files.streams import is_standard
+    from keyss.runs.opening import is_sealed
 
-    (key,) = keys(key_file, 1)
+    key: str | None = None
+    if handed is None or key_file or is_sealed(handed):
+        (key,) = keys(key_file, 1)
     if not is_standard(out) and not is_model_path(out):
-        if decoy or force or frame != "secret":
+        if key is None or handed or decoy or force or frame != "secret":
             raise UsageError(
                 f"{out} is not the name of a model: expected one that ends in .ply, or a hidden file's, for "
-                "which there is no --decoy, --force or --frame"
+                "which there is no --handed, --decoy, --force or --frame"
             )
         with hinting_at_white_space([key]):
             found = api.reveal_file(stego, key, out=out, overwrite=overwrite)
         print(f"{out}: {found.name!r}, {len(found.data):,} bytes")
         return
-    with hinting_at_white_space([key]):
+    with hinting_at_white_space([key] if key else []):
         revealed = api.reveal_counted(
             stego,
             key,
+            handed=handed,
             frame=frame,
             decoy=decoy,
             force=force,

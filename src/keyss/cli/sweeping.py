@@ -57,7 +57,7 @@ def sweep(
         "private/master-key.txt": "what the keys of the cells follow from",
     }
     print_files(out, described)
-    failures = [(each.name, each.failure and each.failure.message) for each in result.failed]
+    failures = [(each.name, each.failure.message if each.failure else None) for each in result.failed]
     _end(failures, len(result.ended), "cells")
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from keyss._verbs.converting import Conversion
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
+    from keyss.runs.comparison import Comparison
     from keyss.runs.metrics import FitMetrics, HideMetrics
     from keyss.runs.planning import Plan
 
@@ -127,6 +128,29 @@ def print_steganalysis(found: Steganalysis) -> None:
     flagged = sum(row.flagged for row in found.rows)
     table.add_row(f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
     Console().print(table)
+
+
+def print_comparison(found: Comparison) -> None:
+    """A block for each method: the table of `comparison.md` is wider than terminals."""
+    from keyss.runs.comparison import table
+
+    heads, *rows = table(found)
+    quality = _table(*heads[:7], texts=1)
+    rest = _table(heads[0], *heads[7:], texts=1)
+    for row in rows:
+        if len(row[1]) > 20:  # why it is not possible
+            continue
+        quality.add_row(*row[:7])
+        rest.add_row(row[0], *row[7:])
+    Console().print(quality)
+    Console().print(rest)
+    for each in found.methods:
+        if each.error is not None:
+            print(f"{each.name}: not possible: {each.error}")
+    print(
+        "Test views: photos that were not trained on. All methods had the same plain models, as many steps "
+        "in each training, and at most as many Gaussians."
+    )
 
 
 def print_verdicts(run: Path) -> None:

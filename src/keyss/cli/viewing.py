@@ -18,7 +18,7 @@ Up = Annotated[
 
 
 def view(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="The published model: .ply, .spz or .sog.")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="The published model, of any format.")],
     *,
     port: Annotated[int, optional("N", "Port to serve on.", "any that is free")] = 0,
     host: Annotated[
@@ -44,7 +44,7 @@ def view(
 
 
 def export_html(
-    model: Annotated[Positional[Path], arg(metavar="FILE", help="The published model: .ply, .spz or .sog.")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="The published model, of any format.")],
     *,
     out: Annotated[
         Path,

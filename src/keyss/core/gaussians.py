@@ -69,6 +69,10 @@ class Gaussians:
     def device(self) -> torch.device:
         return self.means.device
 
+    def like(self, changed: Gaussians) -> Gaussians:
+        """`changed`, made of these one by one, with what else belongs to them: nothing but in subclasses."""
+        return changed
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """The Gaussians with `function` applied to each of the five tensors."""
         return Gaussians(*(function(getattr(self, f.name)) for f in fields(self)))
@@ -102,3 +106,13 @@ class Gaussians:
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
         """All Gaussians of `parts` in order; they must have one SH degree."""
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+
+
+def same_bits(one: Gaussians, other: Gaussians) -> bool:
+    """Whether two models that have nothing but numbers are equal to the last bit, in the same order."""
+    if not type(one) is type(other) is Gaussians:
+        return False
+    if (len(one), one.sh_degree) != (len(other), other.sh_degree):
+        return False
+    pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(Gaussians))
+    return all(torch.equal(a.cpu().view(torch.int32), b.cpu().view(torch.int32)) for a, b in pairs)

@@ -80,13 +80,14 @@ class Similarity:
         rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
         product = torch.tensor(rows, dtype=torch.float64, device=gaussians.device)
         quats = gaussians.quats.double() @ product.T
-        return Gaussians(
+        moved = Gaussians(
             means=self.apply_points(gaussians.means),
             quats=quats.to(gaussians.quats.dtype),
             log_scales=gaussians.log_scales + math.log(self.scale),
             opacity_logits=gaussians.opacity_logits,
             sh=_rotate_sh(gaussians.sh, self.rotation),
         )
+        return gaussians.like(moved)
 
 
 def _rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:

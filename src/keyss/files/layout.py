@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,12 @@ class SceneLayout:
     train: tuple[Photo, ...]
     test: tuple[Photo, ...]
     points: PointCloud = NO_POINTS
+
+
+def usual_up(path: Path | str) -> Literal["-y", "z"]:
+    """The way up in a scene, as the programs that write its layout have it; of all else, as COLMAP has it."""
+    names = ("transforms_train.json", "transforms.json")  # of Blender and of Nerfstudio
+    return "z" if any((Path(path) / name).is_file() for name in names) else "-y"
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:

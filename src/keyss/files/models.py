@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write
@@ -21,6 +22,8 @@ from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.ply import read_ply, write_ply
 from keyss.files.ply_rows import is_compressed
 from keyss.files.streams import MemoryInput, MemoryOutput, StandardInput, StandardOutput, is_standard
+
+DECODED_SUFFIX = ".3dgs.safetensors"  # of models whose pictures a network makes
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,21 @@ def _writer(module: str) -> Callable[[Path | StandardOutput, Gaussians], None]:
     return write
 
 
+def _write_decoded(target: Path | StandardOutput, model: Gaussians) -> None:
+    """Only what a network decodes: others have formats of their own."""
+    if not isinstance(model, DecodedGaussians):
+        raise UsageError(
+            f"cannot write a 3DGS model as {target}: files that end in {DECODED_SUFFIX} are for models that "
+            "a network decodes; take a name that ends in .ply"
+        )
+    try:
+        data = _format("decoded").write_decoded(model)
+    except OutputError as error:
+        raise OutputError(f"cannot write {target}: {error}") from error
+    with atomic_write(target) as file:
+        file.write(data)
+
+
 def _read_any_ply(source: Path | StandardInput) -> Gaussians:
     """Compressed files end in .ply, too."""
     return _reader("compressed_ply")(source) if is_compressed(source) else read_ply(source)
@@ -92,6 +110,8 @@ FORMATS = [
     ModelFormat(".splat", (".splat",), (), _reader("splat"), _writer("splat")),
     ModelFormat(".ksplat", (".ksplat",), (), _reader("ksplat"), None),
 ]
+# No format of 3DGS models: it is read where it is named.
+_DECODED = ModelFormat("decoded", (DECODED_SUFFIX,), (), _reader("decoded"), _write_decoded, exact=True)
 _PLY = FORMATS[1]
 
 
@@ -121,14 +141,14 @@ def write_model(path: Path | str, model: Gaussians) -> None:
     UsageError for an unknown suffix, OutputError for a model that is empty, not finite or beyond what the
     format holds, and when the system refuses.
     """
-    _, write = _for_writing(path)
+    _, write = _for_writing(path, model)
     write(StandardOutput() if is_standard(path) else Path(path), model)
 
 
 def model_bytes(path: Path | str, model: Gaussians) -> bytes:
     """What `write_model` would write to `path`. Raises as it does."""
     memory = MemoryOutput(str(path))
-    _for_writing(path)[1](memory, model)
+    _for_writing(path, model)[1](memory, model)
     return memory.data
 
 
@@ -160,15 +180,22 @@ def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path]
 
 def _by_suffix(path: Path | str) -> ModelFormat | None:
     name = Path(path).name.lower()
-    return next((each for each in FORMATS if name.endswith(each.suffixes)), None)
+    return next((each for each in (*FORMATS, _DECODED) if name.endswith(each.suffixes)), None)
 
 
-def _for_writing(path: Path | str) -> tuple[ModelFormat, Callable[[Path | StandardOutput, Gaussians], None]]:
-    """The format that a name means, and what writes it. Raises UsageError."""
+def _for_writing(
+    path: Path | str, model: Gaussians | None = None
+) -> tuple[ModelFormat, Callable[[Path | StandardOutput, Gaussians], None]]:
+    """The format that a name means, and what writes it. Raises UsageError, also where it cannot hold it."""
     found = _PLY if is_standard(path) else _by_suffix(path)
     if found is None or found.write is None:
         known = ", ".join(suffix for each in FORMATS if each.write for suffix in each.suffixes)
         raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known}")
+    if isinstance(model, DecodedGaussians) and found.write is not _write_decoded:
+        raise UsageError(
+            f"cannot write {path}: a network makes the pictures of this model, which 3DGS files do not hold; "
+            f"take a name that ends in {DECODED_SUFFIX}, and `keyss render` draws it"
+        )
     return found, found.write
 
 

@@ -7,16 +7,20 @@ then blue).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from keyss.core import Gaussians, OutputError
 from keyss.files.atomic import atomic_write
-from keyss.files.ply_rows import model_names, read_rows, settle
-from keyss.files.ply_table import ply_header
+from keyss.files.ply_rows import Settled, model_names, read_row_blocks
+from keyss.files.ply_table import Rows, ply_header
 from keyss.files.streams import StandardInput, StandardOutput
+
+_BLOCK = 1 << 13  # Gaussians that are written at a time
 
 
 def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
@@ -30,18 +34,28 @@ def write_ply(path: Path | str | StandardOutput, gaussians: Gaussians) -> None:
     names = model_names(k)
     names[3:3] = ["nx", "ny", "nz"]
     flat = gaussians.detach().to("cpu")
-    rest = flat.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1))
-    parts = (
-        *(flat.means, torch.zeros(n, 3), flat.sh[:, 0], rest),
-        *(flat.opacity_logits[:, None], flat.log_scales, flat.quats),
-    )
-    rows = np.concatenate(parts, axis=1, dtype="<f4")
-    problem = settle(rows, names)
-    if problem:
-        raise OutputError(f"cannot write {path}: {problem}")
+    settled = Settled()
     with atomic_write(path) as file:
         file.write(ply_header({"vertex": (n, (f"float {name}" for name in names))}))
-        file.write(rows.data)
+        for start in range(0, n, _BLOCK):
+            rows = _rows(flat[start : start + _BLOCK])
+            settled.settle(rows, names)
+            file.write(rows.astype("<f4", copy=False).data)
+        if problem := settled.problem(names):
+            raise OutputError(f"cannot write {path}: {problem}")
+
+
+def _rows(part: Gaussians) -> npt.NDArray[np.float32]:
+    """[N, 14 + 3 K] of some Gaussians, in the order of the file."""
+    n, k = part.sh.shape[:2]
+    rows = np.zeros((n, 14 + 3 * k), np.float32)
+    rows[:, :3] = part.means.numpy()
+    rows[:, 6:9] = part.sh[:, 0].numpy()
+    rows[:, 9:-8] = part.sh[:, 1:].numpy().transpose(0, 2, 1).reshape(n, 3 * (k - 1))
+    rows[:, -8] = part.opacity_logits.numpy()
+    rows[:, -7:-4] = part.log_scales.numpy()
+    rows[:, -4:] = part.quats.numpy()
+    return rows
 
 
 def read_ply(path: Path | str | StandardInput) -> Gaussians:
@@ -52,12 +66,22 @@ def read_ply(path: Path | str | StandardInput) -> Gaussians:
     +-OPACITY_LOGIT_BOUND. Raises InputError for anything that is not a whole, finite 3DGS model in
     binary or ascii PLY.
     """
-    values = torch.from_numpy(read_rows(path)[1])
-    rest = values[:, 6:-8].reshape(len(values), 3, -1).transpose(1, 2)  # [N, K - 1, 3]
-    return Gaussians(
-        means=values[:, 0:3].contiguous(),
-        quats=values[:, -4:].contiguous(),
-        log_scales=values[:, -7:-4].contiguous(),
-        opacity_logits=values[:, -8].contiguous(),
-        sh=torch.cat([values[:, None, 3:6], rest], dim=1),
-    )
+    tensors: list[npt.NDArray[np.float32]] = []
+
+    def begin(names: list[str], count: int) -> Callable[[int, Rows], None]:
+        k = (len(names) - 11) // 3
+        for shape in ((3,), (4,), (3,), (), (k, 3)):
+            tensors.append(np.empty((count, *shape), np.float32))
+        return place
+
+    def place(start: int, rows: Rows) -> None:
+        part = slice(start, start + len(rows))
+        means, quats, log_scales, opacity_logits, sh = tensors
+        means[part], quats[part], log_scales[part] = rows[:, 0:3], rows[:, -4:], rows[:, -7:-4]
+        opacity_logits[part], sh[part, 0] = rows[:, -8], rows[:, 3:6]
+        rest = rows[:, 6:-8].reshape(len(rows), 3, -1)
+        for colour in range(3):
+            sh[part, 1:, colour] = rest[:, colour]
+
+    read_row_blocks(path, begin)
+    return Gaussians(*map(torch.from_numpy, tensors))

@@ -6,14 +6,13 @@ Without torch, which takes a second to load, for those who only want to know wha
 from __future__ import annotations
 
 import re
-from collections.abc import Set
+from collections.abc import Callable, Set
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from keyss.core.errors import InputError
-from keyss.files.ply_table import MAX_HEADER_BYTES, read_vertices
+from keyss.files.ply_table import MAX_HEADER_BYTES, Rows, WholeTable, read_vertex_blocks
 from keyss.files.streams import StandardInput
 
 # Stands in for an infinite opacity logit. Converters write infinities for opacities of 0 and 1; a larger
@@ -27,16 +26,34 @@ def is_compressed(source: Path | StandardInput) -> bool:
         return b" packed_position" in file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
 
 
-def read_rows(path: Path | str | StandardInput) -> tuple[list[str], npt.NDArray[np.float32]]:
+def read_rows(path: Path | str | StandardInput) -> tuple[list[str], Rows]:
     """Names and values [N, len(names)] of a model's properties in the order of `model_names`.
 
     Raises InputError for anything that is not a whole, finite 3DGS model in binary or ascii PLY.
     """
-    names, rows = read_vertices(path, lambda found: _model_properties(found.keys(), path))
-    problem = settle(rows, names)
-    if problem:
+    whole = WholeTable()
+    return read_row_blocks(path, whole.begin), whole.rows
+
+
+def read_row_blocks(
+    path: Path | str | StandardInput, begin: Callable[[list[str], int], Callable[[int, Rows], None]]
+) -> list[str]:
+    """`read_rows` for some Gaussians at a time; `begin`: see `ply_table.read_vertex_blocks`."""
+    settled = Settled()
+
+    def begin_settled(names: list[str], count: int) -> Callable[[int, Rows], None]:
+        place = begin(names, count)
+
+        def settle_and_place(start: int, rows: Rows) -> None:
+            settled.settle(rows, names)
+            place(start, rows)
+
+        return settle_and_place
+
+    names = read_vertex_blocks(path, lambda found: _model_properties(found.keys(), path), begin_settled)
+    if problem := settled.problem(names):
         raise InputError(f"{path}: {problem}")
-    return names, rows
+    return names
 
 
 def _model_properties(found: Set[str], path: Path | str | StandardInput) -> list[str]:
@@ -60,19 +77,33 @@ def _model_properties(found: Set[str], path: Path | str | StandardInput) -> list
     raise InputError(f"{path}: {why}: properties missing: {', '.join(missing)}")
 
 
-def settle(rows: npt.NDArray[np.float32], names: list[str]) -> str | None:
-    """Clamp infinite opacity logits in place; say what is still wrong with the values, if anything."""
-    if len(rows) == 0:
-        return "it holds no Gaussians"
-    opacity = rows[:, names.index("opacity")]
-    opacity[np.isposinf(opacity)] = OPACITY_LOGIT_BOUND
-    opacity[np.isneginf(opacity)] = -OPACITY_LOGIT_BOUND
-    bad = np.count_nonzero(~np.isfinite(rows), axis=0)
-    wrong = [f"{name} in {count:,}" for name, count in zip(names, bad, strict=True) if count]
-    if not wrong:
-        return None
-    more = f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else ""
-    return f"NaN or infinite values among {len(rows):,} Gaussians: {', '.join(wrong[:5])}{more}"
+class Settled:
+    """What is wrong with the values of a model, which come some rows at a time."""
+
+    def __init__(self) -> None:
+        self._count, self._bad = 0, np.zeros(0, np.int64)
+
+    def settle(self, rows: Rows, names: list[str]) -> None:
+        """Clamp infinite opacity logits in place, and take notice of what is still not finite."""
+        self._count += len(rows)
+        if np.isfinite(rows).all():
+            return
+        opacity = rows[:, names.index("opacity")]
+        opacity[np.isposinf(opacity)] = OPACITY_LOGIT_BOUND
+        opacity[np.isneginf(opacity)] = -OPACITY_LOGIT_BOUND
+        if not len(self._bad):
+            self._bad = np.zeros(len(names), np.int64)
+        self._bad += np.count_nonzero(~np.isfinite(rows), axis=0)
+
+    def problem(self, names: list[str]) -> str | None:
+        """What is wrong with the values, if anything."""
+        if not self._count:
+            return "it holds no Gaussians"
+        wrong = [f"{name} in {count:,}" for name, count in zip(names, self._bad, strict=False) if count]
+        if not wrong:
+            return None
+        more = f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else ""
+        return f"NaN or infinite values among {self._count:,} Gaussians: {', '.join(wrong[:5])}{more}"
 
 
 def model_names(k: int) -> list[str]:

@@ -23,6 +23,8 @@ from keyss.files.streams import StandardInput
 if TYPE_CHECKING:
     from keyss.files.layout import PointCloud
 
+Rows = npt.NDArray[np.float32]
+
 MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
@@ -40,13 +42,38 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 
 def read_vertices(
     path: Path | str | StandardInput, choose: Callable[[dict[str, str]], list[str]]
-) -> tuple[list[str], npt.NDArray[np.float32]]:
+) -> tuple[list[str], Rows]:
     """The vertex properties that `choose` picks, and their values [N, len(names)] in that order.
 
+    See `read_vertex_blocks`.
+    """
+    whole = WholeTable()
+    return read_vertex_blocks(path, choose, whole.begin), whole.rows
+
+
+class WholeTable:
+    """What takes all vertices of `read_vertex_blocks`."""
+
+    def begin(self, names: list[str], count: int) -> Callable[[int, Rows], None]:
+        self.rows = np.empty((count, len(names)), np.float32)
+        return self._place
+
+    def _place(self, start: int, rows: Rows) -> None:
+        self.rows[start : start + len(rows)] = rows
+
+
+def read_vertex_blocks(
+    path: Path | str | StandardInput,
+    choose: Callable[[dict[str, str]], list[str]],
+    begin: Callable[[list[str], int], Callable[[int, Rows], None]],
+) -> list[str]:
+    """Read the vertex properties that `choose` picks, some vertices at a time; the names of these.
+
     `choose` gets the numpy codes of all scalar vertex properties by name ("f4", "u1", ...) and returns
-    names among them; it may raise InputError. Reads ascii and both binary byte orders; comments, other
-    elements and bytes after the data are ignored. Raises InputError for a file that is missing, damaged
-    or too short, and for list properties up to the vertices.
+    names among them; it may raise InputError. `begin` gets the names and the number of vertices, and returns
+    what takes the values [n, len(names)] of the vertices from a number on; it may keep and change them. Reads
+    ascii and both binary byte orders; comments, other elements and bytes after the data are ignored. Raises
+    InputError for a file that is missing, damaged or too short, and for list properties up to the vertices.
     """
     path = Path(path) if isinstance(path, str) else path
     if not path.is_file():
@@ -57,7 +84,12 @@ def read_vertices(
             *before, vertex = elements[: [each.name for each in elements].index("vertex") + 1]
             _check_no_list([*before, vertex], path)
             names = choose(vertex.properties)
-            return names, _read_rows(file, byte_order, before, vertex, names, path)
+            parts = _blocks(file, byte_order, before, vertex, names, path)
+            place, start = begin(names, vertex.count), 0
+            for rows in parts:
+                place(start, rows)
+                start += len(rows)
+            return names
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
@@ -168,15 +200,15 @@ def _header_lines(file: BinaryIO, path: Path | StandardInput) -> list[str]:
     raise InputError(f"{path}: header is longer than {MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines")
 
 
-def _read_rows(
+def _blocks(
     file: BinaryIO,
     byte_order: str | None,
     before: list[_Element],
     vertex: _Element,
     names: list[str],
     path: Path | StandardInput,
-) -> npt.NDArray[np.float32]:
-    """[N, len(names)] values of the vertices. Raises InputError when the file is too short for them."""
+) -> Iterator[Rows]:
+    """[n, len(names)] values of some vertices at a time. Raises InputError when the file is too short."""
     start = file.tell()
     left = file.seek(0, os.SEEK_END) - start
     file.seek(start)
@@ -189,44 +221,52 @@ def _read_rows(
         needed = skipped + vertex.count * vertex.stride
     _check_size(needed, left, vertex, path)
     if byte_order is None:
-        return _read_ascii(file, skipped, vertex, names, path)
+        return _ascii_blocks(file, skipped, vertex, names, path)
     file.seek(skipped, os.SEEK_CUR)
+    return _binary_blocks(file, byte_order, vertex, names, path)
+
+
+def _binary_blocks(
+    file: BinaryIO, byte_order: str, vertex: _Element, names: list[str], path: Path | StandardInput
+) -> Iterator[Rows]:
     dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
-    rows = np.empty((vertex.count, len(names)), dtype=np.float32)
-    step = max(1, _CHUNK_BYTES // vertex.stride)
+    plain = set(vertex.properties.values()) == {"f4"}
+    columns = [list(vertex.properties).index(name) for name in names]
+    step = max(1, _CHUNK_BYTES // max(1, vertex.stride))
     for start in range(0, vertex.count, step):
-        part = rows[start : start + step]
-        data = file.read(len(part) * vertex.stride)
-        if len(data) != len(part) * vertex.stride:
+        count = min(step, vertex.count - start)
+        data = file.read(count * vertex.stride)
+        if len(data) != count * vertex.stride:
             raise InputError(f"{path}: not a whole .ply file: it ends inside the data")
-        chunk = np.frombuffer(data, dtype=dtype)
+        if plain:
+            table = np.frombuffer(data, byte_order + "f4").reshape(count, -1)
+            yield table.take(columns, axis=1).astype(np.float32, copy=False)
+            continue
+        chunk, rows = np.frombuffer(data, dtype=dtype), np.empty((count, len(names)), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is reported as infinite
             for column, name in enumerate(names):
-                part[:, column] = chunk[name]
-    return rows
+                rows[:, column] = chunk[name]
+        yield rows
 
 
-def _read_ascii(
+def _ascii_blocks(
     file: BinaryIO, skipped: int, vertex: _Element, names: list[str], path: Path | StandardInput
-) -> npt.NDArray[np.float32]:
+) -> Iterator[Rows]:
     """The values in text, after `skipped` values. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
     columns = [list(vertex.properties).index(name) for name in names]
-    rows = np.empty((vertex.count, len(names)), dtype=np.float32)
     step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
     tokens = _tokens(file)
     try:
         for _ in range(skipped):
             next(tokens)
         for start in range(0, vertex.count, step):
-            part = rows[start : start + step]
-            count = len(part) * width
+            count = min(step, vertex.count - start) * width
             values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=count)
             with np.errstate(over="ignore"):
-                part[:] = values.reshape(len(part), width)[:, columns]
+                yield values.reshape(-1, width)[:, columns].astype(np.float32)
     except (StopIteration, ValueError) as error:
         raise InputError(f"{path}: the ascii data are cut short or hold something not a number") from error
-    return rows
 
 
 def _tokens(file: BinaryIO) -> Iterator[bytes]:

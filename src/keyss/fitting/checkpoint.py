@@ -63,6 +63,30 @@ def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimize
         parameters[name] = parameter
 
 
+def pack_network(prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> State:
+    """Weights and Adam moments of a network that `optimizer` trains and nothing else."""
+    state: State = {f"{prefix}.{name}": value for name, value in network.state_dict().items()}
+    for index, moments in optimizer.state_dict()["state"].items():
+        state |= {f"{prefix}_adam.{index}.{name}": value for name, value in moments.items()}
+    return state
+
+
+def unpack_network(
+    state: State, prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer
+) -> None:
+    """Put back what `pack_network` gave."""
+    start = f"{prefix}."
+    network.load_state_dict(
+        {name.removeprefix(start): value for name, value in state.items() if name.startswith(start)}
+    )
+    adam = optimizer.state_dict()
+    for name, value in state.items():
+        if name.startswith(f"{prefix}_adam."):
+            index, key = name.removeprefix(f"{prefix}_adam.").split(".")
+            adam["state"].setdefault(int(index), {})[key] = value
+    optimizer.load_state_dict(adam)
+
+
 def pack_density(state: Mapping[str, Any]) -> State:
     """The running statistics of a strategy."""
     return {f"density.{key}": value for key, value in state.items() if isinstance(value, Tensor)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,9 @@ from torch import Tensor
 
 from keyss.fitting.config import FitConfig
 from keyss.fitting.parameters import Optimizers, Parameters
+
+# A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
+Drawn = tuple[dict[str, Any], Tensor | None, float]
 
 
 class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
@@ -66,3 +69,25 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         if 0 < count < len(pruned):
             remove(params=params, optimizers=optimizers, state=state, mask=pruned)
         return count
+
+
+def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
+    """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
+
+    `drawn` holds for each render its meta, the indices of the Gaussians it was made of (None: all
+    `count`), and the weight of its loss, by which its gradients are divided to be as large as those that
+    the thresholds of plain 3DGS are meant for.
+    """
+    device = drawn[0][0]["means2d"].device
+    gradients = torch.zeros(len(drawn), count, 2, device=device)
+    radii = torch.zeros(len(drawn), count, 2, device=device)
+    width, height = drawn[0][0]["width"], drawn[0][0]["height"]
+    for row, (meta, indices, weight) in enumerate(drawn):
+        where = slice(None) if indices is None else indices
+        size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
+        gradients[row, where] = meta["means2d"].grad[0] * (size / weight)
+        radii[row, where] = meta["radii"][0].float()
+    means2d = torch.zeros_like(gradients)
+    means2d.grad = gradients
+    batch = {"width": width, "height": height, "n_cameras": 1, "gaussian_ids": None}
+    return {"means2d": means2d, "radii": radii, **batch}

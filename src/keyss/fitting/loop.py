@@ -8,13 +8,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.core.errors import Interrupted as Interrupted
+from keyss.core.gaussians import Gaussians
 from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
 
 _ENDING = tuple(
@@ -64,6 +65,30 @@ class Reporter(Protocol):
 
     def finish(self) -> None:
         """The work is done, or was interrupted."""
+
+
+@runtime_checkable
+class Modelled(Protocol):
+    """A run that trains a model which can be looked at."""
+
+    def gaussians(self) -> Gaussians:
+        """The model as it is now; later steps change its tensors."""
+
+
+@runtime_checkable
+class ModelReporter(Protocol):
+    """A reporter that looks at the model, too."""
+
+    def look(self, model: Callable[[], Gaussians]) -> None:
+        """A step is done; `model` gives what it came to, see `Modelled`."""
+
+    def of_secret(self) -> Reporter:
+        """The same reporter, for the training of a secret's model."""
+
+
+def of_secret(reporter: Reporter | None) -> Reporter | None:
+    """What the training of a secret's model reports to."""
+    return reporter.of_secret() if isinstance(reporter, ModelReporter) else reporter
 
 
 class SilentReporter:
@@ -120,6 +145,8 @@ def train(
                 raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
         started = saved = time.monotonic()
         numbers: dict[str, float] = {}
+        look = reporter.look if isinstance(reporter, ModelReporter) else None
+        model = run.gaussians if isinstance(run, Modelled) else None
         reporter.start(title, run.iterations, run.iteration)
 
         def save() -> None:
@@ -139,6 +166,8 @@ def train(
                 if reporter.loss_every and run.iteration % reporter.loss_every == 0:
                     told = numbers | {"loss": float(run.loss)}
                 reporter.update(run.iteration, len(run), told)
+                if look and model:
+                    look(model)
                 if (signum := interrupted()) is not None:
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)

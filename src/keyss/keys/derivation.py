@@ -12,6 +12,7 @@ import unicodedata
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from argon2.exceptions import HashingError
 from argon2.low_level import Type, hash_secret_raw
@@ -28,6 +29,7 @@ SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
 MAX_KEY_BYTES = 4096
+_STREAM_BLOCK = 1 << 16  # bytes that are made at a time
 
 
 TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4
@@ -71,8 +73,18 @@ def expand(secret: bytes, label: str, length: int) -> bytes:
 
 def stream(secret: bytes, label: str, length: int) -> bytes:
     """The same for more bytes than HKDF gives: the key stream of ChaCha20 (RFC 8439) under a derived key."""
-    cipher = Cipher(ChaCha20(expand(secret, label, 32), bytes(16)), mode=None)
-    return cipher.encryptor().update(bytes(length))
+    data = np.empty(length, np.uint8)
+    fill(secret, label, data)
+    return data.tobytes()
+
+
+def fill(secret: bytes, label: str, data: npt.NDArray[np.uint8]) -> None:
+    """Overwrite contiguous `data` with what `stream` gives."""
+    encryptor = Cipher(ChaCha20(expand(secret, label, 32), bytes(16)), mode=None).encryptor()
+    flat, zeros = data.reshape(-1).data, bytes(_STREAM_BLOCK)
+    for start in range(0, len(flat), _STREAM_BLOCK):
+        part = flat[start : start + _STREAM_BLOCK]
+        encryptor.update_into(zeros[: len(part)], part)
 
 
 class DerivedKey:

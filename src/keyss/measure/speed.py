@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.ply import read_ply, write_ply
+from keyss.files.models import DECODED_SUFFIX, read_model, write_model
+from keyss.files.ply import read_ply
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_package, transform
 from keyss.measure.robustness.survival import Reopen
@@ -90,10 +92,11 @@ def speed(
                 progress(number, len(names), name)
             file = stego
             if number > 0:
-                file = Path(folder) / f"{number}.ply"
+                decoded = isinstance(reopen[number - 1](read_model(stego)).gaussians, DecodedGaussians)
+                file = Path(folder) / f"{number}{DECODED_SUFFIX if decoded else '.ply'}"
                 revealed.append(reveal_seconds(stego, reopen[number - 1], file))
             files.append(FileSize(name, file.stat().st_size))
-            model = read_ply(file).to(device)
+            model = read_model(file).to(device)
             rendered.append(render_time(name, model, plain.to(device), scene, rounds=rounds))
             read += [replace(each, file=name) for each in readers(file)]
     if progress is not None:
@@ -132,16 +135,20 @@ def reveal_seconds(stego: Path, reopen: Reopen, out: Path, *, repeats: int = 3) 
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        write_ply(out, reopen(read_ply(stego)).gaussians)
+        write_model(out, reopen(read_model(stego)).gaussians)
         seconds.append(time.perf_counter() - start)
     return median(seconds)
 
 
 def readers(path: Path) -> list[ReaderResult]:
-    """Whether other people's programs read a .ply of ours: plyfile, gsply and splat-transform."""
+    """Whether other people's programs read a model of ours: plyfile, gsply and splat-transform."""
+    programs = (("plyfile", _plyfile), ("gsply", _gsply), ("splat-transform", _splat_transform))
+    if path.name.endswith(DECODED_SUFFIX):
+        note = "a network makes its pictures: it is no 3DGS model"
+        return [ReaderResult(name, path.name, False, note=note) for name, _ in programs]
     expected = _columns_of(read_ply(path))
     found: list[ReaderResult] = []
-    for name, read in (("plyfile", _plyfile), ("gsply", _gsply), ("splat-transform", _splat_transform)):
+    for name, read in programs:
         try:
             columns = read(path)
         except BackendError as error:

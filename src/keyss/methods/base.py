@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, Self
 import torch
 from torch import Tensor
 
-from keyss.channels.base import Content
+from keyss.channels.base import Content, Payload
 from keyss.channels.rooms import AnyChannel, Publish
 from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
@@ -133,6 +133,18 @@ class Stego:
     seconds: float  # of hiding alone, without plain models
     iterations: int = 0  # of the method's own training
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of its own, for metrics.json
+    verified: bool = False  # whether `opened` was read from `gaussians` with the keys
+    handed: tuple[Payload, ...] = ()  # for each secret what is handed over, where the method does that
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capabilities:
+    """What a method can do; what it cannot is said where it is asked for, and in comparisons."""
+
+    keys: bool = True  # a key opens each secret; else whoever has what is handed over sees it
+    hands_over: bool = False  # there is a file for each secret beside the published model
+    standard: bool = True  # what is published is a 3DGS model, which every viewer draws
+    models: bool = True  # and so is what a secret is revealed as; else a network makes its pictures
 
 
 @dataclass(frozen=True)
@@ -194,6 +206,10 @@ class Method(Protocol):
         """How many secrets one model can have."""
 
     @property
+    def capabilities(self) -> Capabilities:
+        """What it can and cannot do."""
+
+    @property
     def options(self) -> type[MethodOptions]:
         """The class of its options."""
 
@@ -217,7 +233,7 @@ class Method(Protocol):
         """
 
     def unpack(self, content: Content) -> Opened:
-        """The secret that lies in what a channel gave. Raises InputError for damage."""
+        """The secret in what a channel gave or what was handed over. Raises InputError for damage."""
 
 
 @contextmanager

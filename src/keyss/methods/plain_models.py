@@ -8,6 +8,7 @@ from dataclasses import replace
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
+from keyss.fitting.loop import of_secret
 from keyss.fitting.plain import fit_scene
 from keyss.methods.base import Context
 
@@ -36,7 +37,7 @@ def plain_models(
                 title=f"plain model of the {role} ({scene.name})",
                 checkpoint=folder / f"plain-{index}.safetensors" if folder else None,
                 resume=context.resume,
-                reporter=context.reporter,
+                reporter=context.reporter if index == 0 else of_secret(context.reporter),
             ).gaussians
         models.append(model)
     return models

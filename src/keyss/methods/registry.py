@@ -7,7 +7,7 @@ from keyss.channels.base import Content
 from keyss.channels.opening import open_content, quick_attempts
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.methods import hidden_file
+from keyss.methods import handed, hidden_file
 from keyss.methods.base import Method, MethodOptions, Opened
 from keyss.methods.carry.method import CarryMethod
 from keyss.methods.carry.options import CarryOptions as CarryOptions
@@ -15,8 +15,9 @@ from keyss.methods.decoy import Decoy
 from keyss.methods.hidden_file import HiddenFile
 from keyss.methods.learned.method import LearnedMethod
 from keyss.methods.learned.options import LearnedOptions as LearnedOptions
+from keyss.methods.peers import PEERS
 
-METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod())}
+METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod(), *PEERS)}
 
 
 def get(name: str) -> Method:
@@ -49,6 +50,14 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
         except WrongKeyError:
             return Decoy.of(stego, derived, appended=isinstance(reader, AppendedReader))
     raise WrongKeyError("this key opens nothing here")
+
+
+def open_handed(data: bytes, key: str | None) -> Opened:
+    """The secret in a file that was handed over (see `keyss.methods.handed`).
+
+    Raises UsageError for a key where none is needed or the other way round, WrongKeyError, InputError.
+    """
+    return _unpacked(handed.unpack(data, key))
 
 
 def _unpacked(content: Content) -> Opened:

@@ -7,6 +7,8 @@ from typing import Any
 from torch import Tensor
 
 from keyss.core import Camera, Gaussians
+from keyss.core.decoded import DecodedGaussians
+from keyss.rendering.decoding import draw_decoded
 from keyss.rendering.rasterize import rasterization
 
 
@@ -16,8 +18,8 @@ def render(
     """The picture [H, W, 3] that the camera takes; 0 is black, 1 is white, and it is not clamped above.
 
     `background` [3] lies behind everything, black when None. `sh_degree` limits the spherical harmonics
-    (default: all that the Gaussians have). Drawn on the device of the Gaussians; differentiable. Raises
-    what `rasterization` raises.
+    (default: all that the Gaussians have). What a network decodes has a background of its own. Drawn on the
+    device of the Gaussians; differentiable. Raises what `rasterization` raises.
     """
     return render_with_meta(gaussians, camera, background, sh_degree=sh_degree)[0]
 
@@ -26,6 +28,8 @@ def render_with_meta(
     gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
 ) -> tuple[Tensor, dict[str, Any]]:
     """Like `render`, with the meta of `rasterization` for this one camera and `alpha` [H, W] in it."""
+    if isinstance(gaussians, DecodedGaussians):
+        return draw_decoded(gaussians, camera, sh_degree)
     device = gaussians.device
     images, alphas, meta = rasterization(
         gaussians.means,

@@ -10,21 +10,25 @@ from itertools import zip_longest
 from pathlib import Path, PurePath
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
 from keyss.measure.images import ImageComparison
 from keyss.measure.robustness.survival import mean_over_draws
 from keyss.report import numbers
+from keyss.report.published import Published, published_model
 from keyss.report.untrusted import AuditPictures, check_bounds, clean, flat
 from keyss.report.verdicts import auc_text, detector_rocs, headline, missing_readers, verdicts, worst_leak
 from keyss.runs.audit_record import Audit, ImagesResult, read_audit
-from keyss.runs.files import REPORT
+from keyss.runs.files import REPORT, stego_in
 from keyss.runs.folder import write_again
+from keyss.viewer.page import embedding_rules
 
 _STYLES = ("page.css", "pictures.css", "print.css")
 _HOW = "`keyss audit RUN --key-file KEY` measures it"
+_NO_MODEL = "what this method publishes is no 3DGS model"
+_OF_3DGS_MODELS = ("Leaks without the key", "The file by itself", "Statistics of the model", "Robustness")
 _EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and audits after it have it"
 
 
@@ -32,31 +36,33 @@ def write_report(run_folder: Path | str) -> Path:
     """Write RUN/private/report.html from RUN/private/audit, atomically, and return its path.
 
     One file that needs no network: pictures, figures, style and script are in it, and so it shows the secret.
-    The same audit gives the same bytes. Raises InputError when there is no audit, or it is broken, too large
-    or names pictures outside its folder; OutputError when the file cannot be written.
+    The published model is in it as well, in the viewer, where it is not too large: see `published_model`.
+    The same audit of the same model gives the same bytes. Raises InputError when there is no audit, or it is
+    broken, too large or names pictures outside its folder; OutputError when the file cannot be written.
     """
     run = Path(run_folder)
-    data = report_bytes(read_audit(run), run)
+    data = report_bytes(read_audit(run), run, stego_in(run))
     write_again(run, "audit", REPORT, partial(write_bytes, data=data))
     return run / REPORT
 
 
-def report_bytes(audit: Audit, folder: Path) -> bytes:
+def report_bytes(audit: Audit, folder: Path, published: Path) -> bytes:
     """The file's content; pictures are in `folder`, laid out as in a run's. Raises InputError."""
     try:
         check_bounds(audit)
     except RecursionError as error:
         raise InputError(f"{folder}: the audit's configuration is nested too deeply") from error
-    return page(audit, AuditPictures(folder)).encode()
+    return page(audit, AuditPictures(folder), published_model(published, audit.run.up)).encode()
 
 
-def page(audit: Audit, pictures: AuditPictures) -> str:
+def page(audit: Audit, pictures: AuditPictures, published: Published) -> str:
     """A whole HTML document. Raises InputError for pictures and curves that are not as they should be."""
     script = _asset("slider.js")
     lines, notes = verdicts(audit), _not_measured(audit)
     found = {  # section by section: its title, and whether there is anything in it
         "verdict": ("Verdict", lines),
         "pictures": ("Pictures", audit.images and audit.images.pictures),
+        "published": ("The published model", published),
         "images": (f"Against the test {'photos' if all(audit.run.photos) else 'views'}", audit.images),
         "wrong-keys": ("Wrong keys", audit.wrong_key),
         "leaks": ("Leaks without the key", audit.leaks),
@@ -76,6 +82,7 @@ def page(audit: Audit, pictures: AuditPictures) -> str:
             title=_title(audit),
             sections={name: title for name, (title, content) in found.items() if content},
             pictures=pictures,
+            published=published,
             lines=lines,
             headline=headline(lines),
             notes=notes,
@@ -86,9 +93,25 @@ def page(audit: Audit, pictures: AuditPictures) -> str:
             changes=mean_over_draws(audit.robustness.changes) if audit.robustness else [],
             style=Markup("".join(map(_asset, _STYLES))),
             script=Markup(script),
-            script_digest=b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+            policy=_policy(script, viewer=published.page is not None),
         )
     )
+
+
+def _policy(script: str, *, viewer: bool) -> str:
+    """Should markup ever slip through the escaping, browsers run no other scripts and fetch nothing."""
+    rules = {
+        "default-src": "'none'",
+        "img-src": "data:",
+        "style-src": "'unsafe-inline'",
+        "script-src": f"'sha256-{b64encode(hashlib.sha256(script.encode()).digest()).decode()}'",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+    if viewer:  # whose frame inherits these, and has stricter ones of its own
+        more = embedding_rules()
+        rules |= more | {"script-src": f"{rules['script-src']} {more['script-src']}"}
+    return "; ".join(f"{name} {sources}" for name, sources in rules.items())
 
 
 def prose(text: str) -> Markup:
@@ -97,6 +120,11 @@ def prose(text: str) -> Markup:
     return Markup("").join(
         code.format(part) if i % 2 else part for i, part in enumerate(clean(text).split("`"))
     )
+
+
+def escaped(page: str) -> Markup:
+    """A whole page as an attribute; unlike texts of others it keeps its length and all characters."""
+    return escape(page)
 
 
 def _environment() -> Environment:
@@ -108,7 +136,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    formats = [*filter(callable, vars(numbers).values()), auc_text, flat, prose]
+    formats = [*filter(callable, vars(numbers).values()), auc_text, escaped, flat, prose]
     environment.filters |= {each.__name__: each for each in formats}
     from keyss.report import figures  # matplotlib takes a second, and few who hide write a report
 
@@ -156,8 +184,9 @@ def _not_measured(audit: Audit) -> list[str]:
         "Speed, files and readers": audit.speed,
     }
     notes = [
-        f"{name}: {_EVALUATE if name == 'Wrong keys' else _HOW}."
+        f"{name}: {_NO_MODEL if name in _OF_3DGS_MODELS and not audit.run.standard else how}."
         for name, found in parts.items()
+        for how in (_EVALUATE if name == "Wrong keys" else _HOW,)
         if not found
     ]
     if audit.stegexpose and audit.stegexpose.sealwatch_missing:

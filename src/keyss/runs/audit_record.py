@@ -38,8 +38,10 @@ class AuditedRun:
     width: int | None  # pixels to which photos were shrunk
     gaussians: int  # of the stego model
     photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
+    standard: bool = True  # whether what is published is a 3DGS model
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
+    up: str = "-y"  # the way up in the cover: "-y", "z" or "y"
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from keyss.channels.codes.published import SUFFIXES, suffix_of
+from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
-from keyss.files.models import write_model
+from keyss.files.models import DECODED_SUFFIX, write_model
+from keyss.methods.handed import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
 from keyss.runs.records import record_bytes
 
 STEGO = f"{PUBLISH}/stego.ply"
-STEGOS = (STEGO, *(f"{PUBLISH}/stego{suffix}" for suffix in SUFFIXES.values()))  # whatever the format
+# Whatever the format.
+STEGOS = (STEGO, *(f"{PUBLISH}/stego{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
 MODEL = "model.ply"  # of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
+HANDED = f"{PRIVATE}/hand-over"  # for those who are to see a secret, and nobody else
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 
 
@@ -35,6 +39,8 @@ def model_in(folder: Path) -> Path | None:
 
 def stego_name(stego: Gaussians) -> str:
     """What the file of a published model is called in the folder of a run."""
+    if isinstance(stego, DecodedGaussians):
+        return f"{PUBLISH}/stego{DECODED_SUFFIX}"
     return f"{PUBLISH}/stego{suffix_of(stego)}"
 
 
@@ -69,6 +75,11 @@ def run_folder(path: Path) -> Path:
 def plain_names(secrets: int) -> list[str]:
     """Files of the plain models of the cover and of so many secrets."""
     return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
+
+
+def handed_names(secrets: int) -> list[str]:
+    """Files that are handed over for so many secrets, by methods that do so."""
+    return [f"{HANDED}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]
 
 
 def writers(contents: Mapping[str, Any]) -> dict[str, Callable[[Path], None]]:

@@ -8,17 +8,29 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.foreign import what_it_is
 from keyss.files.models import known_suffixes, read_model
+from keyss.files.reading import read_file
 from keyss.files.scenes import load_scene
-from keyss.methods import registry
+from keyss.measure.robustness.survival import Reopener
+from keyss.methods import handed, registry
 from keyss.methods.base import MethodOptions, Opened
 from keyss.rendering.orbit import is_model, scene_of_model
 from keyss.runs.config import Background, PathLike, RunConfig, read_config, secret_ids
-from keyss.runs.files import CONFIG, METRICS, is_run, model_in, plain_names, run_folder, stego_in
+from keyss.runs.files import (
+    CONFIG,
+    METRICS,
+    handed_names,
+    is_run,
+    model_in,
+    plain_names,
+    run_folder,
+    stego_in,
+)
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 
@@ -38,8 +50,15 @@ class HidingRun:
     metrics: HideMetrics
     stego: Gaussians
     opened: tuple[Opened, ...]  # in the order of the secrets
-    keys: tuple[str, ...] = field(repr=False)  # in the same order
+    keys: tuple[str, ...] = field(repr=False)  # in the same order; "" where the method has none
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
+
+    @property
+    def reopeners(self) -> list[Reopener]:
+        """What opens the secrets in a changed model; what was handed over does not change."""
+        if registry.get(self.config.method).capabilities.hands_over:
+            return [Reopener("", lambda stego, key, own=own: own) for own in self.opened]  # type: ignore[misc]
+        return [Reopener(key, registry.open_model) for key in self.keys]
 
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
         """The cover and the secrets with their photos, or with pictures of the models that they are."""
@@ -76,15 +95,40 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego = read_model(stego_in(folder))
-    every = [open_in(stego, key) for key in keys]
+    capabilities = registry.get(config.method).capabilities
+    if not capabilities.keys:
+        if keys:
+            raise UsageError(f"the method {config.method} has no keys: give none")
+        keys = [""] * len(config.payloads)
+    if capabilities.hands_over:
+        every = [
+            read_handed(folder / name, key or None)
+            for name, key in zip(handed_names(len(config.payloads)), keys, strict=False)
+        ]
+    else:
+        every = [open_in(stego, key) for key in keys]
     names = secret_ids(config.options.fit.known_seed, every)
-    found = dict(zip(names, zip(every, keys, strict=True), strict=True))
+    found = dict(zip(names, zip(every, keys, strict=False), strict=True))
     if set(found) != set(config.payloads):
         raise UsageError(
             f"expected the keys of all {len(config.payloads)} secret(s), got {len(found)} of them"
         )
     secrets, own = zip(*(found[each] for each in config.payloads), strict=True)
     return HidingRun(folder, config, metrics, stego, secrets, own, sources)
+
+
+def read_handed(path: PathLike, key: str | None) -> Opened:
+    """The secret in a file that was handed over; see `registry.open_handed`."""
+    data = read_file(Path(path), handed.MOST_BYTES)
+    try:
+        return registry.open_handed(data, key)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def is_sealed(path: PathLike) -> bool:
+    """Whether it takes a key to open a file that was handed over. Raises InputError."""
+    return handed.is_sealed(read_file(Path(path), handed.MOST_BYTES))
 
 
 def open_in(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
@@ -141,3 +185,11 @@ def as_model(source: PathLike | Gaussians) -> Gaussians:
     if inside := model_in(Path(source)):
         raise InputError(f"{source}: expected the file of a 3DGS model, found a folder; give {inside}")
     return read_model(source)
+
+
+def as_3dgs_model(source: PathLike | Gaussians, what: str) -> Gaussians:
+    """`as_model`, and UsageError where a network makes its pictures."""
+    found = as_model(source)
+    if isinstance(found, DecodedGaussians):
+        raise UsageError(f"a network makes the pictures of {what}'s model: expected a 3DGS model")
+    return found

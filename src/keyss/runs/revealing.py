@@ -7,10 +7,11 @@ from typing import TypedDict
 
 import torch
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Frame, Remains
-from keyss.runs.opening import open_in
+from keyss.runs.config import PathLike
+from keyss.runs.opening import open_in, read_handed
 
 # Pruning compensation makes up for nine tenths at most (`keyss.core.pruning_compensation`): below that the
 # pictures of what is left get emptier and emptier.
@@ -48,19 +49,28 @@ class RevealOptions(TypedDict, total=False):
     frame: Frame
     decoy: bool
     force: bool
+    handed: PathLike | None
 
 
 def reveal_model(
     model: Gaussians,
-    key: str,
+    key: str | None,
     *,
     device: torch.device,
     frame: Frame = "secret",
     decoy: bool = False,
     force: bool = False,
+    handed: PathLike | None = None,
 ) -> RevealResult:
     """What `key` opens in a stego model, however little it is; see `keyss.api.reveal`, also for errors."""
-    opened = open_in(model, key, decoy=decoy)
+    if handed is not None:
+        if decoy:
+            raise UsageError("there are no decoys of what was handed over: leave out `decoy=True`")
+        opened = read_handed(handed, key)
+    elif key is None:
+        raise UsageError("nothing to open it with: give `key`, or `handed` for a file that was handed over")
+    else:
+        opened = open_in(model, key, decoy=decoy)
     revealed = opened.reveal(model.to(device), frame=frame, force=force)
     remains = opened.remains(revealed)
     return RevealResult(revealed, remains, tuple(_loss(remains)))

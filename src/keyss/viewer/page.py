@@ -13,16 +13,14 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
-from keyss.core.errors import OutputError, UsageError
+from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.files.atomic import write_bytes
 from keyss.files.output import check_not_an_input, check_output_file
-from keyss.files.reading import read_file
+from keyss.viewer.showing import shown
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
 MOST_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers take text of 512 MiB, and time for it
 MOST_BYTES = 2 << 30
-# What the page reads, by the first bytes.
-_MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 # Argon2id is WebAssembly; workers, and pictures that are saved, come from blobs that the page makes itself.
 _WASM, _SELF = "'wasm-unsafe-eval'", "'self'"
 _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
@@ -36,13 +34,12 @@ def served_policy() -> str:
 
 def page_beside(model: str, up: str = "-y") -> bytes:
     """The page for `model`, the address of a file beside it; style and script lie beside it too."""
-    return _page(
-        policy=served_policy(),
-        style=f'<link rel="stylesheet" href="{STYLE}">',
-        model=f'<meta name="keyss-model" content="{html.escape(model)}">',
-        script=f'<script src="{SCRIPT}"></script>',
-        up=up,
-    )
+    return _served("keyss-model", model, up)
+
+
+def page_live(state: str, up: str = "-y") -> bytes:
+    """The page for a training that goes on; `state`: the address of what `keyss.viewer.live` says of it."""
+    return _served("keyss-live", state, up)
 
 
 def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
@@ -60,18 +57,31 @@ def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
     )
 
 
+def embedding_rules() -> dict[str, str]:
+    """What the policy of a page that has `page_with` in a frame has to allow: sources by directive."""
+    script = f"{_hash(asset(SCRIPT).decode())} {_WASM}"
+    return {"script-src": script, "worker-src": "blob:", "img-src": "blob: data:"}
+
+
 def export_html(
     model: Path | str, out: Path | str, *, up: str = "-y", overwrite: bool = False
 ) -> tuple[Path, ...]:
     """Write the viewer with the published `model`: one file, or a folder where `out` does not end in .html.
 
     One file opens from disk; a folder, for larger models, has to be served. `up`: "-y", as captures made with
-    COLMAP have it, "z" or "y". Returns what was written.
-    Raises UsageError for a model that the page cannot read or that is too large, InputError, OutputError.
+    COLMAP have it, "z" or "y". A model of a format that the page does not read is converted, with a
+    KeyssWarning. Returns what was written.
+    Raises UsageError for a model that is too large, InputError for what is none, OutputError.
     """
     model, out = Path(model), Path(out)
-    data = read_file(model, MOST_BYTES)
-    check_shown(model, data)
+    found = shown(model)
+    if found.bytes > MOST_BYTES:
+        raise UsageError(f"{model} has {found.bytes:,} bytes, and a page takes {MOST_BYTES:,}")
+    try:
+        with found.open() as file:
+            data = file.read()
+    except OSError as error:
+        raise InputError(f"{model}: cannot be read: {error.strerror}") from error
     if out.suffix.lower() in (".html", ".htm"):
         if len(data) > MOST_IN_ONE_FILE:
             raise UsageError(
@@ -79,9 +89,9 @@ def export_html(
                 "for the output, which a web server can serve"
             )
         check_not_an_input(out, [model])
-        write_bytes(check_output_file(out, overwrite), page_with(data, model.name, up))
+        write_bytes(check_output_file(out, overwrite), page_with(data, found.name, up))
         return (out,)
-    contents = {INDEX: page_beside(quote(model.name), up), model.name: data}
+    contents = {INDEX: page_beside(quote(found.name), up), found.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
     if len(contents) < 5:
         raise UsageError(f"{model} has the name of a file of the viewer: give it another one")
@@ -97,15 +107,19 @@ def export_html(
     return tuple(out / name for name in contents)
 
 
-def check_shown(model: Path, start: bytes) -> None:
-    """Raise UsageError for a file that the page cannot read, by its first bytes."""
-    if not start.startswith(_MAGIC):
-        raise UsageError(f"{model}: the page shows .ply, .spz and .sog; `keyss convert` makes one of others")
-
-
 def asset(name: str) -> bytes:
     """A file of the built application."""
     return files("keyss.viewer").joinpath("assets", name).read_bytes()
+
+
+def _served(name: str, content: str, up: str) -> bytes:
+    return _page(
+        policy=served_policy(),
+        style=f'<link rel="stylesheet" href="{STYLE}">',
+        model=f'<meta name="{name}" content="{html.escape(content)}">',
+        script=f'<script src="{SCRIPT}"></script>',
+        up=up,
+    )
 
 
 def _page(*, up: str = "-y", **parts: str) -> bytes:

@@ -1,9 +1,9 @@
-"""The page and one model over HTTP, for this machine unless told otherwise."""
+"""The page over HTTP, for this machine unless told otherwise: with one model, or whatever else is given."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
@@ -11,24 +11,36 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
-from keyss.core.errors import InputError, OutputError
-from keyss.files.reading import read_file
-from keyss.viewer.page import SCRIPT, STYLE, asset, check_shown, page_beside, served_policy
+from keyss.core.errors import OutputError
+from keyss.viewer.page import SCRIPT, STYLE, asset, page_beside, served_policy
+from keyss.viewer.showing import shown
 
 LOCALHOST = "127.0.0.1"
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}
-_START_BYTES = 16
+# What is given out at an address: its type, and what opens it or raises OSError.
+Contents = Mapping[str, tuple[str, Callable[[], BinaryIO]]]
 
 
-class ModelServer:
-    """A server of the viewer and one model. Nothing else is given out, whatever is asked."""
+class PageServer:
+    """A server of the page and of `contents`. Nothing else is given out, whatever is asked."""
 
-    def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0, up: str = "-y") -> None:
-        """`port` 0: any that is free. Raises InputError, UsageError, and OutputError where it is in use."""
-        self.model = Path(model)
-        read_file_start(self.model)
+    def __init__(
+        self, page: bytes, contents: Contents, host: str = LOCALHOST, port: int = 0, folder: str = "/"
+    ) -> None:
+        """`port` 0: any that is free. `folder`: where all of it lies, between slashes.
+
+        Raises OutputError for a port in use.
+        """
+        application: Contents = {
+            "": ("text/html; charset=utf-8", lambda: BytesIO(page)),
+            SCRIPT: ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
+            STYLE: ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
+        }
+        everything = {folder + name: content for name, content in {**application, **contents}.items()}
+        everything["/favicon.ico"] = ("image/x-icon", lambda: BytesIO())
+        self._folder = folder
         try:
-            self._server = ThreadingHTTPServer((host, port), _handler(self.model, up, host in _LOCAL_NAMES))
+            self._server = ThreadingHTTPServer((host, port), _handler(everything, host in _LOCAL_NAMES))
         except (OSError, OverflowError) as error:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
@@ -37,7 +49,7 @@ class ModelServer:
     def address(self) -> str:
         """Where the page is."""
         host, port = self._server.server_address[:2]
-        return f"http://{host!s}:{port}/"
+        return f"http://{host!s}:{port}{self._folder}"
 
     def run(self) -> None:
         """Serve until `close` is called by another thread, or a signal ends it."""
@@ -50,27 +62,20 @@ class ModelServer:
         self._server.shutdown()
 
 
-def read_file_start(model: Path) -> None:
-    """Raise InputError or UsageError for what is no file that the page can show."""
-    if not model.is_file():
-        read_file(model)  # says what it is
-    try:
-        with model.open("rb") as file:
-            check_shown(model, file.read(_START_BYTES))
-    except OSError as error:
-        raise InputError(f"{model}: cannot be read: {error.strerror}") from error
+class ModelServer(PageServer):
+    """A server of the page and one model."""
+
+    def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0, up: str = "-y") -> None:
+        """`port` 0: any that is free. Warns (KeyssWarning) of a model that is converted for the page.
+
+        Raises InputError for what is no model, and OutputError for a port in use.
+        """
+        found = shown(Path(model))
+        page = page_beside(f"model/{quote(found.name)}", up)
+        super().__init__(page, {f"model/{found.name}": ("application/octet-stream", found.open)}, host, port)
 
 
-def _handler(model: Path, up: str, local: bool) -> type[BaseHTTPRequestHandler]:
-    own = f"/model/{model.name}"
-    contents: dict[str, tuple[str, Callable[[], BinaryIO]]] = {
-        "/": ("text/html; charset=utf-8", lambda: BytesIO(page_beside(f"model/{quote(model.name)}", up))),
-        f"/{SCRIPT}": ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
-        f"/{STYLE}": ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
-        own: ("application/octet-stream", lambda: model.open("rb")),
-        "/favicon.ico": ("image/x-icon", lambda: BytesIO()),
-    }
-
+def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         server_version, sys_version = "keyss", ""
         timeout = 30

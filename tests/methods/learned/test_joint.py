@@ -15,15 +15,16 @@ from keyss.channels.appended import is_appended
 from keyss.core import Gaussians, InputError, KeyssWarning, Scene, UsageError, WrongKeyError
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
+from keyss.fitting.density import combine_densification
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, SilentReporter
 from keyss.keys import random_embeddings
 from keyss.methods import registry
 from keyss.methods.base import SceneInput
 from keyss.methods.learned.decoder import parse_mask
-from keyss.methods.learned.joint import JointRun, combine_densification
+from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions
-from keyss.methods.learned.targets import CombinedPoses, PlacedScene
+from keyss.methods.poses import CombinedPoses, PlacedScene
 from keyss.rendering import render
 from methods.learned.hiding import Hidden, hide_scenes, open_secret
 from tiny_scenes import random_gaussians, tiny_scene

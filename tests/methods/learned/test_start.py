@@ -11,9 +11,9 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
 from keyss.methods.learned.options import LearnedOptions
 from keyss.methods.learned.refit import most_contributing
-from keyss.methods.learned.room import divided
 from keyss.methods.learned.start import make_start
-from keyss.methods.learned.targets import PlacedScene
+from keyss.methods.points import divided
+from keyss.methods.poses import PlacedScene
 from tiny_scenes import random_gaussians, tiny_scene
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from keyss.methods.learned.targets import possibly_seen
+from keyss.methods.poses import possibly_seen
 from keyss.rendering import render_with_meta
 from keyss.rendering.orbit import orbit
 from tiny_scenes import random_gaussians

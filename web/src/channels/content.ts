@@ -20,6 +20,9 @@ export type Content = Records | Payload;
 
 /** A channel of one model, prepared for any number of keys. */
 export interface Reader {
+  /** Keys that each attempt derives, whatever it opens. */
+  readonly derivations: number;
+
   /** What `key` opens, null for nothing. Raises InputError for damage. */
   open(key: string, derive?: Derive): Promise<Content | null>;
 }

@@ -1,9 +1,42 @@
-/** Opening with a key, in whichever channel of a model the secret lies. */
-import type { Gaussians } from '../core/gaussians.ts';
-import type { Reader } from './content.ts';
+/**
+ * Opening with a key, in whichever channel of a model the secret lies; `keyss.channels.opening` on the other side.
+ *
+ * All channels are looked through for every key, also when one of them has opened already: how long it takes tells
+ * neither whether a key opens something nor where.
+ */
+import type { ReadModel } from '../files/models.ts';
+import type { Derive } from '../keys/derivation.ts';
+import { AppendedReader } from './appended/reader.ts';
+import { CodesReader } from './codes/reader.ts';
+import { ColoursReader } from './colours/reader.ts';
+import type { Content, Reader } from './content.ts';
 import { LowBitsReader } from './low_bits/reader.ts';
 
 /** The channels of a model, prepared for any number of keys. */
-export function readerOf(model: Gaussians): Reader {
-  return LowBitsReader.of(model);
+export function readerOf(model: ReadModel): Reader {
+  return new Channels(readersOf(model));
+}
+
+/** One for each channel that a model has, those that come first counting most. */
+export function readersOf(model: ReadModel): Reader[] {
+  const exact = model.codes ? CodesReader.of(model.codes) : LowBitsReader.of(model);
+  return [exact, AppendedReader.of(model), ColoursReader.of(model)].filter((each) => each !== null);
+}
+
+/** Several channels, of which the first one that opens counts. */
+export class Channels implements Reader {
+  constructor(private readonly readers: readonly Reader[]) {}
+
+  get derivations(): number {
+    return this.readers.reduce((sum, each) => sum + each.derivations, 0);
+  }
+
+  async open(key: string, derive?: Derive): Promise<Content | null> {
+    const outcomes = await Promise.allSettled(this.readers.map((each) => each.open(key, derive)));
+    for (const outcome of outcomes) {
+      if (outcome.status === 'rejected') throw outcome.reason;
+      if (outcome.value !== null) return outcome.value;
+    }
+    return null;
+  }
 }

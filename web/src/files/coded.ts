@@ -3,6 +3,7 @@ import { InputError } from '../core/errors.ts';
 
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
+const LEAST_SCALE = 2 ** -126;
 const SMALL_COUNT = 1 << 18; // more Gaussians than this have to take a byte each
 
 /** Raises InputError where a packed file of `size` bytes cannot hold `count` Gaussians, or holds none. */
@@ -12,9 +13,29 @@ export function checkCount(count: number, size: number): void {
 
 /** Of an opacity of `byte` 255ths. */
 export function logit(byte: number): number {
-  const value = byte / 255;
-  const found = Math.log(value) - Math.log1p(-value);
+  return logitOf(byte / 255);
+}
+
+/** Of an opacity from 0 to 1, both of which have finite ones as well. */
+export function logitOf(opacity: number): number {
+  const found = Math.log(opacity) - Math.log1p(-opacity);
   return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, found));
+}
+
+/** Of a colour of `byte` 255ths. */
+export function constantHarmonic(byte: number): number {
+  return (byte / 255 - 0.5) / SH_C0;
+}
+
+/** Of a scale; that of 0 is that of the smallest normal number, of negative ones NaN. */
+export function logScale(scale: number): number {
+  return Math.log(scale === 0 ? LEAST_SCALE : scale);
+}
+
+/** A quaternion of length 1; one of length 0 becomes (1, 0, 0, 0), as renderers take it. */
+export function unitQuat(w: number, x: number, y: number, z: number): number[] {
+  const length = Math.sqrt(w * w + x * x + y * y + z * z);
+  return length > 0 ? [w / length, x / length, y / length, z / length] : [1, 0, 0, 0];
 }
 
 /** A unit quaternion of three of its parts, and which one is the fourth. */

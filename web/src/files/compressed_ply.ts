@@ -3,17 +3,40 @@ import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.
 import { damagedFile, fromSmallestThree, logit, SH_C0 } from './coded.ts';
 import { checkedFinite, column, type PlyHeader } from './ply.ts';
 
-const CHUNK = 256; // Gaussians
+export const CHUNK = 256; // Gaussians
 const ENDS = ['min', 'max'];
 const AXES = ['x', 'y', 'z'].map((axis) => ENDS.map((end) => `${end}_${axis}`));
 const SCALES = ['x', 'y', 'z'].map((axis) => ENDS.map((end) => `${end}_scale_${axis}`));
 const COLOURS = ['r', 'g', 'b'].map((colour) => ENDS.map((end) => `${end}_${colour}`));
 
+/** What of a file's numbers can carry secrets. */
+export interface CompressedPlyCodes {
+  readonly kind: 'compressed-ply';
+  readonly count: number;
+  readonly scaleBounds: Float64Array[][]; // of each axis smallest and largest log scales [C]; a chunk is 256 Gaussians
+  readonly scales: Float64Array; // [N] 11, 10 and 11 bits between the bounds
+  readonly rotations: Float64Array; // [N] which part is left out (2 bits), the others (10 bits each)
+}
+
+export const VECTOR = [2047, 1023, 2047]; // largest x, y and z
+
+/** x, y or z of a packed vector. */
+export function vectorPart(packed: number, axis: number): number {
+  return (packed >>> [21, 11, 0][axis]) & VECTOR[axis];
+}
+
+/** Of a packed rotation a part that is there, 0 to 1023. */
+export function rotationPart(packed: number, part: number): number {
+  return (packed >>> (20 - 10 * part)) & 1023;
+}
+
 export function isCompressed(header: PlyHeader): boolean {
   return header.elements.some((each) => each.properties.some(({ name }) => name === 'packed_position'));
 }
 
-export function readCompressedPly(bytes: Uint8Array, header: PlyHeader): Gaussians {
+export function readCompressedPly(
+  bytes: Uint8Array, header: PlyHeader,
+): Gaussians & { readonly codes: CompressedPlyCodes } {
   const element = (name: string) => header.elements.find((each) => each.name === name);
   const [vertex, chunk, sh] = [element('vertex'), element('chunk'), element('sh')];
   if (!vertex?.count || !chunk || chunk.count !== Math.ceil(vertex.count / CHUNK)) throw damagedFile();
@@ -38,10 +61,12 @@ export function readCompressedPly(bytes: Uint8Array, header: PlyHeader): Gaussia
     const own = Math.floor(row / CHUNK);
     const between = ([low, high]: Float64Array[], share: number): number =>
       low[own] * (1 - share) + high[own] * share;
-    const vector = (packed: number): number[] => [(packed >>> 21) / 2047, ((packed >>> 11) & 1023) / 1023, (packed & 2047) / 2047];
-    vector(position[row]).forEach((share, axis) => (model.means[3 * row + axis] = between(places[axis], share)));
-    vector(scale[row]).forEach((share, axis) => (model.logScales[3 * row + axis] = between(sizes[axis], share)));
-    const others = [20, 10, 0].map((shift) => (((rotation[row] >>> shift) & 1023) / 1023 - 0.5) * Math.sqrt(2));
+    for (let axis = 0; axis < 3; axis++) {
+      const share = (packed: number): number => vectorPart(packed, axis) / VECTOR[axis];
+      model.means[3 * row + axis] = between(places[axis], share(position[row]));
+      model.logScales[3 * row + axis] = between(sizes[axis], share(scale[row]));
+    }
+    const others = [0, 1, 2].map((part) => (rotationPart(rotation[row], part) / 1023 - 0.5) * Math.sqrt(2));
     model.quats.set(fromSmallestThree(rotation[row] >>> 30, others), 4 * row);
     [24, 16, 8].forEach((shift, channel) => {
       const value = between(colours[channel], ((colour[row] >>> shift) & 255) / 255);
@@ -58,5 +83,6 @@ export function readCompressedPly(bytes: Uint8Array, header: PlyHeader): Gaussia
       model.sh[3 * (k * row + each) + channel] = level / 32 - 4;
     });
   }
-  return checkedFinite(model);
+  const codes = { kind: 'compressed-ply', count: vertex.count, scaleBounds: sizes, scales: scale, rotations: rotation } as const;
+  return { ...checkedFinite(model), codes };
 }

@@ -1,13 +1,24 @@
-/** Models of any format that can be read, told by their first bytes. */
+/** Models of any format that can be read, told by their first bytes, or by their names where those tell nothing. */
 import { InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
-import { isCompressed, readCompressedPly } from './compressed_ply.ts';
+import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
+import { readGlb } from './glb.ts';
+import { readKsplat } from './ksplat.ts';
 import { plyHeader, readPly } from './ply.ts';
-import { readSog } from './sog.ts';
-import { readSpz } from './spz.ts';
+import { readSog, type SogCodes } from './sog.ts';
+import { readSplat } from './splat.ts';
+import { readSpz, type SpzCodes } from './spz.ts';
+
+/** The integers of formats whose last bits can carry; only the very file has them. */
+export type Codes = SpzCodes | SogCodes | CompressedPlyCodes;
+
+/** A file's model. Whatever makes another one of it must leave out the codes. */
+export interface ReadModel extends Gaussians {
+  readonly codes?: Codes;
+}
 
 /** Raises InputError for a file that is none of them, or damaged. */
-export async function readModel(bytes: Uint8Array): Promise<Gaussians> {
+export async function readModel(bytes: Uint8Array, name = ''): Promise<ReadModel> {
   const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
   if (start.startsWith('ply')) {
     const header = plyHeader(bytes);
@@ -15,5 +26,8 @@ export async function readModel(bytes: Uint8Array): Promise<Gaussians> {
   }
   if (start === 'NGSP' || start.startsWith('\x1f\x8b')) return readSpz(bytes);
   if (start === 'PK\x03\x04') return readSog(bytes);
+  if (start === 'glTF') return readGlb(bytes);
+  if (/\.ksplat$/i.test(name)) return readKsplat(bytes);
+  if (/\.splat$/i.test(name)) return readSplat(bytes);
   throw new InputError('This is not a file of a 3D Gaussian Splatting model that this page can read.');
 }

@@ -6,8 +6,8 @@ import { checkedFinite } from './ply.ts';
 import { browserPixels, type Pixels } from './webp.ts';
 import { openZip } from './zip.ts';
 
-const FINEST = 65535;
-const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored
+export const FINEST = 65535; // a position's largest code
+export const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored
 const ROW = 64; // vectors of the palette in a row of pixels
 const BOOK = 256;
 const MOST_LABELS = 65536;
@@ -22,53 +22,81 @@ interface Meta {
   shN?: { count: number; bands: number; codebook: number[]; files: string[] };
 }
 
-export async function readSog(bytes: Uint8Array, pixels: Pixels = browserPixels): Promise<Gaussians> {
+/** All numbers of a file. */
+export interface SogCodes {
+  readonly kind: 'sog';
+  readonly count: number;
+  readonly mins: readonly number[]; // [3] smallest positions, as sign(x) ln(|x| + 1)
+  readonly maxs: readonly number[]; // [3] largest ones
+  readonly positions: Uint16Array; // [N, 3] in 65535ths between them
+  readonly quats: Uint8Array; // [N, 4] three parts of a quaternion, then 252 + which one is left out
+  readonly scaleBook: Float32Array; // [256] log scales
+  readonly scales: Uint8Array; // [N, 4] three indices into it
+  readonly colourBook: Float32Array; // [256] constant harmonics
+  readonly colours: Uint8Array; // [N, 4] three indices into it, then opacity in 255ths
+  readonly shDegree: number;
+  readonly labels: Uint16Array; // [N] indices into the palette; of a model without harmonics 0
+  readonly harmonicBook: Float32Array; // [256]
+  readonly palette: Uint8Array; // [P, K - 1, 4] three indices into it
+}
+
+export async function readSog(
+  bytes: Uint8Array, pixels: Pixels = browserPixels,
+): Promise<Gaussians & { readonly codes: SogCodes }> {
+  const codes = await parsed(bytes, pixels);
+  return { ...checkedFinite(dequantised(codes)), codes };
+}
+
+async function parsed(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
   const file = openZip(bytes);
-  const meta = checkedMeta(await file('meta.json'), bytes.length);
-  const { count } = meta;
+  const { count, means, quats, scales, sh0, shN } = checkedMeta(await file('meta.json'), bytes.length);
   const image = async (name: string): Promise<Uint8Array> => pixels(await file(name), count);
-  const [low, high] = [await image(meta.means.files[0]), await image(meta.means.files[1])];
-  const [quats, scales] = [await image(meta.quats.files[0]), await image(meta.scales.files[0])];
-  const colours = await image(meta.sh0.files[0]);
-  const degree = meta.shN?.bands ?? 0;
-  const model = emptyGaussians(count, degree);
-  const k = coefficients(degree);
+  const [low, high] = [await image(means.files[0]), await image(means.files[1])];
+  const positions = new Uint16Array(3 * count);
+  for (let row = 0; row < count; row++) {
+    for (let axis = 0; axis < 3; axis++) positions[3 * row + axis] = low[4 * row + axis] | (high[4 * row + axis] << 8);
+  }
+  const rest = coefficients(shN?.bands ?? 0) - 1;
+  let [labels, palette] = [new Uint16Array(count), new Uint8Array(0) as Uint8Array];
+  if (shN && rest) {
+    const pairs = await image(shN.files[1]);
+    labels = labels.map((_, row) => pairs[4 * row] | (pairs[4 * row + 1] << 8));
+    if (labels.some((label) => label >= shN.count)) throw damagedFile();
+    palette = await pixels(await file(shN.files[0]), Math.ceil(shN.count / ROW) * ROW * rest, ROW * rest);
+  }
+  return {
+    kind: 'sog', count, mins: means.mins, maxs: means.maxs, positions, quats: await image(quats.files[0]),
+    scaleBook: Float32Array.from(scales.codebook), scales: await image(scales.files[0]),
+    colourBook: Float32Array.from(sh0.codebook), colours: await image(sh0.files[0]),
+    shDegree: shN?.bands ?? 0, labels, harmonicBook: Float32Array.from(shN?.codebook ?? []), palette,
+  };
+}
+
+function dequantised(codes: SogCodes): Gaussians {
+  const { count, mins, maxs, positions, quats, scales, colours, shDegree, labels, palette } = codes;
+  const model = emptyGaussians(count, shDegree);
+  const k = coefficients(shDegree);
   for (let row = 0; row < count; row++) {
     const largest = quats[4 * row + 3] - LARGEST;
     if (largest < 0) throw damagedFile();
     const others = [0, 1, 2].map((part) => ((quats[4 * row + part] / 255) * 2 - 1) * Math.sqrt(0.5));
     model.quats.set(fromSmallestThree(largest, others), 4 * row);
     for (let axis = 0; axis < 3; axis++) {
-      const [min, max] = [meta.means.mins[axis], meta.means.maxs[axis]];
-      const level = low[4 * row + axis] | (high[4 * row + axis] << 8);
-      const log = min + (min === max ? 1 : max - min) * (level / FINEST);
+      const [min, max] = [mins[axis], maxs[axis]];
+      const log = min + (min === max ? 1 : max - min) * (positions[3 * row + axis] / FINEST);
       model.means[3 * row + axis] = Math.sign(log) * Math.expm1(Math.abs(log));
-      model.logScales[3 * row + axis] = meta.scales.codebook[scales[4 * row + axis]];
-      model.sh[3 * k * row + axis] = meta.sh0.codebook[colours[4 * row + axis]];
+      model.logScales[3 * row + axis] = codes.scaleBook[scales[4 * row + axis]];
+      model.sh[3 * k * row + axis] = codes.colourBook[colours[4 * row + axis]];
     }
     model.opacityLogits[row] = logit(colours[4 * row + 3]);
-  }
-  if (meta.shN && degree) await putHarmonics(model, meta.shN, file, pixels);
-  return checkedFinite(model);
-}
-
-async function putHarmonics(
-  model: Gaussians, shN: NonNullable<Meta['shN']>, file: (name: string) => Promise<Uint8Array>, pixels: Pixels,
-): Promise<void> {
-  const rest = coefficients(shN.bands) - 1;
-  const labels = await pixels(await file(shN.files[1]), model.count);
-  const size = Math.ceil(shN.count / ROW) * ROW;
-  const palette = await pixels(await file(shN.files[0]), size * rest, ROW * rest);
-  for (let row = 0; row < model.count; row++) {
-    const label = labels[4 * row] | (labels[4 * row + 1] << 8);
-    if (label >= shN.count) throw damagedFile();
-    for (let each = 0; each < rest; each++) {
+    for (let each = 0; each < k - 1; each++) {
       for (let colour = 0; colour < 3; colour++) {
-        const code = palette[4 * (label * rest + each) + colour];
-        model.sh[3 * ((rest + 1) * row + each + 1) + colour] = shN.codebook[code];
+        const code = palette[4 * (labels[row] * (k - 1) + each) + colour];
+        model.sh[3 * (k * row + each + 1) + colour] = codes.harmonicBook[code];
       }
     }
   }
+  return model;
 }
 
 function checkedMeta(bytes: Uint8Array, size: number): Meta {

@@ -13,19 +13,48 @@ const MAGNITUDE = 511;
 // Signs of the harmonics of degrees 1 to 3 where y and z change theirs: SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
-interface Sections {
-  readonly version: number;
+interface Header {
+  readonly version: number; // 2 to 4
   readonly count: number;
   readonly shDegree: number;
-  readonly fractionalBits: number;
-  readonly parts: Uint8Array[]; // positions, alphas, colours, scales, rotations, harmonics
+  readonly fractionalBits: number; // of positions
 }
 
-export async function readSpz(bytes: Uint8Array): Promise<Gaussians> {
-  return dequantised(bytes[0] === 0x1f ? await legacy(bytes) : version4(bytes));
+/** All integers of a file, as their bytes. */
+export interface SpzCodes extends Header {
+  readonly kind: 'spz';
+  readonly positions: Uint8Array; // [N, 3, 3] 24 bits each
+  readonly alphas: Uint8Array; // [N]
+  readonly colours: Uint8Array; // [N, 3]
+  readonly scales: Uint8Array; // [N, 3] 16ths of log scales
+  readonly rotations: Uint8Array; // [N, 4] a word of 32 bits; version 2: [N, 3]
+  readonly harmonics: Uint8Array; // [N, K - 1, 3]
 }
 
-function header(bytes: Uint8Array, versions: number[], size: number): Omit<Sections, 'parts'> & { sizes: number[] } {
+export async function readSpz(bytes: Uint8Array): Promise<Gaussians & { readonly codes: SpzCodes }> {
+  const codes = bytes[0] === 0x1f ? await legacy(bytes) : version4(bytes);
+  return { ...dequantised(codes), codes };
+}
+
+/** The code of a coordinate: multiples of 2^-fractionalBits. */
+export function positionCode({ positions }: SpzCodes, row: number, axis: number): number {
+  const at = 9 * row + 3 * axis;
+  return ((positions[at] | (positions[at + 1] << 8) | (positions[at + 2] << 16)) << 8) >> 8;
+}
+
+/** Of a rotation since version 3 its word of 32 bits. */
+export function rotationWord({ rotations }: SpzCodes, row: number): number {
+  const at = 4 * row;
+  return (rotations[at] | (rotations[at + 1] << 8) | (rotations[at + 2] << 16) | (rotations[at + 3] << 24)) >>> 0;
+}
+
+/** A part of it, the last being the lowest bits: a signed magnitude of 0 to 511. */
+export function rotationPart(word: number, part: number): number {
+  const bits = (word >>> (20 - 10 * part)) & 1023;
+  return (bits & 512 ? -1 : 1) * (bits & MAGNITUDE);
+}
+
+function header(bytes: Uint8Array, versions: number[], size: number): Header & { sizes: number[] } {
   const view = viewOf(bytes);
   if (bytes.length < LEGACY_BYTES || view.getUint32(0, true) !== 0x5053474e) throw damagedFile(); // NGSP
   const [version, count] = [view.getUint32(4, true), view.getUint32(8, true)];
@@ -39,7 +68,14 @@ function header(bytes: Uint8Array, versions: number[], size: number): Omit<Secti
   return { version, count, shDegree, fractionalBits, sizes };
 }
 
-async function legacy(bytes: Uint8Array): Promise<Sections> {
+function codesOf({ version, count, shDegree, fractionalBits }: Header, sections: Uint8Array[]): SpzCodes {
+  const [positions, alphas, colours, scales, rotations, harmonics] = sections;
+  return {
+    kind: 'spz', version, count, shDegree, fractionalBits, positions, alphas, colours, scales, rotations, harmonics,
+  };
+}
+
+async function legacy(bytes: Uint8Array): Promise<SpzCodes> {
   const most = Math.min(MOST_UNPACKED, 64 * Math.max(bytes.length, 1 << 18)) + MOST_EXTENSION_BYTES;
   const data = await unpacked(bytes, 'gzip', most);
   const found = header(data, [2, 3], bytes.length);
@@ -50,10 +86,10 @@ async function legacy(bytes: Uint8Array): Promise<Sections> {
     parts.push(data.subarray(at, at + size));
     at += size;
   }
-  return { ...found, parts };
+  return codesOf(found, parts);
 }
 
-function version4(bytes: Uint8Array): Sections {
+function version4(bytes: Uint8Array): SpzCodes {
   const found = header(bytes, [4], bytes.length);
   if (bytes.length < HEADER_BYTES) throw damagedFile();
   const view = viewOf(bytes);
@@ -76,24 +112,21 @@ function version4(bytes: Uint8Array): Sections {
       throw damagedFile();
     }
   });
-  return { ...found, parts };
+  return codesOf(found, parts);
 }
 
-function dequantised({ version, count, shDegree, fractionalBits, parts }: Sections): Gaussians {
-  const [positions, alphas, colours, scales, rotations, harmonics] = parts;
+function dequantised(codes: SpzCodes): Gaussians {
+  const { count, shDegree, fractionalBits, alphas, colours, scales, harmonics } = codes;
   const model = emptyGaussians(count, shDegree);
   const k = coefficients(shDegree);
-  const view = viewOf(rotations);
   for (let row = 0; row < count; row++) {
     for (let axis = 0; axis < 3; axis++) {
-      const at = 9 * row + 3 * axis;
-      const code = ((positions[at] | (positions[at + 1] << 8) | (positions[at + 2] << 16)) << 8) >> 8;
-      model.means[3 * row + axis] = code * 2 ** -fractionalBits * (axis ? -1 : 1);
+      model.means[3 * row + axis] = positionCode(codes, row, axis) * 2 ** -fractionalBits * (axis ? -1 : 1);
       model.logScales[3 * row + axis] = scales[3 * row + axis] / 16 - 10;
       model.sh[3 * k * row + axis] = (colours[3 * row + axis] / 255 - 0.5) / 0.15;
     }
     model.opacityLogits[row] = logit(alphas[row]);
-    const [x, y, z, w] = quaternion(version, rotations, view, row);
+    const [x, y, z, w] = quaternion(codes, row);
     model.quats.set([w, x, -y, -z], 4 * row);
     for (let each = 0; each < k - 1; each++) {
       for (let colour = 0; colour < 3; colour++) {
@@ -105,14 +138,11 @@ function dequantised({ version, count, shDegree, fractionalBits, parts }: Sectio
   return model;
 }
 
-function quaternion(version: number, rotations: Uint8Array, view: DataView, row: number): number[] {
-  if (version === 2) {
-    return fromSmallestThree(3, [0, 1, 2].map((part) => rotations[3 * row + part] / 127.5 - 1));
+function quaternion(codes: SpzCodes, row: number): number[] {
+  if (codes.version === 2) {
+    return fromSmallestThree(3, [0, 1, 2].map((part) => codes.rotations[3 * row + part] / 127.5 - 1));
   }
-  const packed = view.getUint32(4 * row, true);
-  const others = [20, 10, 0].map((shift) => {
-    const part = (packed >>> shift) & 1023;
-    return (part & 512 ? -1 : 1) * (part & MAGNITUDE) * (Math.sqrt(0.5) / MAGNITUDE);
-  });
-  return fromSmallestThree(packed >>> 30, others);
+  const word = rotationWord(codes, row);
+  const others = [0, 1, 2].map((part) => rotationPart(word, part) * (Math.sqrt(0.5) / MAGNITUDE));
+  return fromSmallestThree(word >>> 30, others);
 }

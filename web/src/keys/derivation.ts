@@ -2,10 +2,11 @@
  * From what a person types to derived keys, as docs/format.md has it: Argon2id (RFC 9106) of the key in NFKC, then
  * HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
+import { chacha20 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { argon2id } from 'hash-wasm';
-import { ascii, joined } from '../core/bytes.ts';
+import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 
 export const SALT_BYTES = 16;
@@ -60,4 +61,24 @@ export function expand(secret: Uint8Array, label: string, length: number): Uint8
     found = joined(found, block);
   }
   return found.slice(0, length);
+}
+
+const AT_ONCE = 1 << 16; // bytes of a stream
+
+/**
+ * The same for more bytes than HKDF gives: the key stream of ChaCha20 (RFC 8439) under a derived key, as little-endian
+ * words of 32 bits, one after the other.
+ */
+export function streamWords(
+  secret: Uint8Array, label: string, count: number, take: (word: number, at: number) => void,
+): void {
+  const [key, nonce] = [expand(secret, label, 32), new Uint8Array(12)];
+  const zeros = new Uint8Array(AT_ONCE);
+  const bytes = new Uint8Array(AT_ONCE);
+  const view = viewOf(bytes);
+  for (let at = 0; at < count; at += AT_ONCE / 4) {
+    chacha20(key, nonce, zeros, bytes, (at * 4) / 64);
+    const end = Math.min(AT_ONCE / 4, count - at);
+    for (let index = 0; index < end; index++) take(view.getUint32(4 * index, true), at + index);
+  }
 }

@@ -14,6 +14,7 @@ interface Pointer {
 
 export class Controls {
   flying = false;
+  touched = false; // whether somebody moved the camera
   private readonly pointers = new Map<number, Pointer>();
 
   /** `moved` is told of every new pose; `home` gives the first one again. */
@@ -24,6 +25,7 @@ export class Controls {
     canvas.style.touchAction = 'none';
     canvas.addEventListener('pointerdown', (event) => {
       canvas.setPointerCapture(event.pointerId);
+      this.touched = true;
       this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     });
     canvas.addEventListener('pointermove', (event) => this.dragged(event, canvas.clientHeight));
@@ -33,6 +35,7 @@ export class Controls {
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
+      this.touched = true;
       this.zoom(Math.exp(event.deltaY * 0.001));
     }, { passive: false });
     canvas.addEventListener('keydown', (event) => this.pressed(event));
@@ -86,6 +89,7 @@ export class Controls {
     const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
     if (action === undefined) return;
     event.preventDefault();
+    this.touched = true;
     action();
   }
 

@@ -1,71 +1,40 @@
 /** The page: a published model, a field for a key, and what the key opens. */
-import { type Gaussians, opacity } from '../core/gaussians.ts';
+import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
-import { COLOURINGS, type Look, lookedAt } from './attacker.ts';
+import { COLOURINGS } from './attacker.ts';
 import { Controls } from './controls.ts';
+import { page } from './elements.ts';
+import { type TrainedSide, watch } from './live.ts';
+import { listenToLooks, looked } from './looking.ts';
 import { Opener } from './opener.ts';
-import {
-  add, difference, firstPose, middleAndRadius, type Pose, poseOfHash, poseToHash, UPS, upOf,
-} from './pose.ts';
+import { count, placeBorder, preparePanel, save, showKey } from './panel.ts';
+import { alike, firstPose, type Pose, poseOfHash, poseToHash, UPS, upOf } from './pose.ts';
+import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
 const MOST_BYTES = 2 ** 31;
-
-function element<T extends HTMLElement>(id: string): T {
-  return document.getElementById(id) as T;
-}
-
-const page = {
-  main: element('main'),
-  canvas: element<HTMLCanvasElement>('picture'),
-  file: element<HTMLInputElement>('file'),
-  form: element<HTMLFormElement>('key-form'),
-  key: element<HTMLInputElement>('key'),
-  open: element<HTMLButtonElement>('open'),
-  status: element('status'),
-  problem: element('problem'),
-  facts: element('facts'),
-  up: element<HTMLSelectElement>('up'),
-  fly: element<HTMLButtonElement>('fly'),
-  home: element<HTMLButtonElement>('home'),
-  snapshot: element<HTMLButtonElement>('snapshot'),
-  download: element<HTMLButtonElement>('download'),
-  wipe: element<HTMLInputElement>('wipe'),
-  revealed: element('revealed'),
-  threshold: element<HTMLInputElement>('threshold'),
-  thresholdText: element<HTMLOutputElement>('threshold-text'),
-  faint: element<HTMLInputElement>('faint'),
-  opaque: element<HTMLInputElement>('opaque'),
-  colouring: element<HTMLSelectElement>('colouring'),
-  count: element('count'),
-};
+const EMBEDDED = location.protocol === 'about:'; // in another page, which has the address to itself
 
 class Page {
   private name = 'model';
   private published: Gaussians | null = null;
   private secret: Gaussians | null = null;
-  private readonly opener = new Opener();
+  private readonly opener = new Opener((share) => (page.progress.value = share));
   private readonly controls: Controls;
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
   private addressTimer = 0;
-  private lookTimer = 0;
   private loads = 0;
   private longest = 0; // milliseconds that a key took so far
 
   constructor(private readonly viewer: Viewer) {
     this.controls = new Controls(page.canvas, this.pose, (pose) => this.moved(pose), () => this.firstPose());
+    page.up.value = this.pose.up;
     this.listen();
   }
 
   private listen(): void {
-    page.file.addEventListener('change', () => page.file.files?.[0] && void this.openFile(page.file.files[0]));
-    document.addEventListener('dragover', (event) => event.preventDefault());
-    document.addEventListener('drop', (event) => {
-      event.preventDefault();
-      const file = event.dataTransfer?.files[0];
-      if (file) void this.openFile(file);
-    });
+    preparePanel((file) => void this.openFile(file));
     page.form.addEventListener('submit', (event) => {
       event.preventDefault();
       void this.unlock();
@@ -79,47 +48,40 @@ class Page {
       this.controls.setPose(this.firstPose());
     });
     page.home.addEventListener('click', () => this.controls.setPose(this.firstPose()));
-    page.snapshot.addEventListener('click', () => void this.viewer.snapshot().then((png) => save('view.png', png)));
+    page.snapshot.addEventListener('click', () => void this.snapshot());
     page.download.addEventListener('click', () => {
       if (this.secret) save('secret.ply', new Blob([writePly(this.secret) as BlobPart]));
     });
-    page.wipe.addEventListener('input', () => this.viewer.setSplit(Number(page.wipe.value) / 100));
-    for (const input of [page.threshold, page.faint, page.opaque, page.colouring]) {
-      input.addEventListener('input', () => this.look());
-    }
+    page.close.addEventListener('click', () => this.closeSecret());
+    page.wipe.addEventListener('input', () => this.split(Number(page.wipe.value) / 100));
+    listenToLooks(() => {
+      this.showPublished();
+      if (this.secret) this.split(1); // it is the published one that is looked at
+    });
     window.addEventListener('hashchange', ({ newURL }) => {
       const pose = poseOfHash(new URL(newURL).hash); // that of now may be one that was written meanwhile
       if (pose) this.controls.setPose(pose);
     });
   }
 
-  /** A model of the page itself, beside it, or in the address. */
+  /** A training that goes on, or a model of the page itself, beside it, or in the address. */
   async start(): Promise<void> {
-    const inside = document.getElementById('model');
-    const beside = document.querySelector<HTMLMetaElement>('meta[name="keyss-model"]')?.content;
-    const asked = new URLSearchParams(location.search).get('file');
-    if (inside?.textContent) {
-      const text = inside.textContent;
-      inside.remove(); // the text is not needed twice
-      await this.load(bytesOfBase64(text), inside.dataset.name ?? 'model');
-    } else if (asked ?? beside) await this.fetched((asked ?? beside)!);
-    else this.say('Open a file, or drop one here.');
-  }
-
-  private async fetched(address: string): Promise<void> {
-    const url = new URL(address, location.href);
+    const live = document.querySelector<HTMLMetaElement>('meta[name="keyss-live"]')?.content;
+    if (live) return this.watch(live);
+    const source = givenModel();
+    if (source === null) return this.say('Open a file, or drop one here.');
     this.say('Loading …');
+    let bytes: Uint8Array;
     try {
-      const response = await fetch(url, { credentials: 'omit' });
-      if (!response.ok) throw new Error(String(response.status));
-      const bytes = new Uint8Array(await response.arrayBuffer());
-      await this.load(bytes, decodeURIComponent(url.pathname.split('/').pop() ?? 'model'));
+      bytes = await source.bytes();
     } catch {
-      this.fail('The file in the address could not be loaded.');
+      return this.fail('The file in the address could not be loaded.');
     }
+    return this.load(bytes, source.name);
   }
 
   private async openFile(file: File): Promise<void> {
+    if (page.main.dataset.live !== undefined) return;
     if (file.size > MOST_BYTES) return this.fail('This file is larger than 2 GiB.');
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
   }
@@ -128,19 +90,48 @@ class Page {
     const own = ++this.loads;
     this.say('Reading …');
     page.problem.textContent = '';
-    const { model, error } = await this.opener.load(bytes);
+    const { model, error } = await this.opener.load(bytes, name);
     if (own !== this.loads) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
-    [this.name, this.published, this.secret] = [name, model, null];
-    page.revealed.hidden = true;
+    [this.name, this.published] = [name, model];
+    this.hideSecret();
     this.longest = 0;
     page.open.disabled = page.key.disabled = false;
-    page.facts.textContent = `${this.name}: ${model.count.toLocaleString('en')} Gaussians, SH degree ${model.shDegree}`;
-    this.viewer.show(null, 'right');
+    page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
+    document.title = `${name} · keyss viewer`;
     this.showPublished();
-    this.controls.setPose(poseOfHash(location.hash) ?? this.firstPose());
+    this.controls.setPose((!EMBEDDED && poseOfHash(location.hash)) || this.firstPose());
     await this.picture();
     this.say('');
+  }
+
+  /** The models of a training as they are now, and no field for keys. */
+  private async watch(address: string): Promise<void> {
+    page.main.dataset.live = '';
+    document.title = 'keyss, training';
+    page.facts.textContent = 'A training, as it is now';
+    await watch(address, {
+      tell: (text) => this.say(text),
+      trained: async (side, ply, anew) => this.trained(side, ply, anew),
+    });
+  }
+
+  private async trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
+    const { model } = await this.opener.look(ply, `${side}.ply`);
+    if (model === undefined) return;
+    if (side === 'published') {
+      this.published = model;
+      this.showPublished();
+    } else {
+      this.secret = model;
+      this.viewer.show(model, 'right');
+      if (page.revealed.hidden) this.split(0);
+      page.revealed.hidden = this.published === null; // nothing to wipe with
+    }
+    const looks = side === 'secret' || this.secret === null;
+    if (looks && (anew || !this.controls.touched)) this.controls.setPose(this.firstPose());
+    else this.moved(this.pose);
+    await this.picture();
   }
 
   /**
@@ -154,8 +145,12 @@ class Page {
     page.open.disabled = true;
     page.main.setAttribute('aria-busy', 'true');
     this.say('Trying the key …');
+    page.progress.value = 0;
+    page.progress.hidden = false;
     const { model, file } = await this.opener.unlock(key);
     page.key.value = '';
+    showKey(false);
+    let found = '';
     if (own === this.loads) {
       if (model) this.reveal(model);
       else if (this.secret) this.viewer.show(this.secret, 'right');
@@ -164,35 +159,68 @@ class Page {
       const left = this.longest - (performance.now() - start);
       if (left > 0) await new Promise((resolve) => setTimeout(resolve, left));
       this.longest = performance.now() - start;
+      if (model) found = `The secret is shown: ${count(model.count)} Gaussians.`;
     }
-    if (file) save(file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file', new Blob([file.data as BlobPart]));
+    if (file) {
+      const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
+      save(name, new Blob([file.data as BlobPart]));
+      found = `A hidden file is saved: ${name}`;
+    }
     page.open.disabled = false;
     page.main.setAttribute('aria-busy', 'false');
-    this.say('');
+    page.progress.hidden = true;
+    this.say(found);
   }
 
+  /** Seen as what was there before was. */
   private reveal(model: Gaussians): void {
+    const pose = alike(this.pose, this.secret ?? this.published ?? model, model);
     this.secret = model;
     this.viewer.show(model, 'right');
-    this.viewer.setSplit(0);
-    page.wipe.value = '0';
+    this.split(0);
     page.revealed.hidden = false;
-    this.controls.setPose(this.firstPose());
+    this.controls.setPose(pose);
     this.writeAddress();
+  }
+
+  private closeSecret(): void {
+    const pose = this.secret && this.published ? alike(this.pose, this.secret, this.published) : this.pose;
+    this.hideSecret();
+    this.controls.setPose(pose);
+    this.writeAddress();
+    this.say('');
+    page.key.focus();
+  }
+
+  private hideSecret(): void {
+    this.secret = null;
+    page.revealed.hidden = true;
+    this.viewer.show(null, 'right');
+    placeBorder(null);
+  }
+
+  /** How much of the width shows the published model, beside the secret: 0 to 1. */
+  private split(share: number): void {
+    page.wipe.value = String(100 * share);
+    this.viewer.setSplit(share);
+    placeBorder(share);
+  }
+
+  private async snapshot(): Promise<void> {
+    save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, await this.viewer.snapshot());
   }
 
   private firstPose(): Pose {
     const model = this.secret ?? this.published;
-    return model ? firstPose(model, this.pose.up) : this.pose;
+    const aspect = page.canvas.clientWidth / Math.max(1, page.canvas.clientHeight);
+    return model ? firstPose(model, this.pose.up, aspect || 1) : this.pose;
   }
 
   private moved(pose: Pose): void {
     this.pose = pose;
     page.up.value = pose.up;
-    if (this.secret && this.published) {
-      this.viewer.setPose(pose, 'right');
-      this.viewer.setPose(this.alike(pose, this.secret, this.published));
-    } else this.viewer.setPose(pose);
+    if (this.secret) this.viewer.setPose(pose, 'right');
+    this.viewer.setPose(this.secret && this.published ? alike(pose, this.secret, this.published) : pose);
     clearTimeout(this.addressTimer);
     this.addressTimer = window.setTimeout(() => this.writeAddress(), ADDRESS_AFTER);
   }
@@ -200,39 +228,12 @@ class Page {
   private writeAddress(): void {
     clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
-    if (this.published && location.hash !== hash) history.replaceState(null, '', hash);
-  }
-
-  /** The pose that shows the second model as `pose` shows the first, which has coordinates of its own. */
-  private alike(pose: Pose, from: Gaussians, to: Gaussians): Pose {
-    const [a, b] = [framing(from), framing(to)];
-    const scale = b.radius / a.radius;
-    const place = (point: Pose['eye']): Pose['eye'] => add(b.middle, difference(point, a.middle), scale);
-    return { eye: place(pose.eye), target: place(pose.target), up: pose.up };
-  }
-
-  private look(): void {
-    clearTimeout(this.lookTimer);
-    page.thresholdText.value = Number(page.threshold.value).toFixed(3);
-    this.lookTimer = window.setTimeout(() => {
-      this.showPublished();
-      if (this.secret) this.viewer.setSplit(Number((page.wipe.value = '100')) / 100); // it is looked at
-    }, 100);
+    if (this.published && !EMBEDDED && location.hash !== hash) history.replaceState(null, '', hash);
   }
 
   private showPublished(): void {
     if (this.published === null) return;
-    const look: Look = {
-      threshold: Number(page.threshold.value),
-      faintOnly: page.faint.checked,
-      opaque: page.opaque.checked,
-      colouring: page.colouring.value as Look['colouring'],
-    };
-    const model = lookedAt(this.published, look);
-    const faint = this.published.opacityLogits.filter((logit) => opacity(logit) < 1 / 255).length;
-    page.count.textContent =
-      `${model.count.toLocaleString('en')} of ${this.published.count.toLocaleString('en')} Gaussians shown; ` +
-      `${faint.toLocaleString('en')} are too faint to be drawn`;
+    const model = looked(this.published);
     this.viewer.show(model.count ? model : null);
   }
 
@@ -250,29 +251,6 @@ class Page {
     this.say('');
     page.problem.textContent = text;
   }
-}
-
-const framings = new WeakMap<Gaussians, ReturnType<typeof middleAndRadius>>();
-
-function framing(model: Gaussians): ReturnType<typeof middleAndRadius> {
-  const known = framings.get(model) ?? middleAndRadius(model);
-  framings.set(model, known);
-  return known;
-}
-
-function bytesOfBase64(text: string): Uint8Array {
-  const binary = atob(text.trim());
-  const bytes = new Uint8Array(binary.length);
-  for (let at = 0; at < binary.length; at++) bytes[at] = binary.charCodeAt(at);
-  return bytes;
-}
-
-function save(name: string, data: Blob): void {
-  const link = document.createElement('a');
-  link.href = URL.createObjectURL(data);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }
 
 async function main(): Promise<void> {

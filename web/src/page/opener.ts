@@ -3,17 +3,25 @@ import DERIVE from 'source:../derive.ts';
 import WORKER from 'source:../worker.ts';
 import type { Answer, Question } from '../protocol.ts';
 
+// That derive keys side by side: each takes 64 MiB, and most of the time that a key takes.
+const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
+
 export class Opener {
   private readonly worker: Worker;
   private readonly waiting = new Map<number, (answer: Answer) => void>();
   private next = 0;
 
-  constructor() {
+  /** `onProgress` is told what share of an attempt is done, 0 to 1: the same for every key. */
+  constructor(private readonly onProgress: (share: number) => void) {
     this.worker = started(WORKER);
-    const { port1, port2 } = new MessageChannel();
-    started(DERIVE).postMessage(null, [port1]);
-    this.worker.postMessage({ id: this.next++, port: port2 }, [port2]);
+    const ports = Array.from({ length: DERIVERS }, () => {
+      const { port1, port2 } = new MessageChannel();
+      started(DERIVE).postMessage(null, [port1]);
+      return port2;
+    });
+    this.worker.postMessage({ id: this.next++, ports }, ports);
     this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
+      if (data.progress !== undefined) return this.onProgress(data.progress);
       this.waiting.get(data.id)?.(data);
       this.waiting.delete(data.id);
     };
@@ -24,8 +32,13 @@ export class Opener {
   }
 
   /** The model in a file; keys are tried on it from now on. */
-  load(bytes: Uint8Array): Promise<Answer> {
-    return this.ask({ id: this.next++, bytes }, [bytes.buffer as ArrayBuffer]);
+  load(bytes: Uint8Array, name: string): Promise<Answer> {
+    return this.ask({ id: this.next++, bytes, name }, [bytes.buffer as ArrayBuffer]);
+  }
+
+  /** The model in a file that nobody has a key for. */
+  look(bytes: Uint8Array, name: string): Promise<Answer> {
+    return this.ask({ id: this.next++, bytes, name, keyless: true }, [bytes.buffer as ArrayBuffer]);
   }
 
   /** What a key opens. */

@@ -44,16 +44,35 @@ export function axes({ eye, target, up }: Pose): { right: Vector; down: Vector; 
   return { right, down: cross(forward, right), forward };
 }
 
-/** From where the detail of a model is in view: inside of the background that captures have around them. */
-export function firstPose(model: Gaussians, up: Up): Pose {
-  const { middle, radius } = middleAndRadius(model);
+/**
+ * From where the detail of a model is in view: inside of the background that captures have around them, and
+ * further away where the picture is higher than wide. `aspect`: its width by its height.
+ */
+export function firstPose(model: Gaussians, up: Up, aspect = 1): Pose {
+  const { middle, radius } = framing(model);
   const flat = Math.sqrt(1 - HEIGHT * HEIGHT);
   const away = add(add([0, 0, 0], FRAMES[up].up, HEIGHT), FRAMES[up].front, flat);
-  return { eye: add(middle, away, AWAY * radius), target: middle, up };
+  return { eye: add(middle, away, (AWAY * radius) / Math.min(1, aspect)), target: middle, up };
+}
+
+const framings = new WeakMap<Gaussians, ReturnType<typeof middleAndRadius>>();
+
+function framing(model: Gaussians): ReturnType<typeof middleAndRadius> {
+  const known = framings.get(model) ?? middleAndRadius(model);
+  framings.set(model, known);
+  return known;
+}
+
+/** The pose that shows the second model as `pose` shows the first, which has coordinates of its own. */
+export function alike(pose: Pose, from: Gaussians, to: Gaussians): Pose {
+  const [a, b] = [framing(from), framing(to)];
+  const scale = b.radius / a.radius;
+  const place = (point: Vector): Vector => add(b.middle, difference(point, a.middle), scale);
+  return { eye: place(pose.eye), target: place(pose.target), up: pose.up };
 }
 
 /** Where half of the Gaussians lie, of a sample; each counts by its opacity, since large ones are background. */
-export function middleAndRadius(model: Gaussians): { middle: Vector; radius: number } {
+function middleAndRadius(model: Gaussians): { middle: Vector; radius: number } {
   const step = Math.max(1, Math.ceil(model.count / SAMPLE));
   const rows: number[] = [];
   for (let row = 0; row < model.count; row += step) rows.push(row);

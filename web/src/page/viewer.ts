@@ -13,6 +13,7 @@ const COARSE = 0.5; // of the resolution, then
 const COARSE_COUNT = 30_000; // and so many Gaussians at most, those that are seen most
 const POLL = 4; // milliseconds
 const AT_REST = 250; // milliseconds without a change after which pictures are fine
+const ASLEEP = 500; // milliseconds without a frame after which the engine has no more to do
 export type Side = 'left' | 'right';
 
 interface Half {
@@ -31,6 +32,7 @@ export class Viewer {
   private inFlight = false; // a frame that is being drawn
   private wanted = false; // another one after it
   private started = 0;
+  private asleep = false; // without a GPU the engine's empty frames alone would take half of two cores
   private slowFrames = 0;
   private split = 1; // share of the width that the left model has
   private whenReady: (() => void)[] = [];
@@ -43,6 +45,7 @@ export class Viewer {
     system.on('frame:request', () => this.draw());
     system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
     app.on('frameend', () => this.afterFrame());
+    app.on('update', () => this.rest());
     app.start();
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
@@ -169,6 +172,15 @@ export class Viewer {
     this.inFlight = true;
     this.started = performance.now();
     this.app.renderNextFrame = true;
+    if (this.asleep) this.app.requestAnimationFrame();
+    this.asleep = false;
+  }
+
+  /** No frames of the engine until there is something to draw. */
+  private rest(): void {
+    if (this.inFlight || performance.now() - this.started < ASLEEP) return;
+    AppBase.cancelTick(this.app);
+    this.asleep = true;
   }
 
   private resize(): void {

@@ -1,7 +1,7 @@
 /** From records to Gaussians; see docs/format.md, "Records of Gaussians". */
 import { halfFloat, viewOf } from '../core/bytes.ts';
-import { InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+import { damaged } from '../keys/encryption.ts';
 
 const BANDS = [1, 3, 5, 7]; // coefficients of each degree
 const CHROMA_FEWER = 2; // bits of the differences of colours
@@ -17,7 +17,7 @@ export class Line {
     const bounded =
       Math.abs(centre) < FURTHEST && spread >= 0 && spread < FURTHEST && reach > 0 && reach < FURTHEST;
     const steep = spread > 0 && (reach > 60 || spread * Math.sinh(reach) > FURTHEST);
-    if (!bounded || steep) throw damagedHeader();
+    if (!bounded || steep) throw damaged();
   }
 
   value(code: number, bits: number): number {
@@ -41,14 +41,14 @@ export class Codec {
 
   /** From a header, of which what follows is ignored. Raises InputError. */
   static unpack(data: Uint8Array): Codec {
-    if (data.length < TABLE_BYTES) throw damagedHeader();
+    if (data.length < TABLE_BYTES) throw damaged();
     let count = TABLE_BYTES;
     while (count > 0 && data[count - 1] === 0) count--;
     const bits = [...data.subarray(0, count)];
     const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MOST_BITS);
-    if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damagedHeader();
+    if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damaged();
     const size = Codec.packedSize(bits.length - 5);
-    if (data.length < size) throw damagedHeader();
+    if (data.length < size) throw damaged();
     const view = viewOf(data);
     const [lines, far]: Line[][] = [[], []];
     for (let at = TABLE_BYTES; at < size; at += LINE_BYTES) {
@@ -93,7 +93,7 @@ export class Codec {
     return found;
   }
 
-  /** Writes the Gaussian of these codes, one for each column of the layout, into a row. */
+  /** Writes the Gaussian of these codes, one for each column of the layout, into a row; further harmonics stay. */
   put(to: Gaussians, row: number, codes: ArrayLike<number>): void {
     const [means, logScales, quatBits, opacity, ...colours] = this.bits;
     const lines = codes[0] ? this.far : this.lines;
@@ -104,7 +104,7 @@ export class Codec {
       to.logScales[3 * row + axis] = lines[3].value(codes[8 + axis], logScales);
     }
     to.opacityLogits[row] = lines[4].value(codes[11], opacity);
-    let [at, coefficient] = [12, row * coefficients(this.shDegree)];
+    let [at, coefficient] = [12, row * coefficients(to.shDegree)];
     colours.forEach((bits, band) => {
       const [bright, different] = [lines[5 + 2 * band], lines[6 + 2 * band]];
       for (let index = 0; index < BANDS[band]; index++, coefficient++) {
@@ -112,9 +112,7 @@ export class Codec {
         const first = at + BANDS[band] + 2 * index;
         const b = different.value(codes[first], bits - CHROMA_FEWER);
         const c = different.value(codes[first + 1], bits - CHROMA_FEWER);
-        to.sh[3 * coefficient] = a * BRIGHTNESS + b * RED_GREEN + c * BLUE;
-        to.sh[3 * coefficient + 1] = a * BRIGHTNESS - b * RED_GREEN + c * BLUE;
-        to.sh[3 * coefficient + 2] = a * BRIGHTNESS - 2 * c * BLUE;
+        putColours(to.sh, 3 * coefficient, a, b, c);
       }
       at += 3 * BANDS[band];
     });
@@ -132,14 +130,17 @@ function unpackCodes(record: Uint8Array, layout: Layout, codes: Uint32Array): vo
   }
 }
 
+/** Red, green and blue of brightness and two differences. */
+export function putColours(to: Float32Array, at: number, brightness: number, first: number, second: number): void {
+  to[at] = brightness * BRIGHTNESS + first * RED_GREEN + second * BLUE;
+  to[at + 1] = brightness * BRIGHTNESS - first * RED_GREEN + second * BLUE;
+  to[at + 2] = brightness * BRIGHTNESS - 2 * second * BLUE;
+}
+
 function wholeQuat(leftOut: number, three: number[]): number[] {
   const squares = three[0] * three[0] + three[1] * three[1] + three[2] * three[2];
   const quat = three.slice();
   quat.splice(leftOut, 0, Math.sqrt(Math.max(0, 1 - squares)));
   const length = Math.max(0.5, Math.sqrt(quat.reduce((sum, each) => sum + each * each, 0)));
   return quat.map((each) => each / length);
-}
-
-export function damagedHeader(): InputError {
-  return new InputError('What this key opens is damaged.');
 }

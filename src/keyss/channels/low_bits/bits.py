@@ -9,30 +9,31 @@ few digits that they were initialised with. Nor are the quaternions of a model w
 length, as tools leave them that normalise: new low bits would change the length, which is known exactly.
 
 What stays of a Gaussian, its position and the high bits, is its *identity*, by which it is known in any
-order. Sign and exponent never change. Which Gaussians can be written: `usable`. All functions work through a
-model in blocks, so that memory beside the model itself stays small.
+order. Sign and exponent never change. Which Gaussians can be written: `usable`.
 """
 
 from __future__ import annotations
 
-import hashlib
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from keyss.channels.low_bits import hashing, kernels
 from keyss.core.gaussians import Gaussians
+from keyss.rendering.cpu.parallel import in_blocks
 
-IDENTITY_BYTES = 16
 FIELDS = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
-GEOMETRY = len(FIELDS)  # fields of a Gaussian before the spherical harmonics
+GEOMETRY = kernels.GEOMETRY  # fields of a Gaussian before the spherical harmonics
 QUATS = slice(3, 7)  # of these
 GEOMETRY_BITS, SH_BITS = 8, 12
 UNUSED_BITS = 1  # below them
 UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5 on average
 
+KERNEL_BLOCK = 1 << 14  # Gaussians that a thread takes at a time
 _BLOCK = 1 << 16  # Gaussians at a time
 
 Words = npt.NDArray[np.uint32]
@@ -50,8 +51,12 @@ class Layout:
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
         """Without quaternions where half of them or more have unit length."""
-        lengths = [coarse_lengths(_words(part.quats)) for part in blocks(gaussians)]
-        deviation = np.abs(np.concatenate(lengths) - 1)
+        quats, deviation = _words(gaussians.quats), np.empty(len(gaussians))
+
+        def measure(start: int, stop: int) -> None:
+            deviation[start:stop] = np.abs(coarse_lengths(quats[start:stop]) - 1)
+
+        in_blocks(measure, len(gaussians), KERNEL_BLOCK)
         return Layout(gaussians.sh_degree, not len(deviation) or float(np.median(deviation)) > UNIT_TOLERANCE)
 
     @property
@@ -74,6 +79,11 @@ class Layout:
             mask[QUATS] = 0
         return mask
 
+    @property
+    def shifts(self) -> Words:
+        """[F] by which a word is shifted so that the bits in use, and those below them, are gone."""
+        return np.array([int(each).bit_length() for each in self.mask], np.uint32)
+
 
 def bytes_per_gaussian(sh_degree: int) -> int:
     """Bytes of one Gaussian's low bits, quaternions included: 8, 21, 44 and 75 at degrees 0 to 3."""
@@ -89,23 +99,27 @@ def coarse_lengths(quats: Words) -> npt.NDArray[np.float64]:
     return lengths
 
 
-def identities(gaussians: Gaussians) -> Bytes:
+def identities(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] for each Gaussian a public hash (BLAKE2b) of all that embedding leaves as it is."""
-    hashes, mask = bytearray(), Layout.of(gaussians).mask
-    for part in blocks(gaussians):
-        rows = np.concatenate([_words(part.means), used_words(part) & ~mask], axis=1)
-        data, size = rows.astype("<u4").tobytes(), 4 * rows.shape[1]
-        for start in range(0, len(data), size):
-            row = data[start : start + size]
-            hashes += hashlib.blake2b(row, digest_size=IDENTITY_BYTES, person=b"keyss/identity").digest()
-    return np.frombuffer(hashes, np.uint8).reshape(-1, IDENTITY_BYTES)
+    words, mask = words_of(gaussians), (layout or Layout.of(gaussians)).mask
+    hashes = np.empty((len(gaussians), 2), np.uint64)
+    in_blocks(
+        lambda start, stop: hashing.identify(start, stop, *words, mask, hashes), len(gaussians), KERNEL_BLOCK
+    )
+    return hashes.view(np.uint8)
 
 
-def read_low_bits(gaussians: Gaussians) -> Bytes:
+def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, B] the low bits of each Gaussian as bytes, as many as its `Layout` is wide."""
-    layout = Layout.of(gaussians)
-    parts = ((used_words(part) & layout.mask)[:, layout.columns] for part in blocks(gaussians))
-    return np.concatenate([_packed(low, layout) for low in parts])
+    layout = layout or Layout.of(gaussians)
+    _, *fields = words_of(gaussians)
+    low = np.empty((len(gaussians), layout.width), np.uint8)
+    in_blocks(
+        lambda start, stop: kernels.pack(start, stop, *fields, layout.quats, low),
+        len(gaussians),
+        KERNEL_BLOCK,
+    )
+    return low
 
 
 def write_low_bits(gaussians: Gaussians, rows: npt.NDArray[np.int64], data: Bytes) -> Gaussians:
@@ -114,20 +128,15 @@ def write_low_bits(gaussians: Gaussians, rows: npt.NDArray[np.int64], data: Byte
     Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
     """
     layout = Layout.of(gaussians)
-    mask = layout.mask
-    if _sh_count(layout.sh_degree) % 2:  # 12 bits are a byte and a half
-        mask[-1] &= ~np.uint32(15 << UNUSED_BITS)
-    order = np.argsort(rows)
-    ascending = rows[order]
-    parts = []
-    for start, part in zip(range(0, len(gaussians), _BLOCK), blocks(gaussians), strict=True):
-        first, last = np.searchsorted(ascending, (start, start + len(part)))
-        own, used = ascending[first:last] - start, used_words(part)
-        new = np.zeros((len(own), used.shape[1]), np.uint32)
-        new[:, layout.columns] = _unpacked(data[order[first:last]], layout)
-        used[own] = used[own] & ~mask | new & mask
-        parts.append(_with_used(part, used))
-    return Gaussians.cat(parts)
+    written = gaussians.detach().map(lambda values: values.clone(memory_format=torch.contiguous_format))
+    written = replace(written.to("cpu"), means=gaussians.means)
+    _, *fields = words_of(written)
+    in_blocks(
+        lambda start, stop: kernels.unpack(start, stop, rows, data, *fields, layout.quats),
+        len(rows),
+        KERNEL_BLOCK,
+    )
+    return written.to(gaussians.device)
 
 
 def blocks(gaussians: Gaussians) -> Iterator[Gaussians]:
@@ -146,38 +155,20 @@ def _sh_count(sh_degree: int) -> int:
     return 3 * ((sh_degree + 1) ** 2 - 1)
 
 
-def _packed(low: Words, layout: Layout) -> Bytes:
-    """[N, B] the bytes of the masked words [N, F'] of the fields in use."""
-    low = low >> np.uint32(UNUSED_BITS)
-    before = low.shape[1] - _sh_count(layout.sh_degree)
-    sh = low[:, before:]
-    if sh.shape[1] % 2:
-        sh = np.concatenate([sh, np.zeros((len(sh), 1), np.uint32)], axis=1)
-    first, second = sh[:, 0::2], sh[:, 1::2]  # two times 12 bits are three bytes
-    packed = np.stack([first >> 4, (first & 15) << 4 | second >> 8, second & 255], axis=2)
-    table = np.concatenate([low[:, :before], packed.reshape(len(low), -1)], axis=1)
-    return table[:, : layout.width].astype(np.uint8)
-
-
-def _unpacked(data: Bytes, layout: Layout) -> Words:
-    """[N, F'] the words of bytes [N, B]: the inverse of `_packed`, zeros where a byte is missing."""
-    count = _sh_count(layout.sh_degree)
-    before = len(layout.columns) - count
-    padded = np.zeros((len(data), -(-count // 2) * 3), np.uint32)
-    padded[:, : data.shape[1] - before] = data[:, before:]
-    a, b, c = padded[:, 0::3], padded[:, 1::3], padded[:, 2::3]
-    sh = np.stack([a << 4 | b >> 4, (b & 15) << 8 | c], axis=2).reshape(len(data), -1)[:, :count]
-    return np.concatenate([data[:, :before], sh], axis=1) << np.uint32(UNUSED_BITS)
+def words_of(gaussians: Gaussians) -> tuple[Words, Words, Words, Words, Words]:
+    """Bit patterns of means [N, 3], log scales [N, 3], quaternions [N, 4], opacity logits [N], and harmonics
+    [N, 3 K], for `kernels`: the model's own memory where it is contiguous and on the CPU.
+    """
+    return (
+        _words(gaussians.means),
+        _words(gaussians.log_scales),
+        _words(gaussians.quats),
+        _words(gaussians.opacity_logits)[:, 0],
+        _words(gaussians.sh),
+    )
 
 
 def _words(values: torch.Tensor) -> Words:
-    flat = values.detach().to("cpu", torch.float32).reshape(len(values), -1).contiguous()
+    width = math.prod(values.shape[1:])
+    flat = values.detach().to("cpu", torch.float32).reshape(len(values), width).contiguous()
     return flat.numpy().view(np.uint32)
-
-
-def _with_used(gaussians: Gaussians, used: Words) -> Gaussians:
-    values = torch.from_numpy(used.view(np.float32)).to(gaussians.device)
-    log_scales, quats, opacity_logits, rest = values.split((3, 4, 1, values.shape[1] - GEOMETRY), dim=1)
-    sh = torch.cat([gaussians.sh[:, :1], rest.reshape(len(values), -1, 3)], dim=1)
-    opacity_logits = opacity_logits[:, 0].contiguous()
-    return Gaussians(gaussians.means, quats.contiguous(), log_scales.contiguous(), opacity_logits, sh)

@@ -30,7 +30,7 @@ from keyss.keys.derivation import expand
 
 TAG_BYTES = 4  # unless more are asked for
 _BLOCK = 16
-_CELLS = 1 << 16  # at a time
+_CELLS = 1 << 13  # at a time: what is made of them stays in the cache
 
 Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
@@ -103,5 +103,7 @@ class CellCipher:
 
 def _encrypt(key: bytes, blocks: Bytes) -> Bytes:
     """Every 16 bytes of `blocks` through AES-256: a permutation of blocks, not a mode of operation."""
-    cipher = Cipher(AES(key), ECB()).encryptor()
-    return np.frombuffer(cipher.update(np.ascontiguousarray(blocks).data), np.uint8).reshape(blocks.shape)
+    plain = np.ascontiguousarray(blocks)
+    encrypted = np.empty(plain.size + _BLOCK - 1, np.uint8)  # the library wants room for one more block
+    Cipher(AES(key), ECB()).encryptor().update_into(plain.reshape(-1).data, encrypted.data)
+    return encrypted[: plain.size].reshape(blocks.shape)

@@ -48,9 +48,10 @@ class LowBits:
         return Room(0, bytes_per_gaussian(sh_degree)).record_bytes(1)
 
     def prepare(self, cover: Gaussians) -> LowBitsCover:
-        usable = usable_carriers(cover)
+        names = identities(cover)
+        usable = usable_carriers(cover, names)
         check_usable(cover, usable)
-        return LowBitsCover(cover, usable)
+        return LowBitsCover(cover, usable, names)
 
     def extract(self, stego: Gaussians, key: str) -> Content:
         """See `Channel` and `LowBitsReader.open`."""
@@ -66,6 +67,7 @@ class LowBitsCover:
 
     cover: Gaussians
     usable: Flags  # [N]
+    names: Bytes  # [N, 16] identities
 
     @property
     def carriers(self) -> int:
@@ -98,7 +100,7 @@ class LowBitsCover:
         if payloads and records:
             raise ValueError("expected payloads or records in one model, got both")
         fresh, salts = self._salts(entropy)
-        room, names = self._room, self._names[self._rows]
+        room, names = self._room, self.names[self._rows]
         writer = Writer(names, room.width, entropy, salts)
         if payloads:
             writer.payloads(payloads, len(self.cover))
@@ -108,17 +110,13 @@ class LowBitsCover:
         return write_low_bits(self.cover, rows, np.concatenate([fresh, writer.table]))
 
     @cached_property
-    def _names(self) -> Bytes:
-        return identities(self.cover)
-
-    @cached_property
     def _low(self) -> Bytes:
         return read_low_bits(self.cover)
 
     @cached_property
     def _salt_rows(self) -> npt.NDArray[np.int64]:
         """[S] in the order of salts."""
-        return salt_rows(self.cover, self._names, self._low)
+        return salt_rows(self.cover, self.names, self._low)
 
     @property
     def _fresh_rows(self) -> npt.NDArray[np.int64]:
@@ -142,7 +140,7 @@ class LowBitsCover:
         fresh = np.frombuffer(noise, np.uint8).reshape(len(self._fresh_rows), -1)
         low = self._low[self._salt_rows].copy()
         low[self.usable[self._salt_rows]] = fresh
-        return fresh, [salt(*each) for each in zip(self._names[self._salt_rows], low, strict=True)]
+        return fresh, [salt(*each) for each in zip(self.names[self._salt_rows], low, strict=True)]
 
 
 def _mixed(entropy: bytes | None, contents: Sequence[Content]) -> bytes:

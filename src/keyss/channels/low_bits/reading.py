@@ -14,7 +14,7 @@ import torch
 
 from keyss.channels.base import Bytes, Content, Payload, RecordPlan, Records
 from keyss.channels.low_bits import parameters
-from keyss.channels.low_bits.bits import Flags, identities, read_low_bits
+from keyss.channels.low_bits.bits import Flags, Layout, identities, read_low_bits
 from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
 from keyss.channels.low_bits.ciphers import (
     ASSOCIATED,
@@ -24,9 +24,11 @@ from keyss.channels.low_bits.ciphers import (
     payload_key,
 )
 from keyss.channels.low_bits.layout import DATA_KEY_BYTES, Room
+from keyss.channels.low_bits.multiples import repeated
 from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.spread import chunk_bytes
+from keyss.channels.mixing import mixed
 from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation
@@ -46,11 +48,13 @@ class LowBitsReader:
 
     @staticmethod
     def of(stego: Gaussians) -> LowBitsReader:
-        names, low = identities(stego), read_low_bits(stego)
+        layout = Layout.of(stego)
+        names, low = identities(stego, layout), read_low_bits(stego, layout)
         rows = _first_of_each(names, low)
         if len(rows) < len(names):
             stego, names, low = stego[torch.from_numpy(rows)], names[rows], low[rows]
-        return LowBitsReader(names, low, [salt(names[row], low[row]) for row in salt_rows(stego, names, low)])
+        salts = [salt(names[row], low[row]) for row in salt_rows(stego, names, low, layout)]
+        return LowBitsReader(names, low, salts)
 
     def keys(self, key: str, most: int = SALTS_TRIED) -> Iterator[DerivedKey]:
         """What `key` becomes under each salt to be tried, the likeliest first; each takes 0.1 s."""
@@ -161,18 +165,34 @@ def _described(content: Content) -> str:
 
 def _first_of_each(names: Bytes, low: Bytes) -> npt.NDArray[np.int64]:
     """[M] rows of identities `names` [N, 16] and `low` bits [N, B], equal ones only once."""
-    prefixes = names[:, :8].copy().view("<u8")[:, 0]
-    order = np.argsort(prefixes, kind="stable")
-    same = np.flatnonzero(prefixes[order][1:] == prefixes[order][:-1])
-    if not len(same):
+    doubtful = np.flatnonzero(repeated(names.view("<u8")[:, 0]))
+    if not len(doubtful):
         return np.arange(len(names))
-    doubtful = np.sort(np.unique(order[np.concatenate([same, same + 1])]))
     whole = np.concatenate([names[doubtful], low[doubtful]], axis=1)
     _, first = np.unique(whole.view(f"S{whole.shape[1]}")[:, 0], return_index=True)
     return np.setdiff1d(np.arange(len(names)), np.delete(doubtful, first))
 
 
 def _are_among(rows: Bytes, others: Bytes) -> Flags:
-    """[R] which of the rows are there among the others."""
-    code = f"S{rows.shape[1]}"  # bytes of a fixed length: zeros at their end make no difference
-    return np.isin(rows.view(code)[:, 0], others.view(code)[:, 0])
+    """[R] which of the rows [R, C] are there among the others [O, C]."""
+    own, theirs = _hashes(rows), _hashes(others)
+    order = np.argsort(theirs)
+    place = np.searchsorted(theirs, own, sorter=order).clip(max=max(0, len(theirs) - 1))
+    maybe = np.flatnonzero(theirs[order[place]] == own) if len(theirs) else np.zeros(0, np.int64)
+    found = np.zeros(len(rows), bool)
+    found[maybe] = (rows[maybe] == others[order[place[maybe]]]).all(axis=1)
+    unsure = maybe[~found[maybe]]  # another row with the same hash: one in 2^64, or somebody's doing
+    if len(unsure):
+        code = f"S{rows.shape[1]}"  # bytes of a fixed length: zeros at their end make no difference
+        found[unsure] = np.isin(rows[unsure].view(code)[:, 0], others.view(code)[:, 0])
+    return found
+
+
+def _hashes(rows: Bytes) -> npt.NDArray[np.uint64]:
+    """[R] of rows [R, C]."""
+    padded = np.zeros((len(rows), -(-rows.shape[1] // 8) * 8), np.uint8)
+    padded[:, : rows.shape[1]] = rows
+    state = np.zeros(len(rows), np.uint64)
+    for word in padded.view("<u8").T:
+        state = mixed(state ^ word)
+    return state

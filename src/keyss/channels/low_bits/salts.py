@@ -13,31 +13,21 @@ import hashlib
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.low_bits.bits import (
-    GEOMETRY,
-    QUATS,
-    UNIT_TOLERANCE,
-    Bytes,
-    Flags,
-    Layout,
-    Words,
-    blocks,
-    coarse_lengths,
-    used_words,
-)
+from keyss.channels.low_bits import kernels
+from keyss.channels.low_bits.bits import KERNEL_BLOCK, UNIT_TOLERANCE, Bytes, Layout, words_of
 from keyss.channels.low_bits.layout import SALTS
-from keyss.channels.low_bits.usable import exponents, near_equal
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES
+from keyss.rendering.cpu.parallel import in_blocks
 
 _LABEL = b"keyss/v2/salt"
-_MANTISSA = np.uint32((1 << 23) - 1)
 
 
-def salt_rows(gaussians: Gaussians, names: Bytes, low: Bytes) -> npt.NDArray[np.int64]:
+def salt_rows(
+    gaussians: Gaussians, names: Bytes, low: Bytes, layout: Layout | None = None
+) -> npt.NDArray[np.int64]:
     """[SALTS or less] the Gaussians, the first first, of identities `names` [N, 16] and `low` bits [N, B]."""
-    layout = Layout.of(gaussians)
-    ranks = np.concatenate([_ranks(used_words(part), layout) for part in blocks(gaussians)])
+    ranks = _ranks(gaussians, layout or Layout.of(gaussians))
     keys = ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
     some = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     order = sorted(some.tolist(), key=lambda row: (int(keys[row]), names[row].tobytes(), low[row].tobytes()))
@@ -49,14 +39,22 @@ def salt(identity: Bytes, low: Bytes) -> bytes:
     return hashlib.sha256(_LABEL + identity.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
 
 
-def _ranks(used: Words, layout: Layout) -> npt.NDArray[np.uint64]:
+def _ranks(gaussians: Gaussians, layout: Layout) -> npt.NDArray[np.uint64]:
     """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is."""
-    chosen = used[:, layout.columns]
-    doubtful: Flags = near_equal(used, layout) | (exponents(chosen) == 0).any(axis=1)
-    doubtful |= (chosen & _MANTISSA & ~layout.mask[layout.columns] & ~np.uint32(1) == 0).any(axis=1)
-    if layout.quats:
-        doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
-    harmonics = used[:, GEOMETRY:] if used.shape[1] > GEOMETRY else chosen
-    least = 255 - exponents(harmonics).min(axis=1).astype(np.uint64)
-    ranks: npt.NDArray[np.uint64] = doubtful.astype(np.uint64) << np.uint64(8) | least
+    _, *fields = words_of(gaussians)
+    ranks = np.empty(len(gaussians), np.uint64)
+    in_blocks(
+        lambda start, stop: kernels.ranks(
+            start,
+            stop,
+            *fields,
+            layout.mask,
+            layout.shifts,
+            layout.quats,
+            UNIT_TOLERANCE,
+            ranks,
+        ),
+        len(gaussians),
+        KERNEL_BLOCK,
+    )
     return ranks

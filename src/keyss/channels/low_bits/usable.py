@@ -20,7 +20,6 @@ twice as many as expected would be seen.
 from __future__ import annotations
 
 import math
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -28,23 +27,27 @@ import numpy.typing as npt
 import torch
 from scipy.stats import binom
 
+from keyss.channels.low_bits import kernels
 from keyss.channels.low_bits.bits import (
     FIELDS,
     GEOMETRY,
+    KERNEL_BLOCK,
     QUATS,
     UNIT_TOLERANCE,
     UNUSED_BITS,
+    Bytes,
     Flags,
     Layout,
     Words,
-    blocks,
-    coarse_lengths,
     identities,
     used_words,
+    words_of,
 )
-from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
+from keyss.channels.low_bits.multiples import crowded, repeated
+from keyss.channels.low_bits.predictability import EXPONENTS, MOST_ZEROS, Counts, least_exponent
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
+from keyss.rendering.cpu.parallel import in_blocks
 
 LEAST_USABLE = 0.5  # share of the Gaussians of a cover
 # What small numbers may give away: squared separation (d') of a plain file and one with new bits, to somebody
@@ -57,11 +60,9 @@ _GROUP_NAMES = ("log scales", "quaternions", "opacity logits", "harmonics")
 # A value is not random, but a short number, when at least this many low bits of its mantissa are zero. By
 # chance that happens to one value in a million; where there are no more of them than that, it is chance.
 _SHORT_BITS = 20
-_SHORT = np.uint32((1 << _SHORT_BITS) - 1)
-# Nor is a Gaussian, when so many of its values have so many zeros; by chance one in three million is that.
-_ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
+# Nor is a Gaussian, when so many of its values have 12 zeros; by chance one in three million is that.
+_ZERO_FIELDS = 3
 
-_EQUAL_HARMONICS = 2  # pairs; in 1 % of the Gaussians by chance
 _EXACT = 1e-6  # of the length of a unit quaternion in single precision
 # Sets of equal values that there may be by chance: those are left alone, and embedding makes as many again.
 _SETS_BY_CHANCE = 0.1
@@ -71,30 +72,36 @@ _LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in traine
 _CHANCE = 1e-6  # that a model with uniform bits is refused
 
 
-def usable_carriers(gaussians: Gaussians) -> Flags:
-    """[N] which Gaussians have low bits that look like those of trained values, and can be replaced."""
+def usable_carriers(gaussians: Gaussians, names: Bytes | None = None) -> Flags:
+    """[N] which Gaussians have low bits that look like those of trained values, and can be replaced.
+
+    `names` [N, 16]: their identities, where they are known.
+    """
     layout = Layout.of(gaussians)
-    usable = ~_occur_together(gaussians, layout)
-    frequent, short = _frequent_values(gaussians), _has_short_values(gaussians, layout)
-    counts = [np.zeros_like(count_trailing_zeros(np.zeros(0, np.uint32))) for _ in _GROUPS]
-    start = 0
-    for part in blocks(gaussians):
-        used, rows = used_words(part), slice(start, start + len(part))
-        usable[rows] &= _are_measured(used, layout, frequent, short) & ~near_equal(used, layout)
-        if layout.quats:
-            usable[rows] &= ~_have_unit_length(used)
-        for group, count in zip(_GROUPS, counts, strict=True):
-            count += count_trailing_zeros(used[usable[rows], group])
-        start += len(part)
-    least = [least_exponent(count, GIVEN_AWAY / len(_GROUPS)) for count in counts]
-    start = 0
-    for part in blocks(gaussians):
-        used, rows = used_words(part), slice(start, start + len(part))
-        for group, limit in zip(_GROUPS, least, strict=True):
-            if layout.quats or group != QUATS:
-                values = used[:, group]
-                usable[rows] &= ~((exponents(values) < limit) & (values & 1 == 0)).any(axis=1)
-        start += len(part)
+    fields, count = words_of(gaussians)[1:], len(gaussians)
+    usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
+    frequent = _frequent_values(gaussians)
+    ends = np.cumsum([0, *map(len, frequent)])
+    values, groups = np.concatenate(frequent), _group_of_fields(len(layout.mask))
+    mask, shifts, quats = layout.mask, layout.shifts, layout.quats
+
+    def judge(start: int, stop: int) -> Counts:
+        counts = np.zeros((len(_GROUPS), EXPONENTS, MOST_ZEROS + 1), np.int64)
+        of_fields = (mask, shifts, groups, quats, short, values, ends)
+        limits = (_ZERO_FIELDS, UNIT_TOLERANCE, _EXACT)
+        kernels.judge(start, stop, *fields, *of_fields, *limits, usable, counts)
+        return counts
+
+    parts = in_blocks(judge, count, KERNEL_BLOCK)
+    if not parts:
+        return usable
+    counts = np.sum(parts, axis=0)
+    least = np.array([least_exponent(each, GIVEN_AWAY / len(_GROUPS)) for each in counts])
+    in_blocks(
+        lambda start, stop: kernels.leave_small(start, stop, *fields, groups, quats, least, usable),
+        count,
+        KERNEL_BLOCK,
+    )
     return usable
 
 
@@ -159,108 +166,50 @@ def chance_of_bits(words: Words, bits: int) -> float:
     return min(1.0, float(every.min() * len(every)))
 
 
-def near_equal(used: Words, layout: Layout) -> Flags:
-    """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
-
-    Or _EQUAL_HARMONICS pairs of one colour's harmonics, next to each other by size, equal. Decided by the
-    bits that embedding leaves, which by chance are so in some 4 % of all Gaussians. `used`: [N, F] of
-    `used_words`.
-    """
-    shifts = [int(mask).bit_length() for mask in layout.mask]
-    high = ((used & np.uint32(0x7FFFFFFF)) >> np.array(shifts, np.uint32)).astype(np.int32)
-    found = np.zeros(len(used), dtype=bool)
-    together = [high[:, None, 0:3], high[:, GEOMETRY:].reshape(len(used), -1, 3)]
-    if layout.quats:
-        together.append(high[:, None, QUATS])
-    for values in together:
-        for a, b in combinations(range(values.shape[2]), 2):
-            found |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
-    harmonics = np.sort(high[:, GEOMETRY:].reshape(len(used), -1, 3), axis=1)
-    found |= (np.diff(harmonics, axis=1) == 0).sum(axis=(1, 2)) >= _EQUAL_HARMONICS
-    return found
-
-
 def exponents(words: Words) -> npt.NDArray[np.uint8]:
     """[...] the biased binary exponents."""
     return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
 
 
-def _has_short_values(gaussians: Gaussians, layout: Layout) -> bool:
-    """Whether there are more short values than by chance."""
-    found = total = 0
-    for part in blocks(gaussians):
-        used = used_words(part)[:, layout.columns]
-        found += int((((used & _SHORT) == 0) & (exponents(used) > 0)).sum())
-        total += used.size
-    expected = total / 2.0**_SHORT_BITS
-    return bool(found > expected + 5 * (expected + 1) ** 0.5)
-
-
-def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: bool) -> Flags:
-    """[N] whether no number in use is subnormal or frequent, and few have many zeros; if `short`, none is."""
-    large = exponents(used)
-    fine = (large > 0) & (large < 254)
-    if short:
-        fine &= (used & _SHORT) != 0
-    for group, values in zip(_GROUPS, frequent, strict=True):
-        fine[:, group] &= ~np.isin(used[:, group], values)
-    zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
-    measured: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
-    return measured
-
-
-def _have_unit_length(used: Words) -> Flags:
-    """[N] whether a quaternion has it, and whatever its low bits are could have it."""
-    words = np.ascontiguousarray(used[:, QUATS])
-    near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
-    lengths = np.linalg.norm(np.where(near[:, None], words.view(np.float32).astype(np.float64), 0), axis=1)
-    unit: Flags = near & (np.abs(lengths - 1) < _EXACT)
-    return unit
-
-
-def _occur_together(gaussians: Gaussians, layout: Layout) -> Flags:
-    """[N] whether the Gaussian, its scales, its quaternion or two harmonics in a row occur twice.
+def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, bool]:
+    """[N] whether neither the Gaussian, its scales, its quaternion nor two harmonics in a row occur twice.
 
     Of harmonics, those with numbers 1 and 2, 3 and 4 and so on, of all colours. Decided by the bits that
-    embedding leaves.
+    embedding leaves. Then whether there are more short values than by chance.
     """
-    together = [np.arange(3)]
-    if layout.quats:
-        together.append(np.arange(3, 7))
-    together += [np.arange(start, start + 6) for start in range(GEOMETRY, len(layout.mask) - 5, 6)]
-    keys = np.empty((len(together) + 1, len(gaussians)), np.uint64)
-    keys[-1] = identities(gaussians)[:, :8].copy().view("<u8")[:, 0]
-    start = 0
-    for part in blocks(gaussians):
-        high = used_words(part) & ~layout.mask & ~np.uint32(1)
-        for key, columns in zip(keys, together, strict=False):
-            key[start : start + len(part)] = _hashes(high[:, columns])
-        start += len(part)
-    found = np.zeros(len(gaussians), dtype=bool)
+    fields, count = words_of(gaussians)[1:], len(gaussians)
+    keys = np.empty((1 + layout.quats + (len(layout.mask) - GEOMETRY) // 6, count), np.uint64)
+    short = in_blocks(
+        lambda start, stop: kernels.triples(start, stop, *fields, layout.mask, layout.quats, keys),
+        count,
+        KERNEL_BLOCK,
+    )
+    apart = ~repeated(names.view("<u8")[:, 0])
     for key in keys:
-        _, inverse, times = np.unique(key, return_inverse=True, return_counts=True)
-        found |= times[inverse] > 1
-    return found
-
-
-def _hashes(words: Words) -> npt.NDArray[np.uint64]:
-    """[N] of rows [N, C]; equal ones of different rows are as rare as chance."""
-    state = np.zeros(len(words), np.uint64)
-    for column in range(words.shape[1]):
-        state = (state ^ words[:, column]) * np.uint64(0x9E3779B97F4A7C15)
-        state ^= state >> np.uint64(29)
-    return state
+        apart &= ~repeated(key)
+    expected = count * len(layout.columns) / 2.0**_SHORT_BITS
+    return apart, bool(sum(short) > expected + 5 * (expected + 1) ** 0.5)
 
 
 def _frequent_values(gaussians: Gaussians) -> list[Words]:
-    """For each group of fields [V] the values that occur more often than is likely."""
-    used = used_words(gaussians)
+    """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
+    scales, quats, opacities, sh = words_of(gaussians)[1:]
     found = []
-    for group in _GROUPS:
-        flat = np.sort(used[:, group], axis=None)
-        more = _unlikely_copies(flat.size) - 1
-        found.append(np.unique(flat[more:][flat[more:] == flat[: len(flat) - more]]))
+    for words, first in ((scales, 0), (quats, 0), (opacities[:, None], 0), (sh, 3)):
+        copies = _unlikely_copies(words[:, first:].size)
+        flat = np.sort(crowded(words, first, copies))
+        found.append(
+            np.unique(flat[copies - 1 :][flat[copies - 1 :] == flat[: max(0, len(flat) - copies + 1)]])
+        )
     return found
+
+
+def _group_of_fields(count: int) -> npt.NDArray[np.int64]:
+    """[count] the group of each field."""
+    groups = np.zeros(count, np.int64)
+    for number, each in enumerate(_GROUPS):
+        groups[each] = number
+    return groups
 
 
 def _unlikely_copies(count: int) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import as_strided
 
 from keyss.channels.base import Bytes, Content, Payload, RecordRequest, Records
 from keyss.channels.low_bits import parameters, spread
@@ -22,7 +23,7 @@ from keyss.channels.low_bits.ciphers import (
 from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, SALTS, Room, payload_parts
 from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
 from keyss.core.errors import KeyssWarning, UsageError
-from keyss.keys.derivation import DerivedKey, expand, stream
+from keyss.keys.derivation import DerivedKey, expand, fill, stream
 from keyss.keys.encryption import compressed_size, encrypt, encrypted_size
 
 _NOTICED = (
@@ -43,8 +44,8 @@ class Writer:
         self._room = Room(len(names), width)
         self.order = self._shuffled("order", len(names))  # [C] carriers; what follows is in this order
         self._names = names[self.order]
-        noise = stream(entropy, "low-bits/noise", len(names) * width)
-        self.table = np.frombuffer(bytearray(noise), np.uint8).reshape(len(names), width)
+        self.table = np.empty((len(names), width), np.uint8)
+        fill(entropy, "low-bits/noise", self.table)
         self._next = 0  # carrier that is not in use yet
 
     def payloads(self, contents: Sequence[tuple[Sequence[DerivedKey], Payload]], gaussians: int) -> None:
@@ -107,17 +108,16 @@ class Writer:
         self, index: int, content: Records, rows: npt.NDArray[np.int64], slots: npt.NDArray[np.int64]
     ) -> None:
         """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
-        size = self._room.width // content.plan.cells_per_carrier
+        count, width = content.plan.cells_per_carrier, self._room.width
+        cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
         split = len(content.records)
         for label, records, part in (
             ("record", content.records, slice(split)),
             ("copy", content.records[content.copied], slice(split, None)),
         ):
             cipher = CellCipher(self._data_key(index), label, records.shape[1])
-            columns = (slots[part] * size)[:, None] + np.arange(cipher.cell_bytes)
-            self.table[rows[part, None], columns] = cipher.encrypt(
-                self._names[rows[part]], records, slots[part]
-            )
+            encrypted = cipher.encrypt(self._names[rows[part]], records, slots[part])
+            cells[rows[part], slots[part], : cipher.cell_bytes] = encrypted
 
     def _shuffled(self, label: str, count: int) -> npt.NDArray[np.int64]:
         """[count] the numbers from 0 on in random order."""
@@ -142,5 +142,8 @@ class Writer:
 
 def digest(content: Content) -> bytes:
     """32 bytes that say which content it is."""
-    data = content.data if isinstance(content, Payload) else content.header + content.records.tobytes()
-    return hashlib.sha256(data).digest()
+    if isinstance(content, Payload):
+        return hashlib.sha256(content.data).digest()
+    state = hashlib.sha256(content.header)
+    state.update(np.ascontiguousarray(content.records).data)
+    return state.digest()

@@ -14,7 +14,16 @@ from keyss.channels.rooms import room_in
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
-from keyss.methods.base import Context, KeyedSource, Outlook, SceneInput, Source, Stego, advising
+from keyss.methods.base import (
+    Capabilities,
+    Context,
+    KeyedSource,
+    Outlook,
+    SceneInput,
+    Source,
+    Stego,
+    advising,
+)
 from keyss.methods.carry.options import PRESETS, CarryOptions
 from keyss.methods.dither import dither, sampled
 from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
@@ -47,6 +56,7 @@ class CarryMethod:
     summary = "carry models in the low bits of the cover's"
     trains = False
     most_secrets = 256
+    capabilities = Capabilities()
     options = CarryOptions
     presets: Mapping[str, CarryOptions] = PRESETS
 
@@ -115,14 +125,14 @@ class CarryMethod:
                     room, keys, models, views, prune=options.prune_to_fit, entropy=context.entropy
                 )
             seconds = time.monotonic() - start
-            return Stego(written.stego, written.opened, seconds, details=written.details)
+            return Stego(written.stego, written.opened, seconds, details=written.details, verified=True)
         check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
         with advising(InputError, _ANY if options.dither else _DITHER):
             prepared = _prepared(cover.model, options, context.entropy)
         counts = _counts(prepared, models, options)
         found = embed_models(prepared, keys, models, counts, NAME, entropy=context.entropy)
         seconds = time.monotonic() - start
-        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model))
+        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model), verified=True)
 
     def unpack(self, content: Content) -> CarriedSecret:
         """The Gaussians that are left. Raises InputError for damage."""

@@ -9,8 +9,16 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
-from keyss.fitting.density import CappedStrategy
+from keyss.fitting.checkpoint import (
+    State,
+    pack_density,
+    pack_network,
+    pack_optimizers,
+    unpack_density,
+    unpack_network,
+    unpack_optimizers,
+)
+from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
@@ -19,11 +27,8 @@ from keyss.keys.derivation import random_embeddings
 from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
 from keyss.methods.learned.start import make_start
-from keyss.methods.learned.targets import CombinedPoses, PlacedScene, possibly_seen
+from keyss.methods.poses import CombinedPoses, PlacedScene, possibly_seen
 from keyss.rendering import render_with_meta
-
-# A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
-Drawn = tuple[dict[str, Any], Tensor | None, float]
 
 
 class JointRun:
@@ -167,9 +172,7 @@ class JointRun:
 
     def state(self) -> tuple[State, dict[str, Any]]:
         tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
-        tensors |= {f"decoders.{name}": value for name, value in self._all_decoders.state_dict().items()}
-        for index, moments in self.decoder_optimizer.state_dict()["state"].items():
-            tensors |= {f"decoder_adam.{index}.{name}": value for name, value in moments.items()}
+        tensors |= pack_network("decoders", self._all_decoders, self.decoder_optimizer)
         tensors |= {"owners": self.owner_order.state(), "generator": self.generator.get_state()}
         tensors |= {f"order.{i}": shuffle.state() for i, shuffle in enumerate(self.shuffles)}
         tensors |= {f"order_generator.{i}": order.get_state() for i, order in enumerate(self.orders)}
@@ -178,41 +181,10 @@ class JointRun:
     def load(self, tensors: State, meta: dict[str, Any]) -> None:
         unpack_optimizers(tensors, self.parameters, self.optimizers)
         unpack_density(tensors, self.density, self.device)
-        prefix = "decoders."
-        self._all_decoders.load_state_dict(
-            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        )
-        adam = self.decoder_optimizer.state_dict()
-        for name, value in tensors.items():
-            if name.startswith("decoder_adam."):
-                _, index, key = name.split(".")
-                adam["state"].setdefault(int(index), {})[key] = value
-        self.decoder_optimizer.load_state_dict(adam)
+        unpack_network(tensors, "decoders", self._all_decoders, self.decoder_optimizer)
         self.owner_order.load(tensors["owners"])
         for i, shuffle in enumerate(self.shuffles):
             shuffle.load(tensors[f"order.{i}"])
             self.orders[i].set_state(tensors[f"order_generator.{i}"])
         self.generator.set_state(tensors["generator"])
         self.iteration = int(meta["iteration"])
-
-
-def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
-    """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
-
-    `drawn` holds for each render its meta, the indices of the Gaussians it was made of (None: all
-    `count`), and the weight of its loss, by which its gradients are divided to be as large as those that
-    the thresholds of plain 3DGS are meant for.
-    """
-    device = drawn[0][0]["means2d"].device
-    gradients = torch.zeros(len(drawn), count, 2, device=device)
-    radii = torch.zeros(len(drawn), count, 2, device=device)
-    width, height = drawn[0][0]["width"], drawn[0][0]["height"]
-    for row, (meta, indices, weight) in enumerate(drawn):
-        where = slice(None) if indices is None else indices
-        size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
-        gradients[row, where] = meta["means2d"].grad[0] * (size / weight)
-        radii[row, where] = meta["radii"][0].float()
-    means2d = torch.zeros_like(gradients)
-    means2d.grad = gradients
-    batch = {"width": width, "height": height, "n_cameras": 1, "gaussian_ids": None}
-    return {"means2d": means2d, "radii": radii, **batch}

@@ -25,7 +25,16 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.base import Context, KeyedSource, Opened, Outlook, SceneInput, Source, Stego
+from keyss.methods.base import (
+    Capabilities,
+    Context,
+    KeyedSource,
+    Opened,
+    Outlook,
+    SceneInput,
+    Source,
+    Stego,
+)
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
 from keyss.methods.learned.joint import JointRun
 from keyss.methods.learned.options import PRESETS, LearnedOptions, sized, training_options
@@ -35,11 +44,11 @@ from keyss.methods.learned.refit import hide_refitted
 from keyss.methods.learned.room import (
     carriers_of,
     check_room,
-    divided,
     record_degree,
     secret_sizes,
 )
-from keyss.methods.learned.targets import PlacedScene
+from keyss.methods.points import divided
+from keyss.methods.poses import PlacedScene
 from keyss.methods.records.embedding import unpack_records
 from keyss.methods.records.prospect import outlook_whole
 from keyss.rendering.difference import cost
@@ -54,6 +63,7 @@ class LearnedMethod:
     summary = "train the secrets for the cover, then carry them"
     trains = True
     most_secrets = 9
+    capabilities = Capabilities()
     options = LearnedOptions
     presets: Mapping[str, LearnedOptions] = PRESETS
 

@@ -17,6 +17,7 @@ from keyss.channels.rooms import Room, room_in
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.loop import of_secret
 from keyss.fitting.plain import refit_model
 from keyss.keys import DerivedKey
 from keyss.methods.base import Context, KeyedSource, Source, Stego
@@ -74,7 +75,7 @@ def hide_refitted(
             title="refit of the secret" if len(secrets) == 1 else f"refit of secret {index}",
             checkpoint=context.checkpoints / f"secret-{index}.safetensors" if context.checkpoints else None,
             resume=context.resume,
-            reporter=context.reporter,
+            reporter=of_secret(context.reporter),
         )
         models.append(found.gaussians)
         seconds += found.seconds

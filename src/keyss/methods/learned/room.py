@@ -21,6 +21,7 @@ from keyss.methods.dither import dither, raised, sampled
 from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.options import LearnedOptions, decoder_shape, training_options
 from keyss.methods.learned.payload import ANCHORS, HiddenSecret, pack_secret
+from keyss.methods.points import divided
 from keyss.methods.records.encoding import record_request
 from keyss.methods.records.table import Table
 
@@ -87,20 +88,6 @@ def secret_sizes(wanted: Sequence[int], cover: int, carriers: int, options: Lear
         return [min(count, each) for count in most]
     requests = [record_request(count, degree) for count in most]
     return divided(most, [1.0] * len(most), record_capacity(requests, carriers, sh_degree))
-
-
-def divided(available: Sequence[int], weights: Sequence[float], total: int) -> list[int]:
-    """`total` items divided by `weights`, nowhere more than `available`; what is left over is given on."""
-    shares = [0] * len(available)
-    while (left := total - sum(shares)) > 0:
-        open_ends = [i for i in range(len(available)) if shares[i] < available[i]]
-        if not open_ends:
-            break
-        weight = sum(weights[i] for i in open_ends)
-        for i in open_ends:
-            fair = max(1, int(left * weights[i] / weight))
-            shares[i] += min(fair, available[i] - shares[i], total - sum(shares))
-    return shares
 
 
 def check_room(options: LearnedOptions, models: Sequence[Gaussians | None]) -> None:

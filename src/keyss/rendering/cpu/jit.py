@@ -37,6 +37,11 @@ def finite_kernel(function: Any) -> Any:
     return _compiled(function, fastmath=True)
 
 
+def exact_kernel(function: Any) -> Any:
+    """Compile `function` at its first call; it computes what the source says, in that order, as IEEE says."""
+    return _compiled(function, fastmath=False)
+
+
 def inlined(function: Any) -> Any:
     """For functions that only kernels call: their code becomes part of the kernel's.
 
@@ -50,6 +55,11 @@ def inlined(function: Any) -> Any:
 def finite_inlined(function: Any) -> Any:
     """`inlined`, for functions that only a `finite_kernel` calls."""
     return _compiled(function, fastmath=True, forceinline=True)
+
+
+def exact_inlined(function: Any) -> Any:
+    """`inlined`, for functions that only an `exact_kernel` calls."""
+    return _compiled(function, fastmath=False, forceinline=True)
 
 
 def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:

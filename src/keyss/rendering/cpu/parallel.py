@@ -1,4 +1,4 @@
-"""Runs a kernel on several threads.
+"""Runs kernels on several threads.
 
 Kernels release the GIL and take their work in small pieces from a shared counter, so ordinary Python
 threads drive them. Compared with numba's own `prange` this costs no second compilation, is safe to call
@@ -9,12 +9,14 @@ The pieces never depend on the number of threads, hence nor do the results.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+
+T = TypeVar("T")
 
 _CORES = os.cpu_count() or 1
 _pools: dict[int, ThreadPoolExecutor] = {}  # one per number of helper threads
@@ -39,6 +41,30 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
         for task in tasks:
             if not task.cancel():
                 task.result()
+
+
+def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[T]:
+    """`function(start, stop)` of all blocks of `size` below `count`, in their order.
+
+    Each runs on one of as many threads as torch uses, which helps where it releases the GIL.
+    """
+    starts = range(0, count, size)
+    results: dict[int, T] = {}
+
+    def work(waiting: Iterator[int]) -> None:
+        for start in waiting:  # the next one of all threads
+            results[start] = function(start, min(start + size, count))
+
+    waiting = iter(starts)
+    helpers = min(torch.get_num_threads(), _CORES, len(starts)) - 1
+    tasks = [_pool(helpers).submit(work, waiting) for _ in range(helpers)]
+    try:
+        work(waiting)
+    finally:
+        for task in tasks:
+            if not task.cancel():
+                task.result()
+    return [results[start] for start in starts]
 
 
 def _pool(helpers: int) -> ThreadPoolExecutor:

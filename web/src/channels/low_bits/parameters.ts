@@ -1,6 +1,7 @@
 /** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
 import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
 import { InputError } from '../../core/errors.ts';
+import { damaged } from '../../keys/encryption.ts';
 
 const VERSION = 2;
 const PREFIX_BYTES = 40;
@@ -51,10 +52,6 @@ export function unpackParameters(parts: Uint8Array[], chunkBytes: number): Param
   if (prefix[1] !== 2 || cells < 1 || cells > MOST_CELLS || length > MAX_HEADER_BYTES) throw damaged();
   const header = firstBytes(best, PREFIX_BYTES + length).subarray(PREFIX_BYTES);
   return { service: 'records', method, cells, recordBytes, header };
-}
-
-export function damaged(): InputError {
-  return new InputError('What this key opens is damaged.');
 }
 
 export function tooMuchRemoved(): InputError {

@@ -1,9 +1,8 @@
 /** Bytes that come out whole or not at all: from chunks to what was encrypted; see docs/format.md, "A payload". */
-import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
-import { ascii, joined, viewOf } from '../../core/bytes.ts';
-import { inflated } from '../../core/inflate.ts';
+import { ascii } from '../../core/bytes.ts';
 import { expand } from '../../keys/derivation.ts';
-import { damaged, type PayloadParameters, tooMuchRemoved } from './parameters.ts';
+import { decrypted } from '../../keys/encryption.ts';
+import { type PayloadParameters, tooMuchRemoved } from './parameters.ts';
 import { decodeCodeword } from '../reed_solomon.ts';
 
 const ASSOCIATED = ascii('keyss/v1/low-bits');
@@ -26,17 +25,4 @@ export function decodePayload(
     data.forEach((row, index) => encrypted.set(row, (codeword * k + index) * chunkBytes));
   });
   return decrypted(expand(dataKey, 'payload-key', 32), encrypted.subarray(0, size), ASSOCIATED);
-}
-
-/** The inverse of `keyss.keys.encryption.encrypt`. Raises InputError when anything is not as it left it. */
-export function decrypted(dataKey: Uint8Array, encrypted: Uint8Array, associated: Uint8Array): Uint8Array {
-  let plain: Uint8Array;
-  try {
-    plain = chacha20poly1305(expand(dataKey, 'payload', 32), new Uint8Array(12), associated).decrypt(encrypted);
-  } catch {
-    throw damaged();
-  }
-  const length = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
-  if (4 + length > plain.length) throw damaged();
-  return inflated(joined(plain.subarray(4, 4 + length)), Math.min(64 << 20, 16 * length + (1 << 20)));
 }

@@ -6,13 +6,14 @@
  */
 import { bytesKey } from '../../core/bytes.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
-import { type Derive, expand, master } from '../../keys/derivation.ts';
+import { type Derive, expand } from '../../keys/derivation.ts';
+import { here } from '../../keys/pool.ts';
+import { damaged } from '../../keys/encryption.ts';
 import type { Content, Payload, Reader, Records } from '../content.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
 import { CellCipher } from './cells.ts';
 import {
-  damaged, mostFrequent, type Parameters, type PayloadParameters, type RecordParameters, tooMuchRemoved,
-  unpackParameters,
+  mostFrequent, type Parameters, type PayloadParameters, type RecordParameters, tooMuchRemoved, unpackParameters,
 } from './parameters.ts';
 import { decodePayload } from './payload.ts';
 import { salts } from './salts.ts';
@@ -45,16 +46,19 @@ export class LowBitsReader implements Reader {
     return new LowBitsReader(names, low, width, salts(fields, names, low, width));
   }
 
+  get derivations(): number {
+    return Math.min(SALTS_TRIED, this.salts.length);
+  }
+
   /** What `key` opens, null for nothing. Raises InputError for damage. */
-  async open(key: string, derive: Derive = master): Promise<Content | null> {
+  async open(key: string, derive: Derive = here): Promise<Content | null> {
     const room = this.width >= TAG_BYTES + DATA_KEY_BYTES;
-    const tried = this.salts.slice(0, SALTS_TRIED);
     const dataKeys: Uint8Array[] = [];
-    let [secret, next] = [new Uint8Array(32), derive(key, tried[0])];
-    for (let index = 0; index < tried.length; index++) {
-      secret = new Uint8Array(expand(await next, 'low-bits/key', 32));
-      // The next one is derived by another worker while this one looks through the cells.
-      if (index + 1 < tried.length) next = derive(key, tried[index + 1]);
+    let secret = new Uint8Array(32);
+    // Other workers derive what comes next while this one looks through the cells.
+    const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
+    for (const each of masters) {
+      secret = new Uint8Array(expand(await each, 'low-bits/key', 32));
       if (!room) continue;
       const found = mostFrequent(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
       if (found !== null) dataKeys.push(found);

@@ -1,0 +1,140 @@
+"""What carrying large models takes, from files to files: seconds, processor seconds, memory.
+
+    python benchmarks/large.py                                # 2 million in 2 million
+    python benchmarks/large.py --count 100000 --repeat 3      # the fastest of three
+    python benchmarks/large.py --secret-degree 0 --publish spz --count 100000 --share 0.1
+    python benchmarks/large.py --commands                     # `keyss hide`, pictures and measures included
+
+Each step is a process of its own, key derivation, reading back what was hidden and imports included; kernels
+are compiled before. `copy`
+reads a model and writes it: what the machine takes for the files alone. Where other programs run beside it,
+look at processor seconds, and at their ratio to those of `copy`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from channels.low_bits.trained_like import trained_like
+from keyss import read_model, write_model
+from keyss.channels.low_bits import LOW_BITS
+from keyss.channels.rooms import room_in
+from keyss.methods.records.embedding import embed_models, embed_whole
+from keyss.runs.revealing import reveal_model
+
+KEY = "the key of the benchmark: 7Vw3-Qp"
+STEPS = ("copy", "hide", "reveal")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one process."""
+
+    seconds: float
+    processor: float  # seconds of all threads, those of the system included
+    gibibytes: float  # of memory, at most
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--count", type=int, default=2_000_000, help="Gaussians of the cover, of SH degree 3")
+    parser.add_argument("--share", type=float, default=1.0, help="Gaussians of the secret for each of these")
+    parser.add_argument("--secret-degree", type=int, default=3, help="of its spherical harmonics")
+    parser.add_argument("--publish", default="ply", choices=["ply", "spz", "sog", "compressed-ply", "any"])
+    parser.add_argument("--repeat", type=int, default=1, help="runs of each step; the fastest counts")
+    parser.add_argument("--commands", action="store_true", help="of the command line, with all that it does")
+    parser.add_argument("--step", nargs=2, metavar=("STEP", "FOLDER"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.step:
+        _step(options.step[0], Path(options.step[1]), options)
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "key.txt").touch(mode=0o600)
+        (folder / "key.txt").write_text(KEY)
+        small = folder / "small"
+        small.mkdir()
+        few = [*_arguments(options), "--count", "2000"]
+        for step in ("make", *STEPS):  # everything is compiled then
+            _run([sys.executable, __file__, "--step", step, str(small), *few])
+        _run([sys.executable, __file__, "--step", "make", name, *_arguments(options)])
+        found = {step: _fastest(step, folder, options) for step in STEPS}
+    print("| step | seconds | processor seconds | of them for each of `copy` | GiB |")
+    print("| --- | --- | --- | --- | --- |")
+    for step, cost in found.items():
+        ratio = cost.processor / found["copy"].processor
+        numbers = f"{cost.seconds:.1f} | {cost.processor:.1f} | {ratio:.1f} | {cost.gibibytes:.2f}"
+        print(f"| {step} | {numbers} |")
+
+
+def _fastest(step: str, folder: Path, options: argparse.Namespace) -> Cost:
+    if options.commands and step != "copy":
+        command = _command(step, folder, options)
+    else:
+        command = [sys.executable, __file__, "--step", step, str(folder), *_arguments(options)]
+    return min((_run(command) for _ in range(options.repeat)), key=lambda cost: cost.processor)
+
+
+def _arguments(options: argparse.Namespace) -> list[str]:
+    names = ("count", "share", "secret_degree", "publish")
+    return [part for name in names for part in ("--" + name.replace("_", "-"), str(getattr(options, name)))]
+
+
+def _command(step: str, folder: Path, options: argparse.Namespace) -> list[str]:
+    run, key = [sys.executable, "-m", "keyss", step], ["--key-file", str(folder / "key.txt"), "--overwrite"]
+    if step == "hide":
+        models = ["--cover", str(folder / "cover.ply"), "--secret", str(folder / "secret.ply")]
+        return [*run, "--method", "carry", "--publish", options.publish, *models, *key, "-o", f"{folder}/run"]
+    suffix = "ply" if options.publish in ("ply", "any") else options.publish.replace("-", ".")
+    return [*run, f"{folder}/run/publish/stego.{suffix}", *key, "-o", f"{folder}/revealed.ply"]
+
+
+def _run(command: list[str]) -> Cost:
+    """Raises SystemExit where it fails."""
+    start = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    if code := os.waitstatus_to_exitcode(status):
+        raise SystemExit(f"{' '.join(command)}: status {code}")
+    kibibytes = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
+    return Cost(seconds, usage.ru_utime + usage.ru_stime, kibibytes / 2**20)
+
+
+def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
+    suffix = "ply" if options.publish in ("ply", "any") else options.publish.replace("-", ".")
+    stego = folder / f"stego.{suffix}"
+    hidden = max(1, round(options.share * options.count))
+    if step == "make":
+        write_model(folder / "cover.ply", trained_like(options.count, 0))
+        write_model(folder / "secret.ply", trained_like(hidden, 1, options.secret_degree))
+    elif step == "copy":
+        write_model(folder / "copy.ply", read_model(folder / "cover.ply"))
+    elif step == "hide":
+        cover, secret = read_model(folder / "cover.ply"), read_model(folder / "secret.ply")
+        if options.publish == "ply":
+            found = embed_models(LOW_BITS.prepare(cover), [KEY], [secret], [hidden], "carry")
+            write_model(stego, found.stego)
+        else:
+            room = room_in(cover, options.publish, "appended")
+            write_model(stego, embed_whole(room, [KEY], [secret], prune=False).stego)
+    else:
+        revealed = reveal_model(read_model(stego), KEY, device=torch.device("cpu")).gaussians
+        write_model(folder / "revealed.ply", revealed)
+        if len(revealed) != hidden:
+            raise SystemExit(f"{len(revealed):,} of {hidden:,} Gaussians came out")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Gaussians of which a network makes pictures out of what the rasterizer draws: nearly a 3DGS model."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+
+MOST_FEATURES = 32  # channels that rasterizers draw at once
+MOST_LAYERS, MOST_CHANNELS = 16, 256  # of a network: files of others may ask for any memory
+Layers = tuple[tuple[Tensor, Tensor], ...]  # weight [out, in, 3, 3] and bias [out] of each
+
+
+@dataclass(frozen=True)
+class PictureNetwork:
+    """3x3 convolutions with ReLU between them, over pictures [H, W, C], zeros outside; the last gives RGB.
+
+    Raises ValueError where the layers do not follow each other, from `background`'s channels to 3.
+    """
+
+    layers: Layers
+    background: Tensor  # [C] what is drawn behind everything, before the network sees it
+
+    def __post_init__(self) -> None:
+        channels = len(self.background)
+        if not 1 <= channels <= MOST_FEATURES or not 1 <= len(self.layers) <= MOST_LAYERS:
+            raise ValueError(f"expected 1 to {MOST_FEATURES} channels and 1 to {MOST_LAYERS} layers")
+        for weight, bias in self.layers:
+            if weight.dim() != 4 or tuple(weight.shape[1:]) != (channels, 3, 3):
+                raise ValueError(f"weight: expected [out, {channels}, 3, 3], got {list(weight.shape)}")
+            channels = len(weight)
+            if tuple(bias.shape) != (channels,) or not 1 <= channels <= MOST_CHANNELS:
+                raise ValueError(
+                    f"bias: expected [{channels}], {MOST_CHANNELS} at most, got {list(bias.shape)}"
+                )
+        if channels != 3:
+            raise ValueError(f"layers: expected 3 channels from the last, got {channels}")
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> PictureNetwork:
+        """The network with `function` applied to each tensor."""
+        layers = tuple((function(weight), function(bias)) for weight, bias in self.layers)
+        return PictureNetwork(layers, function(self.background))
+
+    def tensors(self) -> Sequence[Tensor]:
+        """All of them in a fixed order."""
+        return [self.background, *(each for layer in self.layers for each in layer)]
+
+
+class DecodedGaussians(Gaussians):
+    """Gaussians, channels of anything in place of their colours where there are some, and the network.
+
+    What selects, moves or transforms Gaussians gives these again; changing a field by `dataclasses.replace`
+    is what `like` is for.
+    """
+
+    __slots__ = ("features", "network")  # and not in vars(), which are the tensors of every model
+
+    features: Tensor | None  # [N, C]; None: the harmonics are drawn
+    network: PictureNetwork
+
+    @staticmethod
+    def of(model: Gaussians, network: PictureNetwork, features: Tensor | None = None) -> DecodedGaussians:
+        """`model` as `network` shows it. Raises ValueError for channels that do not fit."""
+        shape = None if features is None else tuple(features.shape)
+        channels = 3 if shape is None else len(network.background)
+        if len(network.background) != channels or shape not in (None, (len(model), channels)):
+            raise ValueError(f"features: expected [{len(model)}, {len(network.background)}], got {shape}")
+        found = DecodedGaussians(model.means, model.quats, model.log_scales, model.opacity_logits, model.sh)
+        object.__setattr__(found, "features", features)
+        object.__setattr__(found, "network", network)
+        return found
+
+    def like(self, changed: Gaussians) -> Gaussians:
+        return DecodedGaussians.of(changed, self.network, self.features)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        features = None if self.features is None else function(self.features)
+        return DecodedGaussians.of(super().map(function), self.network, features)
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        moved = super().to(device)
+        assert isinstance(moved, DecodedGaussians)
+        return DecodedGaussians.of(moved, self.network.map(lambda each: each.to(device)), moved.features)
+
+    def with_sh_degree(self, degree: int) -> Gaussians:
+        plain = Gaussians(self.means, self.quats, self.log_scales, self.opacity_logits, self.sh)
+        return self.like(plain.with_sh_degree(degree))
+
+    def digest(self) -> str:
+        state = hashlib.sha256(super().digest().encode())
+        for each in (*(() if self.features is None else (self.features,)), *self.network.tensors()):
+            state.update(f"{list(each.shape)}".encode() + each.detach().cpu().contiguous().numpy().tobytes())
+        return state.hexdigest()

@@ -1,0 +1,69 @@
+"""Models that a network decodes, as safetensors: no format of anybody else's, and nothing executable in it.
+
+Tensors of single precision: `means` [N, 3], `quats` [N, 4], `log_scales` [N, 3], `opacity_logits` [N],
+`sh` [N, K, 3]; `features` [N, C] where they stand in for the harmonics; `background` [C]; and of each layer,
+from 0 on, `layer.I.weight` [out, in, 3, 3] and `layer.I.bias` [out].
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from keyss.core.decoded import DecodedGaussians, PictureNetwork
+from keyss.core.errors import InputError, OutputError
+from keyss.core.gaussians import Gaussians
+
+FORMAT = "keyss-decoded/1"
+
+_NAMES = tuple(each.name for each in fields(Gaussians))
+
+
+def write_decoded(model: DecodedGaussians) -> bytes:
+    """The bytes of a file. Raises OutputError for a model that is empty or not finite."""
+    tensors = {name: getattr(model, name) for name in _NAMES} | {"background": model.network.background}
+    if model.features is not None:
+        tensors["features"] = model.features
+    for index, (weight, bias) in enumerate(model.network.layers):
+        tensors |= {f"layer.{index}.weight": weight, f"layer.{index}.bias": bias}
+    kept = {name: each.detach().cpu().float().contiguous() for name, each in tensors.items()}
+    if wrong := [name for name, each in kept.items() if not bool(each.isfinite().all())]:
+        raise OutputError(f"NaN or infinite values in {', '.join(wrong)}")
+    if not len(model):
+        raise OutputError("it holds no Gaussians")
+    return safetensors.torch.save(kept, {"format": FORMAT})
+
+
+def read_decoded(data: bytes) -> Gaussians:
+    """The model of `write_decoded`. Raises InputError."""
+    try:
+        tensors = safetensors.torch.load(data)
+    except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise InputError(f"expected a model that a network decodes: {str(error)[:200]}") from error
+    wrong = [
+        name for name, each in tensors.items() if each.dtype != torch.float32 or not each.isfinite().all()
+    ]
+    if wrong:
+        raise InputError(f"expected finite numbers of single precision in {', '.join(sorted(wrong))[:200]}")
+    try:
+        return _of_tensors(tensors)
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(f"expected a model that a network decodes: {str(error)[:200]}") from error
+
+
+def _of_tensors(tensors: dict[str, Tensor]) -> DecodedGaussians:
+    model = Gaussians(*(tensors.pop(name) for name in _NAMES))
+    features, background = tensors.pop("features", None), tensors.pop("background")
+    if len(model) == 0:
+        raise ValueError("it holds no Gaussians")
+    if background.dim() != 1:
+        raise ValueError(f"background: expected [channels], got {list(background.shape)}")
+    count = len(tensors) // 2
+    layers = tuple((tensors.pop(f"layer.{i}.weight"), tensors.pop(f"layer.{i}.bias")) for i in range(count))
+    if tensors:
+        raise ValueError(f"unexpected {', '.join(sorted(tensors))}")
+    return DecodedGaussians.of(model, PictureNetwork(layers, background), features)

@@ -1,0 +1,65 @@
+"""Files that are handed over: what somebody needs beside the published model to see a secret.
+
+Methods whose secrets do not lie in the published model alone have one for each. It is sealed with the
+secret's key where the method has keys; else whoever has the file sees the secret.
+
+    magic (16 bytes) | method (15) | 1 if sealed, else 0 | salt (16, zeros where not sealed) | content
+"""
+
+from __future__ import annotations
+
+import os
+
+from keyss.channels.base import METHOD_BYTES, Payload, pack_method, unpack_method
+from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES
+from keyss.keys.encryption import DATA_KEY_BYTES, decrypt, encrypt
+
+SUFFIX = ".keyss"
+MOST_BYTES = 1 << 30
+_MAGIC = b"keyss handed 1\0\0"
+_HEADER = len(_MAGIC) + METHOD_BYTES + 1 + SALT_BYTES
+_NOT_ONE = "expected a file that was handed over, as `keyss hide` writes them for some methods"
+
+
+def pack(payload: Payload, key: str | None) -> bytes:
+    """The bytes of a file, sealed if there is a key."""
+    start = _MAGIC + pack_method(payload.method)
+    if key is None:
+        return start + bytes(1 + SALT_BYTES) + payload.data
+    header = start + b"\1" + os.urandom(SALT_BYTES)
+    return header + encrypt(_data_key(header, key), payload.data, header)
+
+
+def is_sealed(data: bytes) -> bool:
+    """Whether it takes a key. Raises InputError for anything but such a file."""
+    if len(data) < _HEADER or not data.startswith(_MAGIC):
+        raise InputError(f"{_NOT_ONE}, got something else")
+    sealed = data[len(_MAGIC) + METHOD_BYTES]
+    if sealed not in (0, 1):
+        raise InputError(f"{_NOT_ONE}, got a damaged one")
+    return bool(sealed)
+
+
+def unpack(data: bytes, key: str | None) -> Payload:
+    """What `pack` got. Raises InputError, WrongKeyError, and UsageError for one key too few or too many."""
+    sealed, header, content = is_sealed(data), data[:_HEADER], data[_HEADER:]
+    try:
+        method = unpack_method(header[len(_MAGIC) :])
+    except UnicodeDecodeError as error:
+        raise InputError(f"{_NOT_ONE}, got a damaged one") from error
+    if not sealed:
+        if key is not None:
+            raise UsageError(f"the method {method} has no keys: whoever has this file sees the secret")
+        return Payload(method, content)
+    if key is None:
+        raise UsageError("this file is sealed with a key: give it")
+    try:
+        return Payload(method, decrypt(_data_key(header, key), content, header))
+    except InputError as error:
+        raise WrongKeyError("this key opens nothing here, or the file is damaged") from error
+
+
+def _data_key(header: bytes, key: str) -> bytes:
+    return DerivedKey(key, KeyDerivation(salt=header[-SALT_BYTES:])).expand("handed", DATA_KEY_BYTES)

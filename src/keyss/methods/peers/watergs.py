@@ -1,0 +1,272 @@
+"""Splats in Splats, also WaterGS (Guo et al. 2024): harmonics in the low bits of harmonics, mapped opacities.
+
+Both scenes share positions, scales and rotations. The secret's harmonics lie encrypted in the low bits of the
+cover's, and its opacities are what a small convolutional autoencoder makes of the cover's. The published file
+is a 3DGS model; the autoencoder and what decrypts are handed over, sealed with the key.
+
+The paper leaves open how many bits there are and when the autoencoder is trained; what is chosen here:
+
+- *importance-graded* both ways: the secret's constant coefficients get most bits, degree 3 the fewest, and
+  the bits that matter most lie where they cost the cover least, at the bottom of its highest degrees;
+- once no Gaussians are added any more, they are sorted along a Morton curve, so that neighbours in the list
+  are neighbours in space; the autoencoder is fitted to the opacities that the secret has by then, and takes
+  their place for the rest of the training, so that everything else makes up for what it misses.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.core.similarity import Similarity
+from keyss.files.formats.common import morton_order
+from keyss.fitting.parameters import make_optimizers
+from keyss.keys.derivation import stream
+from keyss.methods.base import Capabilities
+from keyss.methods.peers.joint import JointPeer
+from keyss.methods.peers.options import PeerOptions, presets_of
+from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.peers.training import PeerRun, Picture
+from keyss.methods.poses import PlacedScene
+from keyss.rendering import render_with_meta
+
+NAME = "watergs"
+COVER_BITS = (8, 10, 12, 14)  # of the 23 of a mantissa, by degree
+SECRET_BITS = (16, 13, 11, 10)  # of a coefficient where there is room for all, by degree
+WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # of the autoencoder, along the list of Gaussians
+_FIT_STEPS = 200  # of the autoencoder, to the opacities that it takes the place of
+_RANGE = 0.999  # of the coefficients of a degree, but for the constant ones; larger ones are cut off
+_BLOCK = 1 << 14  # Gaussians at a time
+_CIPHER_BYTES = 32
+
+Words = npt.NDArray[np.uint32]
+Bits = npt.NDArray[np.uint8]
+
+
+def graded_bits(degree: int) -> tuple[int, ...]:
+    """Bits of a secret's coefficients by degree, in a model of SH `degree`: as many as have room."""
+    room = sum((2 * each + 1) * COVER_BITS[each] for each in range(degree + 1))
+    for less in range(SECRET_BITS[0]):
+        found = tuple(max(0, SECRET_BITS[each] - less) for each in range(degree + 1))
+        if sum((2 * each + 1) * bits for each, bits in enumerate(found)) <= room:
+            return found
+    raise ValueError(f"no room for harmonics of degree {degree}")
+
+
+@cache
+def _places(degree: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """(coefficient, bit) of the secret's bits, those that matter most first, and of where they lie.
+
+    There are more of the second kind. Bit 0 is the lowest.
+    """
+    degrees = [math.isqrt(index) for index in range((degree + 1) ** 2)]
+    sizes = graded_bits(degree)
+    secret = [(index, bit) for index, each in enumerate(degrees) for bit in range(sizes[each])]
+    # What a bit is worth: high ones of the codes, and of these the ones of low degrees.
+    secret.sort(key=lambda place: (sizes[degrees[place[0]]] - place[1], degrees[place[0]]))
+    cover = [(index, bit) for index, each in enumerate(degrees) for bit in range(COVER_BITS[each])]
+    cover.sort(key=lambda place: (place[1], -degrees[place[0]]))
+    return secret, cover
+
+
+def ranges_of(sh: Tensor) -> Tensor:
+    """[degree + 1] within which nearly all coefficients of each degree lie."""
+    found = []
+    for degree in range(math.isqrt(sh.shape[1])):
+        values = sh[:, degree**2 : (degree + 1) ** 2].abs().flatten().double().numpy()
+        found.append(max(float(np.quantile(values, _RANGE if degree else 1)), 1e-6))
+    return torch.tensor(found)
+
+
+def write_bits(cover: Tensor, secret: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
+    """`cover` [N, K, 3] with `secret` [N, K, 3] in its low bits, all of which get what looks random."""
+    degree = math.isqrt(cover.shape[1]) - 1
+    sizes, (places, homes) = graded_bits(degree), _places(degree)
+    words = cover.contiguous().numpy().view(np.uint32).copy()
+    for block, noise in _blocks(len(cover), len(homes), cipher):
+        bits = noise
+        codes = _codes(secret[block], ranges, sizes)
+        for row, (index, bit) in enumerate(places):
+            bits[:, row] ^= ((codes[:, index] >> np.uint32(bit)) & np.uint32(1)).astype(np.uint8)
+        part = words[block]
+        for row, (index, bit) in enumerate(homes):
+            one = np.uint32(1 << bit)
+            part[:, index] = (part[:, index] & ~one) | (bits[:, row].astype(np.uint32) << np.uint32(bit))
+    return torch.from_numpy(words.view(np.float32))
+
+
+def read_bits(stego: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
+    """The secret [N, K, 3] of `write_bits`, rounded."""
+    degree = math.isqrt(stego.shape[1]) - 1
+    sizes, (places, homes) = graded_bits(degree), _places(degree)
+    words = stego.contiguous().numpy().view(np.uint32)
+    found = np.empty(words.shape, np.float32)
+    for block, bits in _blocks(len(words), len(homes), cipher):
+        part = words[block]
+        codes = np.zeros(part.shape, np.uint32)
+        for row, ((index, bit), (home, low)) in enumerate(zip(places, homes, strict=False)):
+            value = ((part[:, home] >> np.uint32(low)) & np.uint32(1)) ^ bits[:, row]
+            codes[:, index] |= value << np.uint32(bit)
+        for index in range(stego.shape[1]):
+            each = math.isqrt(index)
+            step = 2 * float(ranges[each]) / max(1, 2 ** sizes[each] - 1)
+            found[block, index] = codes[:, index] * step - float(ranges[each])
+    return torch.from_numpy(found)
+
+
+def _codes(secret: Tensor, ranges: Tensor, sizes: Sequence[int]) -> Words:
+    """[n, K, 3] coefficients as whole numbers of so many bits."""
+    codes = np.empty(secret.shape, np.uint32)
+    for index in range(codes.shape[1]):
+        each = math.isqrt(index)
+        most = 2 ** sizes[each] - 1
+        share = (secret[:, index].double().numpy() / float(ranges[each]) + 1) / 2
+        codes[:, index] = np.rint(share.clip(0, 1) * most)
+    return codes
+
+
+def _blocks(count: int, places: int, cipher: bytes) -> Iterator[tuple[slice, Bits]]:
+    """Slices of the Gaussians, and random bits [n, places, 3] for each, which follow from `cipher`."""
+    for number, start in enumerate(range(0, count, _BLOCK)):
+        size = min(_BLOCK, count - start)
+        total = size * places * 3
+        data = np.frombuffer(stream(cipher, f"watergs/{number}", -(-total // 8)), np.uint8)
+        bits = np.unpackbits(data)[:total].reshape(size, places, 3)
+        yield slice(start, start + size), bits.copy()
+
+
+class OpacityMapping(torch.nn.Module):
+    """From the cover's opacity logits [N] to the secret's, by what lies near in the list."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        pairs = pairwise(WIDTHS)
+        layers = [torch.nn.Conv1d(a, b, KERNEL, padding=KERNEL // 2) for a, b in pairs]
+        self.layers = torch.nn.ModuleList(layers)
+
+    def forward(self, logits: Tensor) -> Tensor:
+        values = logits[None, None]
+        for index, layer in enumerate(self.layers):
+            values = layer(values if index == 0 else values.relu())
+        return values[0, 0]
+
+
+class WaterGsRun(PeerRun):
+    """Two sets of harmonics and of opacities; the second opacities are mapped in the end."""
+
+    def prepare(self, start: Gaussians) -> None:
+        optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
+        self.add("secret_sh", start.sh.clone(), optimizer)
+        self.add("secret_opacities", start.opacity_logits.clone(), self.options.fit.opacities_rate)
+        self.mapping = OpacityMapping()
+        self.networks.append(self.mapping)
+
+    @property
+    def mapped(self) -> bool:
+        """Whether the autoencoder has taken the place of free opacities."""
+        return self.iteration >= int(self.strategy.refine_stop_iter)
+
+    def step(self) -> None:
+        before = self.mapped
+        super().step()
+        if self.mapped and not before:
+            self._sort()
+            self._fit_mapping()
+
+    def opacity_for_pruning(self) -> Tensor:
+        both = self.parameters["opacities"], self.parameters["secret_opacities"]
+        return torch.maximum(*both).sigmoid()
+
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        pictures = []
+        for scene in scenes:
+            logits, sh = self.parameters["opacities"], self.parameters["sh"]
+            if scene:
+                logits = self.mapping(logits) if self.mapped else self.parameters["secret_opacities"]
+                sh = self.parameters["secret_sh"]
+            model = Gaussians(**self.geometry(), opacity_logits=logits, sh=sh)
+            pictures.append(render_with_meta(model, camera, self.backgrounds[scene], sh_degree=sh_degree))
+        return pictures
+
+    @torch.no_grad()
+    def _sort(self) -> None:
+        """The order in which the model is published, and by which the autoencoder goes."""
+        means = self.parameters["means"]
+        order = torch.from_numpy(morton_order(means.detach().cpu().numpy())).to(means.device)
+        for name, parameter in self.parameters.items():
+            for values in (parameter, *self.optimizers[name].state[parameter].values()):
+                if isinstance(values, Tensor) and values.shape == parameter.shape:
+                    values.copy_(values[order])
+
+    def _fit_mapping(self) -> None:
+        """By cross entropy: squared errors of opacities have no slope where these are nearly 0 or 1."""
+        logits = self.parameters["opacities"].detach()
+        wanted = self.parameters["secret_opacities"].detach().sigmoid()
+        adam = torch.optim.Adam(self.mapping.parameters(), lr=5 * self.options.network_rate)
+        for _ in range(_FIT_STEPS):
+            adam.zero_grad()
+            F.binary_cross_entropy_with_logits(self.mapping(logits), wanted).backward()
+            adam.step()
+        adam.zero_grad()
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaterGsOptions(PeerOptions):
+    """See `PeerOptions`."""
+
+
+class WaterGsMethod(JointPeer):
+    """See `keyss.methods.base.Method`."""
+
+    name = NAME
+    summary = "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)"
+    capabilities = Capabilities(hands_over=True)
+    options = WaterGsOptions
+    presets: Mapping[str, PeerOptions] = presets_of(WaterGsOptions)
+
+    def begin(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> WaterGsRun:
+        return WaterGsRun(scenes, options, device)
+
+    def publish(self, run: WaterGsRun, frame: Similarity) -> tuple[Gaussians, HandedTensors]:
+        """All Gaussians: the autoencoder goes by their list."""
+        kept = {name: value.detach().cpu() for name, value in run.parameters.items()}
+        ranges, cipher = ranges_of(kept["secret_sh"]), os.urandom(_CIPHER_BYTES)
+        sh = write_bits(kept["sh"], kept["secret_sh"], ranges, cipher)
+        stego = Gaussians(kept["means"], kept["quats"], kept["scales"], kept["opacities"], sh)
+        tensors = {f"mapping.{name}": value for name, value in run.mapping.state_dict().items()}
+        tensors |= {"ranges": ranges, "cipher": torch.tensor(list(cipher), dtype=torch.uint8)}
+        return stego, HandedTensors(tensors, frame, rows=len(stego))
+
+    def open(self, handed: HandedTensors) -> HandedSecret:
+        mapping = OpacityMapping().requires_grad_(False)
+        names = [f"mapping.{name}" for name in mapping.state_dict()]
+        *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
+        try:
+            mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
+        except RuntimeError as error:
+            raise InputError("what was handed over is damaged: no such autoencoder") from error
+        if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
+            raise InputError("what was handed over is damaged: no such cipher")
+        cipher = bytes(numbers.tolist())
+
+        def show(stego: Gaussians) -> Gaussians:
+            if stego.sh_degree != len(ranges) - 1:
+                raise InputError(f"expected SH degree {len(ranges) - 1}, got {stego.sh_degree}")
+            sh = read_bits(stego.sh, ranges, cipher)
+            logits = mapping(stego.opacity_logits)
+            return Gaussians(stego.means, stego.quats, stego.log_scales, logits, sh)
+
+        return HandedSecret(handed, show)

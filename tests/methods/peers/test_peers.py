@@ -1,0 +1,222 @@
+"""The peers: each hides, is measured, and opens again from the files that are given away."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import keyss
+from keyss import FitConfig, Secret
+from keyss.api import SecretFile, hide_files
+from keyss.audit import audit
+from keyss.cli import main
+from keyss.core import InputError, UsageError, WrongKeyError
+from keyss.core.decoded import DecodedGaussians
+from keyss.core.similarity import Similarity
+from keyss.fitting.checkpoint import State
+from keyss.methods import peers, registry
+from keyss.methods.peers.options import PeerOptions
+from keyss.methods.peers.training import PeerRun
+from keyss.methods.poses import PlacedScene
+from keyss.runs.files import handed_names, stego_in
+from test_api import write_nerfstudio
+from tiny_scenes import random_gaussians, tiny_scene
+
+FIT = FitConfig(iterations=120, max_gaussians=300, sh_degree=1, grow_every=30, evaluate_every=60, seed=0)
+PEERS = [each.name for each in peers.PEERS]
+TRAINED = [each.name for each in peers.PEERS if each.trains]
+KEY = "a key of many characters: 93hXmQ2"
+
+
+def options_of(name: str, **changes: Any) -> PeerOptions:
+    """Small enough for seconds."""
+    found: Any = registry.METHODS[name].options
+    return replace(found(fit=FIT, common_poses=0.5), **changes)  # type: ignore[no-any-return]
+
+
+def key_of(name: str) -> str:
+    return KEY if registry.METHODS[name].capabilities.keys else ""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A hiding of tiny scenes."""
+
+    name: str
+    out: Path
+    result: keyss.HideResult
+
+    @property
+    def keys(self) -> list[str]:
+        return [KEY] if key_of(self.name) else []
+
+    @property
+    def handed(self) -> Path:
+        return self.out / handed_names(1)[0]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("scenes")
+    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
+
+
+@pytest.fixture(scope="module", params=PEERS)
+def made(
+    request: pytest.FixtureRequest, folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> Made:
+    name, out = request.param, tmp_path_factory.mktemp("runs") / "run"
+    secret = Secret(folders[1], key_of(name))
+    result = keyss.hide(folders[0], [secret], method=options_of(name), min_psnr=0, out=out)
+    return Made(name, out, result)
+
+
+def test_what_is_written_is_what_was_measured(made: Made) -> None:
+    files = {str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()}
+    assert files == {
+        str(stego_in(made.out).relative_to(made.out)),
+        *handed_names(1),
+        *(f"private/{name}" for name in ("config.json", "metrics.json", "manifest.json")),
+        *(f"private/{name}.ply" for name in ("cover", "secret-1")),
+    }
+    assert keyss.evaluate(made.out, made.keys) == made.result.metrics
+    assert made.result.metrics.method == made.name
+    for each in made.result.metrics.against_plain:
+        assert each.psnr > each.nothing + 5
+
+
+def test_both_files_show_the_secret(made: Made, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    capabilities = registry.METHODS[made.name].capabilities
+    stego = stego_in(made.out)
+    assert (stego.suffix == ".ply") == capabilities.standard
+    out = tmp_path / ("secret.ply" if capabilities.models else "secret.3dgs.safetensors")
+    key = KEY if capabilities.keys else None
+    keyss.reveal(stego, key, handed=made.handed, out=out)
+    assert isinstance(keyss.read_model(out), DecodedGaussians) != capabilities.models
+    scene = keyss.load_scene(folders[1])
+    pictures = dict(keyss.render(out, folders[1]))
+    errors = [
+        (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
+        for view in scene.test
+    ]
+    psnr = float(-10 * torch.stack(errors).log10().mean())
+    assert psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
+    if not capabilities.models:
+        with pytest.raises(UsageError, match="network"):
+            keyss.reveal(stego, key, handed=made.handed, out=tmp_path / "secret.ply")
+    if capabilities.keys:
+        with pytest.raises(WrongKeyError):
+            keyss.reveal(stego, "wrong", handed=made.handed)
+    else:
+        with pytest.raises(UsageError, match="no keys"):
+            keyss.reveal(stego, KEY, handed=made.handed)
+        with pytest.raises(UsageError, match="no keys"):
+            keyss.evaluate(made.out, [KEY])
+
+
+@pytest.mark.parametrize("at", [0, 20, 31, 60, 200, -1])
+def test_damage_is_told(made: Made, tmp_path: Path, at: int) -> None:
+    data = bytearray(made.handed.read_bytes())
+    key = KEY if key_of(made.name) else None
+    path = tmp_path / "damaged.keyss"
+    path.write_bytes(data[:at])
+    with pytest.raises((InputError, WrongKeyError)):
+        keyss.reveal(stego_in(made.out), key, handed=path)
+    data[at] ^= 0x55
+    path.write_bytes(data)
+    try:
+        keyss.reveal(stego_in(made.out), key, handed=path)
+    except (InputError, UsageError, WrongKeyError):
+        return
+    assert key is None  # a changed number is another number, where nothing is sealed
+
+
+def test_the_command_line(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    monkeypatch.delenv("KEYSS_KEY", raising=False)
+    key = tmp_path / "key.txt"
+    key.touch(0o600)
+    key.write_text(KEY)
+    given = ["--key-file", str(key)] if made.keys else []
+    assert main(["evaluate", str(made.out), *given]) == 0
+    assert f"{made.result.metrics.secrets[0].psnr:.2f}" in capsys.readouterr().out
+    models = registry.METHODS[made.name].capabilities.models
+    out = str(tmp_path / ("a.ply" if models else "a.3dgs.safetensors"))
+    stego = str(stego_in(made.out))
+    assert main(["reveal", stego, "--handed", str(made.handed), *given, "-o", out]) == 0
+    assert main(["info", out]) == 0
+    assert main(["info", str(made.out)]) == 0
+    assert made.name in capsys.readouterr().out
+    assert main(["reveal", stego, "--handed", stego, "-o", str(tmp_path / "b.ply")]) == 4
+    assert "handed over" in capsys.readouterr().err
+
+
+def test_a_key_for_what_has_none_and_what_it_cannot_do_are_refused(folders: tuple[Path, Path]) -> None:
+    with pytest.raises(UsageError, match="no keys"):
+        keyss.hide(folders[0], [Secret(folders[1], KEY)], method="3dgs-sh")
+    with pytest.raises(UsageError, match="1 to 1 secrets"):
+        keyss.hide(folders[0], [Secret(folders[1]), Secret(folders[0])], method="3dgs-sh")
+    with pytest.raises(UsageError, match="publish"):
+        options_of("gs-hider", publish="any")
+    with pytest.raises(UsageError, match="key is empty"):
+        keyss.hide(folders[0], [Secret(folders[1])], method="learned")
+
+
+def test_what_a_network_draws_is_no_cover(made: Made, folders: tuple[Path, Path]) -> None:
+    if registry.METHODS[made.name].capabilities.standard:
+        return
+    stego = stego_in(made.out)
+    for cover, secret in ((stego, folders[1]), (folders[0], stego)):
+        with pytest.raises(UsageError, match="network"):
+            keyss.hide(cover, [Secret(secret, KEY)])
+    with pytest.raises(UsageError, match="network"):
+        hide_files(stego, [SecretFile(made.handed, KEY)], out=made.out.parent / "files")
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
+    """All state is in checkpoints: parameters that a peer adds, networks, moments, the order of poses."""
+    scenes = [tiny_scene(0), tiny_scene(1)]
+    placed = [PlacedScene.of(scene, random_gaussians(50), Similarity.identity()) for scene in scenes]
+    method: Any = registry.METHODS[name]
+    whole, resumed = (method.begin(placed, options_of(name), torch.device("cpu")) for _ in range(2))
+
+    def run_to(run: PeerRun, end: int) -> State:
+        torch.manual_seed(run.iteration)  # which `train` keeps
+        while run.iteration < end:
+            run.step()
+        tensors, _ = run.state()
+        return {key: value.clone() for key, value in tensors.items()}
+
+    resumed.load(run_to(whole, 70), whole.state()[1])
+    ends = [run_to(run, 90) for run in (whole, resumed)]
+    assert ends[0].keys() == ends[1].keys()
+    for key, value in ends[0].items():
+        assert torch.equal(value, ends[1][key]), key
+    assert whole.evaluate() == resumed.evaluate()
+
+
+def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    if made.name not in ("3dgs-decoder", "gs-hider"):  # the others are 3DGS models throughout
+        return
+    standard = registry.METHODS[made.name].capabilities.standard
+    if not standard:
+        with pytest.raises(UsageError, match="no 3DGS model"):
+            audit(made.out, [], only=["images", "stealth"])
+    found = audit(made.out, [], only=["images", "speed"], controls=2)
+    assert found.run.standard == standard
+    assert found.images is not None
+    assert found.images.secrets[0].mean.psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
+    assert found.speed is not None
+    ours = [each for each in found.speed.readers if each.file == "secret 1"]
+    assert ours
+    assert not any(each.loads for each in ours)
+    assert main(["report", str(made.out)]) == 0
+    assert ("no 3DGS model" in (made.out / "private" / "report.html").read_text()) != standard

@@ -1,0 +1,137 @@
+"""Models whose pictures a network makes: drawn, moved, selected, written and read."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from keyss.core import InputError, UsageError
+from keyss.core.decoded import DecodedGaussians, PictureNetwork
+from keyss.core.similarity import Similarity
+from keyss.files import read_model, write_model
+from keyss.files.models import DECODED_SUFFIX
+from keyss.rendering import rasterization, render
+from tiny_scenes import random_gaussians, ring_cameras
+
+CHANNELS = 5
+
+
+def network(channels: int = CHANNELS, widths: tuple[int, ...] = (8, 3)) -> PictureNetwork:
+    generator = torch.Generator().manual_seed(7)
+    layers, before = [], channels
+    for width in widths:
+        weight = 0.3 * torch.randn(width, before, 3, 3, generator=generator)
+        layers.append((weight, torch.randn(width, generator=generator)))
+        before = width
+    return PictureNetwork(tuple(layers), torch.rand(channels, generator=generator))
+
+
+@pytest.fixture
+def model() -> DecodedGaussians:
+    features = torch.randn(50, CHANNELS, generator=torch.Generator().manual_seed(3))
+    return DecodedGaussians.of(random_gaussians(50, sh_degree=1), network(), features)
+
+
+def convolved(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """A 3x3 convolution over [H, W, C], zeros outside, as nine sums: slow and plain."""
+    height, width, _ = image.shape
+    padded = torch.zeros(height + 2, width + 2, image.shape[2])
+    padded[1:-1, 1:-1] = image
+    out = bias.expand(height, width, -1).clone()
+    for y in range(3):
+        for x in range(3):
+            out += padded[y : y + height, x : x + width] @ weight[:, :, y, x].T
+    return out
+
+
+def test_the_picture_is_what_the_layers_make_of_the_features(model: DecodedGaussians) -> None:
+    camera = ring_cameras()[3]
+    assert model.features is not None
+    drawn, _, _ = rasterization(
+        model.means,
+        model.quats,
+        model.scales,
+        model.opacities,
+        model.features,
+        camera.viewmat[None],
+        camera.K[None],
+        camera.width,
+        camera.height,
+        backgrounds=model.network.background[None],
+    )
+    (first, second) = model.network.layers
+    expected = convolved(convolved(drawn[0], *first).relu(), *second)
+    torch.testing.assert_close(render(model, camera), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_without_features_the_network_sees_the_colours_before_its_own_background() -> None:
+    """Whoever draws it says what lies behind *their* scene, which is not what the network learned with."""
+    plain, camera = random_gaussians(50), ring_cameras()[0]
+    identity = torch.zeros(3, 3, 3, 3)
+    identity[range(3), range(3), 1, 1] = 1
+    own = torch.tensor([0.2, 0.4, 0.6])
+    shown = DecodedGaussians.of(plain, PictureNetwork(((identity, torch.zeros(3)),), own))
+    torch.testing.assert_close(render(shown, camera, torch.ones(3)), render(plain, camera, own))
+
+
+def test_selecting_moving_and_turning_keep_the_network(model: DecodedGaussians) -> None:
+    camera = ring_cameras()[3]
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0]]).double())
+    frame = Similarity(1.7, turn, torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64))
+    moved = frame.apply_gaussians(model)
+    torch.testing.assert_close(
+        render(moved, frame.apply_camera(camera)), render(model, camera), atol=2e-3, rtol=1e-3
+    )
+    some = model[torch.arange(50) % 2 == 0].with_sh_degree(0).to("cpu").detach()
+    assert isinstance(some, DecodedGaussians)
+    assert some.features is not None
+    assert (len(some), len(some.features)) == (25, 25)
+    assert model.features is not None
+    assert DecodedGaussians.of(model, network(), -model.features).digest() != model.digest()
+
+
+def test_files_come_and_go_and_no_3dgs_file_takes_it(model: DecodedGaussians, tmp_path: Path) -> None:
+    path = tmp_path / f"a{DECODED_SUFFIX}"
+    write_model(path, model)
+    again = read_model(path)
+    assert isinstance(again, DecodedGaussians)
+    assert again.digest() == model.digest()
+    with pytest.raises(UsageError, match="network"):
+        write_model(tmp_path / "a.ply", model)
+    with pytest.raises(UsageError, match="network"):
+        write_model(tmp_path / f"b{DECODED_SUFFIX}", random_gaussians(10))
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("means", None),
+        ("features", torch.zeros(49, CHANNELS)),
+        ("features", torch.full((50, CHANNELS), math.nan)),
+        ("background", torch.zeros(3, 3)),
+        ("layer.1.bias", torch.zeros(4)),
+        ("layer.0.weight", torch.zeros(8, CHANNELS + 1, 3, 3)),
+        ("layer.0.weight", torch.zeros(8, CHANNELS, 3, 3, dtype=torch.float64)),
+        ("layer.7.bias", torch.zeros(4)),
+        ("quats", torch.zeros(3)),
+    ],
+)
+def test_damage_is_told(model: DecodedGaussians, tmp_path: Path, name: str, change: Tensor | None) -> None:
+    path = tmp_path / f"a{DECODED_SUFFIX}"
+    write_model(path, model)
+    tensors = safetensors.torch.load_file(path)
+    del tensors[name if name in tensors else "sh"]
+    if change is not None:
+        tensors[name] = change
+    path.write_bytes(safetensors.torch.save(tensors))
+    with pytest.raises(InputError):
+        read_model(path)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(InputError):
+        read_model(path)

@@ -1,0 +1,65 @@
+"""Models with secrets that survive other formats, as `make_vectors.py` writes them."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from channels.low_bits.trained_like import trained_like
+from keyss.channels import appended, robust
+from keyss.channels.base import Payload
+from keyss.channels.packing import pack_payload
+from keyss.core.errors import KeyssWarning
+from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.files import write_model
+from keyss.methods.hidden_file import HiddenFile
+from keyss.methods.records import whole
+from keyss.methods.records.embedding import OPENED_BY
+from measure.lifelike import lifelike
+
+NAMES = ("appended.ply", "appended-moved.spz", "colours.spz", "colours-moved.splat")
+NOTE = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
+
+
+def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
+    """In Gaussians that were appended, and in colours: models, and files of other keys."""
+    ply, spz, one, moved = (folder / name for name in NAMES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KeyssWarning)  # of more secrets than one
+        model = with_appended(keys)
+    write_model(ply, model)
+    rows = torch.randperm(len(model), generator=torch.Generator().manual_seed(21))
+    write_model(spz, elsewhere(model[rows[: 9 * len(rows) // 10]]))
+    cover = lifelike(4000, 22).with_sh_degree(0)
+    notes = [
+        (keys[0], pack_payload(NOTE.payload())),
+        (keys[1], pack_payload(Payload("file", b"\0" + b"?" * 9))),
+    ]
+    write_model(one, robust.embed(cover, notes, entropy=bytes(32)))
+    secret = pack_payload(Payload(OPENED_BY, whole.encode(trained_like(12, 25, 0))))
+    write_model(
+        moved, elsewhere(robust.embed(cover[:2300], [(keys[0], secret)], strength=40, entropy=bytes(32)))
+    )
+
+
+def with_appended(keys: tuple[str, str]) -> Gaussians:
+    """Among as many faint Gaussians of its own: places of lattices are not plain to see."""
+    cover = trained_like(120, 23, 0)
+    cover = replace(cover, opacity_logits=torch.where(torch.arange(120) % 2 == 0, -5.5, 2.0))
+    secrets = [
+        (keys[0], Payload(OPENED_BY, whole.encode(trained_like(40, 24, 1)))),
+        (keys[1], NOTE.payload()),
+    ]
+    return appended.embed(cover, secrets, entropy=bytes(32))
+
+
+def elsewhere(model: Gaussians) -> Gaussians:
+    """Moved, turned and scaled."""
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [1.0, 2.0, 3.0]).as_matrix())
+    return Similarity(math.pi / 2, rotation, torch.tensor([3.0, -2.0, 1.0])).apply_gaussians(model)

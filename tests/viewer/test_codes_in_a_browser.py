@@ -1,0 +1,71 @@
+"""Secrets in the codes of published files, end to end in headless Chromium."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from keyss.channels.codes.published import SUFFIXES
+from keyss.channels.rooms import room_in
+from keyss.core.gaussians import Gaussians
+from keyss.files.models import read_model, write_model
+from keyss.methods.records.embedding import embed_whole
+from keyss.rendering.difference import Viewpoints
+from keyss.viewer import export_html
+from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
+
+pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
+
+KEYS = ("the first key", "ein zweiter Schlüssel")
+CLOSE = 25.0  # dB on the canvas
+PUBLISHED = dict[str, tuple[Path, list[Gaussians]]]
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> PUBLISHED:
+    """By format a page with a model of 4,000 Gaussians, and what its two keys open."""
+    folder, found = tmp_path_factory.mktemp("published"), {}
+    for publish, suffix in SUFFIXES.items():
+        room = room_in(made(4000, 0), publish, "appended")  # type: ignore[arg-type]
+        secrets = [made(100, seed).with_sh_degree(1) for seed in (1, 2)]
+        views = [Viewpoints.around(each) for each in secrets]
+        hidden = embed_whole(room, KEYS, secrets, views, prune=False, entropy=bytes(32))
+        write_model(folder / f"stego{suffix}", hidden.stego)
+        (page,) = export_html(folder / f"stego{suffix}", folder / f"{publish}.html")
+        found[suffix] = page, [each.gaussians for each in hidden.opened]
+    return found
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES.values())
+def test_two_keys_open_two_secrets_and_a_wrong_one_nothing(
+    tab: Visit, published: PUBLISHED, suffix: str, tmp_path: Path
+) -> None:
+    page, secrets = published[suffix]
+    tab.goto(page.as_uri() + POSE)
+    cover = tab.picture()
+    assert psnr(cover, drawn(read_model(page.parent / f"stego{suffix}"), POSE)) > CLOSE
+    tab.try_key("another key")
+    assert np.abs(tab.picture() - cover).mean() < 0.01 * 255
+    assert tab.page.locator("#revealed").is_hidden()
+    assert tab.page.locator("[role=status]").inner_text() == tab.page.locator("#problem").inner_text() == ""
+    for key, secret in zip(KEYS, secrets, strict=True):
+        tab.try_key(key)
+        tab.at(POSE)
+        shown = tab.picture()
+        assert psnr(shown, drawn(secret, POSE)) > CLOSE > psnr(shown, cover)
+        with tab.page.expect_download() as download:
+            tab.page.click("#download")
+        download.value.save_as(tmp_path / "secret.ply")
+        assert read_model(tmp_path / "secret.ply").digest() == secret.digest()
+
+
+@pytest.mark.alone
+def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, published: PUBLISHED) -> None:
+    tab.goto(published[".spz"][0].as_uri())
+    # Each as long as those before it or longer; other work on the machine makes single ones longer.
+    times = [tab.try_key(key) for key in ("wrong", KEYS[0], "wrong again", KEYS[1])]
+    assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times

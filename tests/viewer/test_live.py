@@ -1,0 +1,194 @@
+"""`--live`: a training on a page, while it goes on."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+import torch
+
+from cli.said import PROGRAM as KEYSS
+from cli.said import SMALL
+from files.scene_files import write_nerfstudio
+from keyss.core.gaussians import Gaussians
+from keyss.files.models import model_of_bytes
+from keyss.fitting.loop import ModelReporter, Reporter, SilentReporter, of_secret
+from keyss.viewer.live import EVERY, LiveTraining
+from tiny_scenes import random_gaussians
+from viewer.browser import PATIENCE, PROGRAM, SWITCHES, visit
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def training(clock: Clock) -> Iterator[LiveTraining]:
+    with LiveTraining(timer=clock) as found:
+        yield found
+
+
+def get(training: LiveTraining, name: str, folder: str | None = None) -> tuple[int, bytes]:
+    where = urlsplit(training.address)
+    connection = http.client.HTTPConnection("127.0.0.1", where.port or 0, timeout=30)
+    connection.request("GET", (where.path if folder is None else folder) + name)
+    try:
+        answer = connection.getresponse()
+    except http.client.RemoteDisconnected:
+        return 0, b""
+    return answer.status, answer.read()
+
+
+def state(training: LiveTraining) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(get(training, "live")[1])
+    return found
+
+
+class Copies:
+    """A model in training, and how often it was copied."""
+
+    def __init__(self) -> None:
+        self.model = random_gaussians(5)
+        self.taken = 0
+
+    def __call__(self) -> Gaussians:
+        self.taken += 1
+        return self.model
+
+
+def stepped(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]) -> None:
+    reporter.update(iteration, 5, {"PSNR": 20.0, "loss": 0.1})
+    assert isinstance(reporter, ModelReporter)
+    reporter.look(model)
+
+
+def test_a_model_is_copied_only_while_somebody_looks_and_now_and_then(
+    training: LiveTraining, clock: Clock
+) -> None:
+    model, reporter = Copies(), training.reporter(SilentReporter())
+    reporter.start("fit garden", 100, 0)
+    for step in range(1, 10):
+        clock.now += 1
+        stepped(reporter, step, model)
+    assert model.taken == 0
+    assert state(training)["versions"] == {"published": 0, "secret": 0}
+    stepped(reporter, 10, model)
+    stepped(reporter, 11, model)
+    assert model.taken == 1
+    clock.now += EVERY
+    stepped(reporter, 12, model)
+    assert model.taken == 2
+    assert state(training) == {
+        "title": "fit garden",
+        "iteration": 12,
+        "iterations": 100,
+        "gaussians": 5,
+        "numbers": {"PSNR": 20.0},
+        "versions": {"published": 2, "secret": 0},
+    }
+    clock.now += 60
+    stepped(reporter, 13, model)
+    assert model.taken == 2  # whoever looked has left
+    stepped(reporter, 100, model)
+    assert model.taken == 3  # what comes after it goes on beside it
+
+
+def test_a_copy_stays_as_it_was(training: LiveTraining) -> None:
+    model, reporter = Copies(), training.reporter(SilentReporter())
+    reporter.start("fit", 1, 0)
+    stepped(reporter, 1, model)
+    expected = model.model.digest()
+    with torch.no_grad():
+        model.model.means.add_(1.0)  # as optimisers do
+    status, ply = get(training, "live/published.ply")
+    assert status == 200
+    assert model_of_bytes("a.ply", ply).digest() == expected != model.model.digest()
+
+
+def test_a_secret_is_not_taken_for_what_is_published(training: LiveTraining) -> None:
+    reporter = training.reporter(SilentReporter())
+    hidden = of_secret(reporter)
+    assert hidden is not None
+    model = Copies()
+    hidden.start("plain model of the secret", 1, 0)
+    stepped(hidden, 1, model)
+    assert state(training)["versions"] == {"published": 0, "secret": 1}
+    assert get(training, "live/published.ply")[0] != 200
+    assert get(training, "live/secret.ply")[0] == 200
+
+
+def test_nobody_gets_anything_without_the_address(training: LiveTraining) -> None:
+    assert re.search(r"/[\w-]{20,}/$", training.address)
+    assert get(training, "")[0] == 200
+    for folder in ("/", "/live/", "/AAAAAAAAAAAAAAAAAAAAAA/"):
+        for name in ("", "live", "secret.ply", "live/secret.ply", "viewer.js"):
+            assert get(training, name, folder)[0] == 404, folder + name
+
+
+def test_a_training_that_went_wrong_has_no_file(training: LiveTraining) -> None:
+    model, reporter = Copies(), training.reporter(SilentReporter())
+    model.model = replace(model.model, means=model.model.means * float("nan"))
+    reporter.start("fit", 1, 0)
+    stepped(reporter, 1, model)
+    assert get(training, "live/published.ply")[0] != 200
+    assert state(training)["versions"]["published"] == 1
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")
+def test_a_fit_is_seen_while_it_goes_on(tmp_path: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    write_nerfstudio(tmp_path / "scene", count=4)
+    command = [
+        *KEYSS,
+        "fit",
+        tmp_path / "scene",
+        "-o",
+        tmp_path / "out",
+        *SMALL[4:],
+        "--live",
+        "--iterations",
+        100_000,
+    ]
+    with (
+        subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as process,
+        playwright.sync_playwright() as started,
+    ):
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.match(r"(http://127\.0\.0\.1:[0-9]+/[\w-]+/) shows the training", line)
+        assert found, line
+        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
+        with visit(browser) as tab:
+            tab.goto(found[1])
+            status = "document.getElementById('status').textContent"
+            tab.page.wait_for_function(f"() => /^fit scene: step [0-9,]+ of 100,000, /.test({status})")
+            assert tab.page.locator("#key-form").is_hidden()
+            first = tab.page.evaluate(status)
+            tab.page.wait_for_function(f"before => {status} !== before", arg=first)
+            models = [url for url in tab.requests if url.endswith(".ply")]
+            assert set(models) == {f"{found[1]}live/published.ply"}
+            assert all(url.startswith((found[1], f"blob:{found[1][:20]}")) for url in tab.requests), (
+                tab.requests
+            )
+            process.terminate()
+            assert process.wait(60) == 143  # as without a page
+            tab.page.wait_for_function(f"() => {status}.endsWith('The training has ended.')")
+            # That the page asks on for a while is known to the browser's console only.
+            tab.complaints[:] = [each for each in tab.complaints if "ERR_CONNECTION_REFUSED" not in each]
+        browser.close()

@@ -1,0 +1,105 @@
+"""Secrets that were published as any format, end to end in headless Chromium."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from keyss.channels.rooms import room_in
+from keyss.core.gaussians import Gaussians
+from keyss.files.models import read_model, write_model
+from keyss.methods.hidden_file import HiddenFile
+from keyss.methods.records.embedding import embed_whole
+from keyss.rendering.difference import Viewpoints
+from keyss.viewer import export_html
+from measure.lifelike import lifelike
+from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
+
+pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
+
+KEY = "the first key"
+CLOSE = 25.0  # dB on the canvas
+SUFFIXES = (".ply", ".spz", ".sog")
+
+
+@pytest.fixture(scope="module")
+def secret() -> Gaussians:
+    return made(100, 1).with_sh_degree(1)
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory, secret: Gaussians) -> tuple[Path, Gaussians]:
+    """A folder with a model as it was published and as others converted it, and what its key opens."""
+    folder = tmp_path_factory.mktemp("published")
+    room = room_in(made(4000, 0), "any", "appended")
+    hidden = embed_whole(room, [KEY], [secret], [Viewpoints.around(secret)], prune=False, entropy=bytes(32))
+    write_model(folder / "stego.ply", hidden.stego)
+    for suffix in SUFFIXES[1:]:
+        write_model(folder / f"stego{suffix}", read_model(folder / "stego.ply"))
+    return folder, hidden.opened[0].gaussians
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_key_opens_the_scene_and_a_wrong_one_nothing(
+    tab: Visit, published: tuple[Path, Gaussians], secret: Gaussians, suffix: str
+) -> None:
+    folder, revealed = published
+    stego = folder / f"stego{suffix}"
+    (page,) = export_html(stego, folder / f"{suffix[1:]}.html")
+    tab.goto(page.as_uri() + POSE)
+    cover = tab.picture()
+    assert psnr(cover, drawn(read_model(stego), POSE)) > CLOSE
+    tab.try_key("another key")
+    assert np.abs(tab.picture() - cover).mean() < 0.01 * 255
+    assert tab.page.locator("#revealed").is_hidden()
+    assert tab.page.locator("#progress").is_hidden()
+    assert tab.page.locator("[role=status]").inner_text() == tab.page.locator("#problem").inner_text() == ""
+    tab.try_key(KEY)
+    tab.at(POSE)
+    shown = tab.picture()
+    assert psnr(shown, drawn(secret, POSE)) > CLOSE > psnr(shown, cover)
+    with tab.page.expect_download() as download:
+        tab.page.click("#download")
+    download.value.save_as(folder / "secret.ply")
+    assert read_model(folder / "secret.ply").digest() == revealed.digest()
+
+
+def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path: Path) -> None:
+    note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
+    room = room_in(lifelike(6000, 0).with_sh_degree(0), "any", "colours")
+    write_model(tmp_path / "stego.spz", room.embed([(KEY, note.payload())], entropy=bytes(32)))
+    tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
+    seen = []
+    for key in ("another key", KEY):
+        tab.page.evaluate(
+            """() => {
+                window.seen = [];
+                const shown = document.getElementById('progress');
+                const note = () => window.seen.push(shown.value);
+                new MutationObserver(note).observe(shown, { attributeFilter: ['value'] });
+            }"""
+        )
+        if key == KEY:
+            with tab.page.expect_download() as download:
+                tab.try_key(key)
+            assert download.value.suggested_filename == note.name
+            download.value.save_as(tmp_path / "note.txt")
+            assert (tmp_path / "note.txt").read_bytes() == note.data
+        else:
+            tab.try_key(key)
+        seen.append(list(dict.fromkeys(tab.page.evaluate("window.seen"))))
+    assert seen[0] == seen[1]
+    assert len(seen[0]) > 17
+
+
+@pytest.mark.alone
+def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, published: tuple[Path, Gaussians]) -> None:
+    folder, _ = published
+    tab.goto(export_html(folder / "stego.spz", folder / "timed.html")[0].as_uri())
+    # Each as long as those before it or longer; other work on the machine makes single ones longer.
+    times = [tab.try_key(key) for key in ("wrong", KEY, "wrong again", KEY, "and again")]
+    assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times

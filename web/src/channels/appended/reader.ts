@@ -1,0 +1,78 @@
+/** Secrets in appended Gaussians (docs/appended.md); `keyss.channels.appended.channel` on the other side. */
+import { ascii, bytesKey } from '../../core/bytes.ts';
+import type { Gaussians } from '../../core/gaussians.ts';
+import { type Derive, expand } from '../../keys/derivation.ts';
+import { damaged, decrypted } from '../../keys/encryption.ts';
+import { here } from '../../keys/pool.ts';
+import type { Payload, Reader } from '../content.ts';
+import { Blocks } from './blocks.ts';
+import {
+  allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
+} from './lattice.ts';
+import { readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
+import { countPilots, type Found, LEAST, ONE_IN, readPilots } from './pilots.ts';
+
+// Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations more of
+// them than by chance.
+const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
+const METHOD_BYTES = 15;
+const ASSOCIATED = ascii('keyss/v1/appended/data');
+
+/** A model's appended Gaussians, prepared for any number of keys. */
+export class AppendedReader implements Reader {
+  readonly derivations = 1;
+
+  private constructor(readonly salt: Uint8Array, private readonly words: TaggedWords) {}
+
+  /** null where there are none, or where their frame cannot be found. */
+  static of(model: Gaussians): AppendedReader | null {
+    const faint = candidates(model);
+    if (faint.count < LEAST / 4) return null;
+    const [colours, steps] = [coloursOf(faint), scaleSteps(faint)];
+    for (const shifts of [likelyShifts, shiftsWithPilots]) {
+      let best: { found: Found; scales: Uint8Array } | null = null;
+      for (const shift of shifts(steps, colours)) {
+        const scales = scalesAt(steps, shift);
+        const found = readPilots(invariantsOf(colours, scales), faint.means);
+        if (found && (best === null || found.agreeing > best.found.agreeing)) best = { found, scales };
+      }
+      if (best !== null) {
+        const { found, scales } = best;
+        return new AppendedReader(found.salt, wordsOfPoints(colours, scales, inOwnFrame(faint, found.toOwn)));
+      }
+    }
+    return null;
+  }
+
+  /** What `key` opens, null for nothing. Raises InputError where too much was lost or changed. */
+  async open(key: string, derive: Derive = here): Promise<Payload | null> {
+    const secret = await derive(key, this.salt);
+    const [headers, packets, data] = ['header', 'packets', 'data'].map((use) => expand(secret, `appended/${use}`, 32));
+    const header = readHeader(headers, this.words);
+    const blocks = header === null ? null : Blocks.ofHeader(header);
+    if (blocks === null) {
+      readPackets(packets, this.words, () => undefined); // as a key that opens something does
+      return null;
+    }
+    const plain = decrypted(data, blocks.decode(packets, this.words), ASSOCIATED);
+    if (plain.length < METHOD_BYTES) throw damaged();
+    const method = bytesKey(plain.subarray(0, METHOD_BYTES)).replace(/\0+$/, '');
+    return { service: 'payload', method, data: plain.slice(METHOD_BYTES) };
+  }
+}
+
+/** Of all places where the lattice of log scales may begin those with most pilots among the Gaussians. */
+function shiftsWithPilots(steps: Float64Array, colours: Uint8Array): number[] {
+  const count = Math.min(SAMPLE, steps.length / 3);
+  const every = steps.length / 3 / count;
+  const rows = Array.from({ length: count }, (_, at) => 3 * Math.floor(at * every));
+  const few = Float64Array.from(rows.flatMap((at) => [...steps.subarray(at, at + 3)]));
+  const own = Uint8Array.from(rows.flatMap((at) => [...colours.subarray(at, at + 3)]));
+  const byChance = count / ONE_IN;
+  return allShifts(few)
+    .map((shift) => ({ shift, pilots: countPilots(invariantsOf(own, scalesAt(few, shift))) }))
+    .filter(({ pilots }) => pilots > byChance + NOT_BY_CHANCE * Math.sqrt(byChance))
+    .sort((a, b) => b.pilots - a.pilots)
+    .slice(0, TRIED)
+    .map(({ shift }) => shift);
+}

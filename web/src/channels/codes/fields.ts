@@ -1,0 +1,110 @@
+/**
+ * Which numbers of a file's codes carry bits, and how many each; `keyss.channels.codes.fields` on the other side.
+ *
+ * All of it is arithmetic that is the same on every machine, in the same order as there, and no logarithms: a bit more or
+ * less anywhere, and nothing could be read.
+ */
+import { CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
+import type { Codes } from '../../files/models.ts';
+import { FINEST, type SogCodes } from '../../files/sog.ts';
+import { positionCode, rotationPart, rotationWord, type SpzCodes } from '../../files/spz.ts';
+
+const MOST_BITS = 10;
+const SHARE = -3; // 2 to this: the range of what is written, in sizes of the Gaussian
+const LOG_SCALE = -4; // 2 to this: the range of what is written in log scales
+const LOG2_E = 1.4426950408889634;
+const MOST_DISTANCE = 64; // powers of 2
+const AXES = [0, 1, 2];
+
+/** One coordinate of an attribute of N Gaussians. */
+export interface Field {
+  readonly levels: Int32Array; // [N] integers that grow with what they stand for
+  readonly bits: Uint8Array; // [N] that each carries, 0 to 10
+}
+
+/** In the order of the file's Gaussians. */
+export function fieldsOf(codes: Codes): Field[] {
+  if (codes.kind === 'spz') return spzFields(codes);
+  return codes.kind === 'sog' ? sogFields(codes) : compressedPlyFields(codes);
+}
+
+/** By how many powers of 2 a .sog's steps are larger at a position than at 0. */
+export function sogDistance(codes: SogCodes, row: number, axis: number): number {
+  const log = Math.abs(codes.mins[axis] + sogExtent(codes, axis) * (codes.positions[3 * row + axis] / FINEST));
+  return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MOST_DISTANCE);
+}
+
+function sogExtent({ mins, maxs }: SogCodes, axis: number): number {
+  return maxs[axis] > mins[axis] ? maxs[axis] - mins[axis] : 1;
+}
+
+function spzFields(codes: SpzCodes): Field[] {
+  const { count, version, fractionalBits, scales, rotations } = codes;
+  const bits = Uint8Array.from({ length: count }, (_, row) => {
+    const size = (middle(scales[3 * row], scales[3 * row + 1], scales[3 * row + 2]) / 16 - 10) * LOG2_E;
+    return fitting(size + fractionalBits + SHARE);
+  });
+  const places = AXES.map((axis) => ({ levels: levels(count, (row) => positionCode(codes, row, axis)), bits }));
+  const part = (row: number, index: number): number =>
+    version === 2 ? rotations[3 * row + index] : rotationPart(rotationWord(codes, row), index);
+  return [...places, ...turns(count, version === 2 ? 1 : 3, part)];
+}
+
+function sogFields(codes: SogCodes): Field[] {
+  const { count, scaleBook, scales, positions, quats } = codes;
+  const places = AXES.map((axis) => {
+    const finest = log2(sogExtent(codes, axis) / FINEST);
+    const bits = Uint8Array.from({ length: count }, (_, row) => {
+      const [a, b, c] = AXES.map((each) => scaleBook[scales[4 * row + each]]);
+      const step = finest + sogDistance(codes, row, axis) + 0.5;
+      return fitting(middle(a, b, c) * LOG2_E + SHARE - step);
+    });
+    return { levels: levels(count, (row) => positions[3 * row + axis]), bits };
+  });
+  return [...places, ...turns(count, 2, (row, index) => quats[4 * row + index])];
+}
+
+function compressedPlyFields(codes: CompressedPlyCodes): Field[] {
+  const { count, scaleBounds, scales, rotations } = codes;
+  const sizes = AXES.map((axis) => {
+    const [low, high] = scaleBounds[axis];
+    const chunks = low.map((least, chunk) => fitting(LOG_SCALE - log2((high[chunk] - least) / VECTOR[axis])));
+    const bits = Uint8Array.from({ length: count }, (_, row) => chunks[Math.floor(row / CHUNK)]);
+    return { levels: levels(count, (row) => vectorPart(scales[row], axis)), bits };
+  });
+  return [...sizes, ...turns(count, 3, (row, index) => pliedPart(rotations[row], index))];
+}
+
+function levels(count: number, level: (row: number) => number): Int32Array {
+  const found = new Int32Array(count);
+  for (let row = 0; row < count; row++) found[row] = level(row);
+  return found;
+}
+
+function turns(count: number, each: number, part: (row: number, index: number) => number): Field[] {
+  const bits = new Uint8Array(count).fill(each);
+  return AXES.map((index) => ({ levels: levels(count, (row) => part(row, index)), bits }));
+}
+
+/** The second of three numbers by size. */
+function middle(a: number, b: number, c: number): number {
+  return Math.max(Math.min(a, b), Math.min(Math.max(a, b), c));
+}
+
+/** How many bits of levels span 2 to `log` at most; NaN, of which bytes make 0, for NaN. */
+function fitting(log: number): number {
+  return Math.min(Math.max(Math.floor(log), 0), MOST_BITS);
+}
+
+const NUMBER = new Float64Array(1);
+const HALVES = new Uint32Array(NUMBER.buffer); // the lower one first, as on all machines that have browsers
+
+/** About the logarithm to base 2, too small by up to 0.09: straight lines between the powers of 2. */
+export function log2(value: number): number {
+  if (value === 0 || !Number.isFinite(value)) return 2 * (value - 1);
+  const small = Math.abs(value) < 2 ** -1022; // without an exponent of its own
+  NUMBER[0] = small ? value * 2 ** 54 : value;
+  const exponent = ((HALVES[1] >>> 20) & 2047) - 1022 - (small ? 54 : 0);
+  HALVES[1] = (HALVES[1] & 0x800fffff) | (1022 << 20);
+  return exponent + 2 * (NUMBER[0] - 1); // of a mantissa of 0.5 to 1
+}

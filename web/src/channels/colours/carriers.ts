@@ -1,0 +1,117 @@
+/**
+ * Which numbers of a model carry something, and by what else of the model they are known again;
+ * `keyss.channels.robust.carriers` on the other side.
+ */
+import { coefficients, type Gaussians, opacity } from '../../core/gaussians.ts';
+
+export const [SCALE_STEP, COLOUR_STEP, OPACITY_STEP] = [1 / 16, 1 / 38.25, 1 / 255]; // of 8-bit formats
+export const CELL = 0.25; // of a log scale
+export const [COLOUR_NOISE, OPACITY_NOISE] = [0.009, 0.004]; // what formats move these numbers by, at most
+export const NAME = 8; // numbers of a name: five, and zeros up to a block of AES
+const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [4, 5, 16]; // that make a cell
+const LEAST_OPACITY = 2.5 / 255;
+const SCALE_NOISE = 0.018;
+const SCALE_ROUNDED = SCALE_STEP / 2;
+const CELLS = 30_000; // on either side of zero
+
+/** What names and carriers are made of, of the C Gaussians that are visible and finite. */
+export interface Numbers {
+  readonly count: number;
+  readonly size: number; // the median log scale: it tells by how much a model was scaled
+  readonly logScales: Float64Array; // [C, 3]
+  readonly opacities: Float64Array; // [C]
+  readonly colours: Float64Array; // [C, 3] constant coefficients
+}
+
+export function numbersOf(model: Gaussians): Numbers {
+  const width = 3 * coefficients(model.shDegree);
+  const opacities = Float64Array.from(model.opacityLogits, (logit) => Math.fround(opacity(logit)));
+  const rows: number[] = [];
+  for (let row = 0; row < model.count; row++) {
+    let sum = 0; // finite where all are
+    for (let axis = 0; axis < 3; axis++) sum += model.logScales[3 * row + axis] + model.sh[width * row + axis];
+    if (Number.isFinite(sum) && opacities[row] > LEAST_OPACITY) rows.push(row);
+  }
+  const [logScales, colours] = [new Float64Array(3 * rows.length), new Float64Array(3 * rows.length)];
+  rows.forEach((row, to) => {
+    logScales.set(model.logScales.subarray(3 * row, 3 * row + 3), 3 * to);
+    colours.set(model.sh.subarray(width * row, width * row + 3), 3 * to);
+  });
+  const sizes = Float64Array.from(rows, (_, at) => (logScales[3 * at] + logScales[3 * at + 1] + logScales[3 * at + 2]) / 3);
+  const own = Float64Array.from(rows, (row) => opacities[row]);
+  return { count: rows.length, size: median(sizes.sort()), logScales, opacities: own, colours };
+}
+
+/** C Gaussians as a reader sees them. */
+export interface Carriers {
+  readonly count: number;
+  readonly names: Int16Array; // [C, NAME] numbers of cells: three log scales, opacity, red; zeros
+  readonly doubt: Float64Array; // [C] chance that the name is not what it was when it was written
+  readonly values: Float64Array; // [C, 2] green and blue
+}
+
+/** The carriers and their names. `offset`: what counts as a log scale of zero. */
+export function carriersOf(numbers: Numbers, offset: number): Carriers {
+  const { count, logScales, opacities, colours } = numbers;
+  const scaleNoise = (offset % CELL === 0 ? SCALE_NOISE : SCALE_ROUNDED) / SCALE_STEP;
+  const names = new Int16Array(NAME * count);
+  const doubt = new Float64Array(count);
+  const values = new Float64Array(2 * count);
+  for (let row = 0; row < count; row++) {
+    let stays = 1;
+    const cell = (column: number, value: number, steps: number, noise: number): void => {
+      const found = Math.floor(value / steps);
+      const inside = value - found * steps;
+      const nearest = Math.min(inside, steps - inside);
+      stays *= 1 - Math.max(0, Math.min(0.5, (noise - nearest) / (2 * noise)));
+      names[NAME * row + column] = Math.max(-CELLS, Math.min(CELLS, found));
+    };
+    for (let axis = 0; axis < 3; axis++) {
+      cell(axis, (logScales[3 * row + axis] - offset) / SCALE_STEP - 0.5, SCALE_STEPS, scaleNoise);
+    }
+    cell(3, opacities[row] / OPACITY_STEP - 0.5, OPACITY_STEPS, OPACITY_NOISE / OPACITY_STEP);
+    cell(4, colours[3 * row] / COLOUR_STEP, COLOUR_STEPS, COLOUR_NOISE / COLOUR_STEP);
+    doubt[row] = 1 - stays;
+    values[2 * row] = colours[3 * row + 1];
+    values[2 * row + 1] = colours[3 * row + 2];
+  }
+  return { count, names, doubt, values };
+}
+
+/** As with an offset that is larger by so many cells. */
+export function shifted(carriers: Carriers, cells: number): Carriers {
+  const names = carriers.names.slice();
+  for (let at = 0; at < names.length; at += NAME) {
+    for (let axis = 0; axis < 3; axis++) names[at + axis] -= cells;
+  }
+  return { ...carriers, names };
+}
+
+/** The carriers of these rows. */
+export function chosen({ names, doubt, values }: Carriers, rows: ArrayLike<number>): Carriers {
+  const found = {
+    count: rows.length,
+    names: new Int16Array(NAME * rows.length),
+    doubt: Float64Array.from(rows, (row) => doubt[row]),
+    values: new Float64Array(2 * rows.length),
+  };
+  for (let to = 0; to < rows.length; to++) {
+    found.names.set(names.subarray(NAME * rows[to], NAME * (rows[to] + 1)), NAME * to);
+    found.values.set(values.subarray(2 * rows[to], 2 * rows[to] + 2), 2 * to);
+  }
+  return found;
+}
+
+/** How much a change of colour shows, from the name: log of area times squared opacity. */
+export function impact(names: Int16Array, row: number): number {
+  const [a, b, c] = [names[NAME * row], names[NAME * row + 1], names[NAME * row + 2]];
+  const two = a + b + c - Math.min(a, b, c) + 1; // halves of a cell are added
+  const seen = (names[NAME * row + 3] + 0.5) * OPACITY_STEPS * OPACITY_STEP;
+  return two * CELL + 2 * Math.log(Math.max(1e-3, seen));
+}
+
+function median(sorted: Float64Array): number {
+  const middle = sorted.length >> 1;
+  if (!sorted.length) return 0;
+  return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
+}

@@ -1,0 +1,162 @@
+/**
+ * What a key opens in the colours of a model: bytes that survive other formats (docs/robust.md).
+ * `keyss.channels.robust.reading` on the other side.
+ */
+import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
+import { sha256 } from '@noble/hashes/sha2.js';
+import { ascii, joined, viewOf } from '../../core/bytes.ts';
+import { InputError } from '../../core/errors.ts';
+import type { Gaussians } from '../../core/gaussians.ts';
+import { namesakes } from '../../core/words.ts';
+import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
+import { here } from '../../keys/pool.ts';
+import type { Payload, Reader } from '../content.ts';
+import { unpackPayload } from '../packing.ts';
+import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
+import { Fountain } from './fountain.ts';
+import {
+  bucketBytes, FILE_KEY_BYTES, type Header, headerAgreement, IDLE, kindOf, ownRows, packBits, readHeader, SHARES, VIEWS,
+} from './header.ts';
+import { bitsOf, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf, SPACINGS } from './lattice.ts';
+import { Index } from './places.ts';
+import { saltsOf } from './salts.ts';
+
+const STATIC_SALT = sha256(ascii('keyss/v1/robust-static')).slice(0, SALT_BYTES);
+// Shares of carriers that may hold something else: in ordinary files, in merged ones.
+const CHANGED = [0.03, 0.5];
+const ROUNDS = 60;
+const MOST_RATE = 4; // data bits for each code bit
+const CELLS_AROUND = [0, 1, -1, 2, -2, 3, -3, 4, -4]; // where a writer may have had its zero, in cells
+const CELLS_SCALED = [0, 1, -1]; // in a model that was scaled
+const ALIGNMENTS = 7; // of borders of cells
+const BEST = 3; // of all these, that are looked at more closely
+const REFINED = [[0.02, 0.004], [0.004, 0.001]]; // where it is looked for once a header is found
+
+/** What a key becomes: without a salt of the file, and with each. */
+interface Derived {
+  readonly fixed: Uint8Array;
+  readonly secrets: readonly Uint8Array[];
+  readonly check: Uint8Array; // what recognises headers
+}
+
+/** The colours of a model, prepared for any number of keys. */
+export class ColoursReader implements Reader {
+  private constructor(private readonly numbers: Numbers, readonly salts: readonly Uint8Array[]) {}
+
+  static of(model: Gaussians): ColoursReader {
+    const numbers = numbersOf(model);
+    return new ColoursReader(numbers, saltsOf(numbers));
+  }
+
+  get derivations(): number {
+    return 1 + this.salts.length;
+  }
+
+  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  async open(key: string, derive: Derive = here): Promise<Payload | null> {
+    const masters = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
+    const fixed = expand(masters[0], 'robust/static', 32);
+    const secrets = masters.slice(1).map((each) => expand(each, 'robust/header', 32));
+    const data = this.read({ fixed, secrets, check: expand(fixed, 'robust/check', 32) });
+    return data && unpackPayload(data);
+  }
+
+  /** The payload that a derived key opens; a key that opens nothing makes about the work of one that does. */
+  read(derived: Derived): Uint8Array | null {
+    const { secrets, check } = derived;
+    const promises: { offset: number; promise: number }[] = [];
+    for (const [offset, index] of this.indices()) promises.push({ offset, promise: index.promise(secrets) });
+    promises.sort((a, b) => b.promise - a.promise || b.offset - a.offset);
+    let found: { header: Header; offset: number } | null = null;
+    for (const { offset } of promises.slice(0, BEST)) {
+      const index = new Index(carriersOf(this.numbers, offset));
+      for (const [kind, view] of VIEWS) {
+        const header = readHeader(secrets, check, index, kind, view);
+        if (header !== null) found ??= { header, offset };
+      }
+    }
+    if (found === null) {
+      payload(NOTHING, derived.fixed, carriersOf(this.numbers, 0), CHANGED[0], ROUNDS / 4);
+      return null;
+    }
+    const { header } = found;
+    const carriers = this.refined(header, secrets, found.offset);
+    const index = new Index(carriers);
+    const taken = new Set(secrets.flatMap((each) => [...index.rows(index.places(each, kindOf(header).places))]));
+    const free = chosen(carriers, Uint32Array.from({ length: carriers.count }, (_, row) => row).filter((row) => !taken.has(row)));
+    for (const changed of CHANGED) {
+      const data = payload(header, derived.fixed, free, changed, ROUNDS);
+      if (data !== null) return data;
+    }
+    throw new InputError('The key is right, but too much of the model was lost or changed.');
+  }
+
+  /** What the writer may have taken for a log scale of zero, and the carriers by their names then. */
+  private *indices(): Generator<[number, Index]> {
+    if (!this.numbers.count) return;
+    const whole = Math.round(this.numbers.size / CELL) * CELL;
+    for (let alignment = 0; alignment < ALIGNMENTS; alignment++) {
+      const offset = whole + (alignment * CELL) / ALIGNMENTS;
+      const carriers = carriersOf(this.numbers, offset);
+      for (const cells of alignment ? CELLS_SCALED : CELLS_AROUND) {
+        yield [offset + cells * CELL, new Index(shifted(carriers, cells))];
+      }
+    }
+  }
+
+  /** The carriers; where the model was scaled, under the names that agree best with the header. */
+  private refined(header: Header, secrets: readonly Uint8Array[], around: number): Carriers {
+    let offset = around;
+    if (offset % CELL) {
+      for (const [reach, step] of REFINED) {
+        const start = offset - reach;
+        let most = -Infinity;
+        for (let at = 0; at <= Math.round((2 * reach) / step); at++) {
+          const agreement = headerAgreement(header, secrets, new Index(carriersOf(this.numbers, start + at * step)));
+          if (agreement > most) [most, offset] = [agreement, start + at * step];
+        }
+      }
+    }
+    return carriersOf(this.numbers, offset);
+  }
+}
+
+/** What a key that opens nothing looks for. */
+const NOTHING: Header = {
+  fileKey: new Uint8Array(FILE_KEY_BYTES),
+  partition: new Uint8Array(2),
+  lattice: { level: LEVELS - 1, spacing: SPACINGS[0], depth: 1 },
+  first: 0,
+  last: SHARES / 4 - 1,
+  bucket: 64,
+  idle: 0,
+  bits: new Uint8Array(0),
+};
+
+/** What the header's data key decrypts, or null. */
+function payload(
+  header: Header, fixed: Uint8Array, carriers: Carriers, changed: number, rounds: number,
+): Uint8Array | null {
+  const own = chosen(carriers, ownRows(header, carriers));
+  const [size, key] = [bucketBytes(header.bucket), expand(joined(fixed, header.fileKey), 'robust/data-key', 32)];
+  const bits = bitsOf(header.lattice, own);
+  if (!own.count || 8 * size > MOST_RATE * bits.reduce((sum, each) => sum + each, 0)) return null;
+  const garbage = Math.min(0.9, header.idle * IDLE + changed);
+  const alike = namesakes(rank(header.partition, 'partition', own.names));
+  const doubt = own.doubt.map((each, row) => 1 - ((1 - garbage) * (1 - each)) / alike[row]);
+  const ratios = readBits(header.lattice, dithers(key, own.names), own, doubt, bits);
+  const seeds = seedsOf(rank(key, 'seeds', own.names), bits.map((each) => COLUMNS * each));
+  const code = new Fountain(8 * size);
+  return decrypted(key, packBits(code.likeliest(seeds, ratios, rounds).subarray(0, 8 * size)));
+}
+
+/** The payload; null where anything at all is not as it was. */
+function decrypted(dataKey: Uint8Array, encrypted: Uint8Array): Uint8Array | null {
+  try {
+    const plain = chacha20poly1305(expand(dataKey, 'robust/payload', 32), new Uint8Array(12)).decrypt(encrypted);
+    const length = viewOf(plain).getUint32(0, true);
+    return length <= plain.length - 4 ? plain.slice(4, 4 + length) : null;
+  } catch {
+    return null;
+  }
+}

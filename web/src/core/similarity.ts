@@ -1,0 +1,131 @@
+/** Similarity transforms of the world, applied to Gaussians; `keyss.core.similarity` on the other side. */
+import { coefficients, type Gaussians } from './gaussians.ts';
+
+/** x -> scale * rotation x + translation. */
+export interface Similarity {
+  readonly scale: number;
+  readonly rotation: readonly number[]; // [9] by rows
+  readonly translation: readonly number[]; // [3]
+}
+
+export function inverse({ scale, rotation: r, translation: t }: Similarity): Similarity {
+  const rotation = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+  return { scale: 1 / scale, rotation, translation: times(rotation, t).map((each) => -each / scale) };
+}
+
+/** Whether it is finite, its scale positive, and its rotation one, to 1e-6. */
+export function isSimilarity({ scale, rotation: r, translation }: Similarity): boolean {
+  const rows = [0, 3, 6].map((at) => r.slice(at, at + 3));
+  const off = rows.flatMap((a, i) => rows.map((b, j) => Math.abs(dot(a, b) - Number(i === j))));
+  const turn = dot(rows[0], [
+    r[4] * r[8] - r[5] * r[7], r[5] * r[6] - r[3] * r[8], r[3] * r[7] - r[4] * r[6],
+  ]);
+  return [scale, ...r, ...translation].every(Number.isFinite) && scale > 0 && Math.max(...off) <= 1e-6 && turn > 0;
+}
+
+/** The Gaussians moved along with the world, their view-dependent colour included. */
+export function moved(by: Similarity, model: Gaussians): Gaussians {
+  const [w, x, y, z] = quaternion(by.rotation);
+  const blocks = Array.from({ length: model.shDegree }, (_, band) => rotatedBand(by.rotation, band + 1));
+  const k = coefficients(model.shDegree);
+  const [means, quats, sh] = [model.means.slice(), model.quats.slice(), model.sh.slice()];
+  for (let row = 0; row < model.count; row++) {
+    const place = times(by.rotation, model.means.subarray(3 * row, 3 * row + 3));
+    place.forEach((each, axis) => (means[3 * row + axis] = by.scale * each + by.translation[axis]));
+    const [a, b, c, d] = model.quats.subarray(4 * row, 4 * row + 4);
+    quats.set([
+      w * a - x * b - y * c - z * d, x * a + w * b - z * c + y * d,
+      y * a + z * b + w * c - x * d, z * a - y * b + x * c + w * d,
+    ], 4 * row);
+    blocks.forEach((block, index) => {
+      const [size, start] = [2 * index + 3, k * row + (index + 1) ** 2];
+      for (let i = 0; i < size; i++) {
+        for (let colour = 0; colour < 3; colour++) {
+          let sum = 0;
+          for (let j = 0; j < size; j++) sum += block[i][j] * model.sh[3 * (start + j) + colour];
+          sh[3 * (start + i) + colour] = sum;
+        }
+      }
+    });
+  }
+  const larger = Math.fround(Math.log(by.scale));
+  return { ...model, means, quats, sh, logScales: model.logScales.map((each) => each + larger) };
+}
+
+function times(m: readonly number[], v: ArrayLike<number>): number[] {
+  return [0, 3, 6].map((at) => m[at] * v[0] + m[at + 1] * v[1] + m[at + 2] * v[2]);
+}
+
+function dot(a: readonly number[], b: readonly number[]): number {
+  return a.reduce((sum, each, at) => sum + each * b[at], 0);
+}
+
+/** wxyz, of length 1, of a rotation matrix (Shepperd 1978). */
+function quaternion(r: readonly number[]): number[] {
+  const squares = [
+    1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8], 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8],
+  ];
+  const rows = [
+    [squares[0], r[7] - r[5], r[2] - r[6], r[3] - r[1]],
+    [r[7] - r[5], squares[1], r[1] + r[3], r[2] + r[6]],
+    [r[2] - r[6], r[1] + r[3], squares[2], r[5] + r[7]],
+    [r[3] - r[1], r[2] + r[6], r[5] + r[7], squares[3]],
+  ];
+  const found = rows[squares.indexOf(Math.max(...squares))];
+  const length = Math.hypot(...found);
+  return found.map((each) => each / length);
+}
+
+/**
+ * [2 band + 1]^2: what turns the coefficients of one degree of harmonics. The basis at as many directions as there are
+ * coefficients, times it, is the basis at the directions turned back.
+ */
+function rotatedBand(r: readonly number[], band: number): number[][] {
+  const size = 2 * band + 1;
+  const directions = Array.from({ length: 3 * size }, (_, index) => spiral(index, 3 * size));
+  const basis = directions.map((each) => harmonics(each, band));
+  const back = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+  const turned = directions.map((each) => harmonics(times(back, each), band));
+  const product = (a: number[][], b: number[][]): number[][] =>
+    a[0].map((_, i) => b[0].map((__, j) => a.reduce((sum, row, at) => sum + row[i] * b[at][j], 0)));
+  return solved(product(basis, basis), product(basis, turned));
+}
+
+/** Directions about evenly spread over the sphere. */
+function spiral(index: number, count: number): number[] {
+  const z = 1 - (2 * index + 1) / count;
+  const [radius, angle] = [Math.sqrt(1 - z * z), index * Math.PI * (3 - Math.sqrt(5))];
+  return [radius * Math.cos(angle), radius * Math.sin(angle), z];
+}
+
+/** The solution of a symmetric positive system, by Gaussian elimination. */
+function solved(matrix: number[][], right: number[][]): number[][] {
+  const rows = matrix.map((row, at) => [...row, ...right[at]]);
+  for (let column = 0; column < rows.length; column++) {
+    const pivot = rows[column];
+    const inverse = 1 / pivot[column];
+    pivot.forEach((each, at) => (pivot[at] = each * inverse));
+    for (const row of rows) {
+      const factor = row[column];
+      if (row !== pivot) row.forEach((each, at) => (row[at] = each - factor * pivot[at]));
+    }
+  }
+  return rows.map((row) => row.slice(rows.length));
+}
+
+/** The real basis of one degree, with the signs of 3DGS. */
+function harmonics([x, y, z]: readonly number[], band: number): number[] {
+  const [xx, yy, zz] = [x * x, y * y, z * z];
+  if (band === 1) return [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x];
+  if (band === 2) {
+    return [
+      1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
+      -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
+    ];
+  }
+  return [
+    -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z, -0.4570457994644658 * y * (4 * zz - xx - yy),
+    0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy), -0.4570457994644658 * x * (4 * zz - xx - yy),
+    1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3 * yy),
+  ];
+}

@@ -1,0 +1,25 @@
+/** Reader of .splat, 32 bytes for each Gaussian; `keyss.files.formats.splat` on the other side. */
+import { viewOf } from '../core/bytes.ts';
+import { emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+import { constantHarmonic, damagedFile, logit, logScale, unitQuat } from './coded.ts';
+import { checkedFinite } from './ply.ts';
+
+const ROW = 32; // bytes: mean and scale in floats, red, green, blue, opacity and the quaternion in bytes
+
+/** Raises InputError. */
+export function readSplat(bytes: Uint8Array): Gaussians {
+  if (bytes.length === 0 || bytes.length % ROW) throw damagedFile();
+  const view = viewOf(bytes);
+  const model = emptyGaussians(bytes.length / ROW, 0);
+  for (let row = 0, at = 0; row < model.count; row++, at += ROW) {
+    for (let axis = 0; axis < 3; axis++) {
+      model.means[3 * row + axis] = view.getFloat32(at + 4 * axis, true);
+      model.logScales[3 * row + axis] = logScale(view.getFloat32(at + 12 + 4 * axis, true));
+      model.sh[3 * row + axis] = constantHarmonic(bytes[at + 24 + axis]);
+    }
+    model.opacityLogits[row] = logit(bytes[at + 27]);
+    const [w, x, y, z] = bytes.subarray(at + 28, at + ROW);
+    model.quats.set(unitQuat(w / 128 - 1, x / 128 - 1, y / 128 - 1, z / 128 - 1), 4 * row);
+  }
+  return checkedFinite(model);
+}

@@ -1,0 +1,60 @@
+/** A training that goes on: its models as they are now, whenever there are newer ones; `keyss.viewer.live` has them. */
+import { fetched } from './sources.ts';
+
+const AGAIN = 2000; // milliseconds from one answer to the next question
+const PATIENCE = 3; // questions without an answer after which the training has ended
+
+export const SIDES = ['published', 'secret'] as const;
+export type TrainedSide = (typeof SIDES)[number];
+
+interface State {
+  readonly title: string;
+  readonly iteration: number;
+  readonly iterations: number;
+  readonly gaussians: number;
+  readonly numbers: Record<string, number>; // decibels
+  readonly versions: Record<TrainedSide, number>; // 0: not there
+}
+
+export interface Audience {
+  /** A newer model; `anew`: the first one of a training. Resolves when it can be seen. */
+  trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void>;
+  /** How far it is. */
+  tell(text: string): void;
+}
+
+/** Resolves when the training has ended. */
+export async function watch(address: string, audience: Audience): Promise<void> {
+  const shown: Record<TrainedSide, number> = { published: 0, secret: 0 };
+  const titles: Partial<Record<TrainedSide, string>> = {};
+  let state: State | null = null;
+  for (let failures = 0; failures < PATIENCE; ) {
+    try {
+      state = JSON.parse(new TextDecoder().decode(await fetched(at(address)))) as State;
+      failures = 0;
+      audience.tell(textOf(state));
+      for (const side of SIDES) {
+        if (state.versions[side] <= shown[side]) continue;
+        const ply = await fetched(at(`${address}/${side}.ply`));
+        await audience.trained(side, ply, titles[side] !== state.title);
+        shown[side] = state.versions[side];
+        titles[side] = state.title;
+      }
+    } catch {
+      failures++;
+    }
+    await new Promise((resolve) => setTimeout(resolve, AGAIN));
+  }
+  audience.tell(`${state ? `${textOf(state)} ` : ''}The training has ended.`);
+}
+
+function at(address: string): URL {
+  return new URL(address, document.baseURI);
+}
+
+function textOf({ title, iteration, iterations, gaussians, numbers }: State): string {
+  if (!title) return 'The training has not begun yet.';
+  const count = (each: number): string => each.toLocaleString('en');
+  const told = Object.entries(numbers).map(([name, value]) => `, ${name} ${value.toFixed(2)} dB`);
+  return `${title}: step ${count(iteration)} of ${count(iterations)}, ${count(gaussians)} Gaussians${told.join('')}.`;
+}

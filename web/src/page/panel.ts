@@ -1,0 +1,58 @@
+/** What the panel does by itself: folding, showing the key as it is typed, taking a file that is dropped. */
+import { page } from './elements.ts';
+
+const NARROW = '(max-width: 600px)'; // where the panel would cover the scene
+
+/** `opened` gets files that are chosen or dropped. */
+export function preparePanel(opened: (file: File) => void): void {
+  fold(window.matchMedia(NARROW).matches);
+  page.more.addEventListener('click', () => fold(page.more.getAttribute('aria-expanded') === 'true'));
+  page.show.addEventListener('click', () => showKey(page.key.type === 'password'));
+  page.file.addEventListener('change', () => {
+    const file = page.file.files?.[0];
+    page.file.value = ''; // so that the same file can be chosen again
+    if (file) opened(file);
+  });
+  document.addEventListener('dragover', (event) => {
+    event.preventDefault();
+    page.drop.hidden = !event.dataTransfer?.types.includes('Files');
+  });
+  document.addEventListener('dragleave', (event) => {
+    if (event.relatedTarget === null) page.drop.hidden = true;
+  });
+  document.addEventListener('drop', (event) => {
+    event.preventDefault();
+    page.drop.hidden = true;
+    const file = event.dataTransfer?.files[0];
+    if (file) opened(file);
+  });
+}
+
+function fold(folded: boolean): void {
+  page.controls.hidden = folded;
+  page.more.textContent = folded ? 'More' : 'Less';
+  page.more.setAttribute('aria-expanded', String(!folded));
+}
+
+export function showKey(shown: boolean): void {
+  page.key.type = shown ? 'text' : 'password';
+  page.show.setAttribute('aria-pressed', String(shown));
+}
+
+/** The border between the two models, at a share of the width; null for none. */
+export function placeBorder(share: number | null): void {
+  page.border.hidden = share === null || share <= 0 || share >= 1;
+  page.border.style.left = `${100 * (share ?? 0)}%`;
+}
+
+export function count(number: number): string {
+  return number.toLocaleString('en');
+}
+
+export function save(name: string, data: Blob): void {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(data);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

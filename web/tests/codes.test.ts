@@ -1,0 +1,56 @@
+import { expect, test } from 'vitest';
+import { log2 } from '../src/channels/codes/fields.ts';
+import { Room } from '../src/channels/codes/layout.ts';
+import { lastBits } from '../src/channels/codes/order.ts';
+import { CodesReader } from '../src/channels/codes/reader.ts';
+import { sortingOrder } from '../src/channels/codes/sorting.ts';
+import type { Codes } from '../src/files/models.ts';
+import { digest, jsonVector, modelOf } from './vectors.ts';
+
+interface Counted {
+  bits: Record<string, { count: number; sha256: string }>;
+  log2: Record<string, number>;
+}
+
+const COUNTED = jsonVector<Counted>('counted.json');
+const FILES = ['coded.spz', 'coded.sog', 'coded.compressed.ply'];
+
+async function codesOf(name: string): Promise<Codes> {
+  return (await modelOf(name)).codes!;
+}
+
+test.each(Object.entries(COUNTED.bits))('the bits that carry in %s', async (name, { count, sha256 }) => {
+  const bits = lastBits(await codesOf(name));
+  expect([bits.length, digest(bits)]).toEqual([count, sha256]);
+});
+
+test.each(Object.entries(COUNTED.log2))('about the logarithm of %s', (value, expected) => {
+  expect(log2(Number(value))).toBe(expected);
+});
+
+test('logarithms of what is no number', () => {
+  expect([log2(Infinity), log2(NaN)]).toEqual([Infinity, NaN]);
+});
+
+test('how many slots there are', () => {
+  expect([0, 12287, 12288, 40000, 10 ** 6, 10 ** 8].map((bits) => new Room(bits).slots)).toEqual([0, 0, 4, 4, 32, 256]);
+});
+
+test('rows are sorted by the last word first, equal ones in their order', () => {
+  const words = [Uint32Array.of(5, 2 ** 32 - 1, 0, 5, 65536), Uint32Array.of(1, 0, 2 ** 31, 1, 1)];
+  expect([...sortingOrder(...words)]).toEqual([1, 0, 3, 4, 2]);
+});
+
+test.each(FILES)('another key opens nothing in %s, and derives as much', async (name) => {
+  const salts: string[] = [];
+  const derive = async (_: string, salt: Uint8Array): Promise<Uint8Array> => {
+    salts.push(digest(salt));
+    return new Uint8Array(32).fill(7);
+  };
+  expect(await CodesReader.of(await codesOf(name))!.open('any', derive)).toBeNull();
+  expect(salts.length).toBe(1);
+});
+
+test('codes without room have no reader', async () => {
+  expect(CodesReader.of(await codesOf('published-2.spz'))).toBeNull();
+});

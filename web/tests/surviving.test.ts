@@ -1,0 +1,180 @@
+import { expect, test } from 'vitest';
+import { AppendedReader } from '../src/channels/appended/reader.ts';
+import { fittedSimilarity, movedPoint } from '../src/channels/appended/fitting.ts';
+import { Fountain } from '../src/channels/colours/fountain.ts';
+import { NOISY, RAPTOR } from '../src/channels/colours/equations.ts';
+import { ColoursReader } from '../src/channels/colours/reader.ts';
+import type { Content, Reader } from '../src/channels/content.ts';
+import { mixed } from '../src/channels/mixing.ts';
+import { Channels, readersOf } from '../src/channels/opening.ts';
+import { unpackPayload } from '../src/channels/packing.ts';
+import { type Gaussians, selected } from '../src/core/gaussians.ts';
+import { namesakes, sortingOrder } from '../src/core/words.ts';
+import { type Derive, expand } from '../src/keys/derivation.ts';
+import { here, inTurn, oneByOne } from '../src/keys/pool.ts';
+import { digest, hex, jsonVector, modelOf } from './vectors.ts';
+
+const OPENED = jsonVector<{ file: string; key: string; payload?: string }[]>('revealed.json');
+const NOTE = OPENED.find((each) => each.file === 'colours.spz')!;
+
+/** Numbers in [0, 1) that are the same every time. */
+function random(seed: number): () => number {
+  const state = new Uint32Array(2);
+  return () => {
+    [state[0], state[1]] = [++seed, 99];
+    return mixed(state)[1] / 2 ** 32;
+  };
+}
+
+/** Rows of a model in another order, of which a share is left. */
+function some(model: Gaussians, share: number, seed: number): Gaussians {
+  const draw = random(seed);
+  const rows = Array.from({ length: model.count }, (_, row) => ({ row, place: draw() }));
+  return selected(model, rows.sort((a, b) => a.place - b.place).slice(0, share * model.count).map(({ row }) => row));
+}
+
+/** Every key is derived once, however often it is asked for. */
+function remembered(derive: Derive): Derive {
+  const known = new Map<string, Promise<Uint8Array>>();
+  return (key, salt) => {
+    const name = `${key} ${salt.join()}`;
+    if (!known.has(name)) known.set(name, derive(key, salt));
+    return known.get(name)!;
+  };
+}
+
+/** Something of Argon2id's size that takes no time. */
+const quick: Derive = async (key, salt) => expand(salt, `test/${key}`, 32);
+
+test('the hash is that of Python', () => {
+  const numbers = [0n, 1n, 2n ** 64n - 1n, 0x123456789abcdef0n, 2n ** 32n, 2n ** 63n];
+  expect([...new BigUint64Array(mixed(new Uint32Array(new BigUint64Array(numbers).buffer)).buffer)]).toEqual([
+    0xe220a8397b1dcdafn, 0x910a2dec89025cc1n, 0xe4d971771b652c20n, 0x161922c645ce50e8n, 0xc42c5a1aa3820138n,
+    0x481ec0a212a9f3dbn, // keyss.channels.mixing
+  ]);
+});
+
+test('words are sorted as BigInt sorts them, equal ones in their order', () => {
+  const draw = random(1);
+  const numbers = Array.from({ length: 300 }, () => BigInt(Math.floor(draw() * 40)) << BigInt(Math.floor(draw() * 59)));
+  const words = new Uint32Array(new BigUint64Array(numbers).buffer);
+  const expected = [...numbers.keys()].sort((a, b) => (numbers[a] < numbers[b] ? -1 : numbers[a] > numbers[b] ? 1 : a - b));
+  expect([...sortingOrder(words)]).toEqual(expected);
+  expect([...namesakes(words)]).toEqual(numbers.map((each) => numbers.filter((other) => other === each).length));
+});
+
+test.each([[112, NOISY, 3, 0.05], [2000, RAPTOR, 1.9, 0.05], [40_000, RAPTOR, 1.8, 0.05]])(
+  'a fountain of %i bits gives them back when some are wrong',
+  (size, degrees, rate, wrong) => {
+    const draw = random(size);
+    const data = Uint8Array.from({ length: size }, () => Math.floor(2 * draw()));
+    const seeds = Uint32Array.from({ length: 2 * Math.ceil(rate * size) }, () => Math.floor(draw() * 2 ** 32));
+    const code = new Fountain(size, degrees);
+    const ratio = Math.log((1 - wrong) / wrong);
+    const ratios = Float32Array.from(code.encode(data, seeds), (bit) => (bit === Number(draw() < wrong) ? ratio : -ratio));
+    expect(digest(code.likeliest(seeds, ratios, 60).subarray(0, size))).toBe(digest(data));
+  },
+);
+
+test('a similarity is found again', () => {
+  const draw = random(5);
+  const turned = { scale: 0.3, rotation: [0, 0, 1, -0.6, 0.8, 0, -0.8, -0.6, 0], translation: [3, -2, 1] };
+  const points = Array.from({ length: 30 }, draw);
+  const there = [...Array(10).keys()].flatMap((at) => movedPoint(turned, points, at));
+  const found = fittedSimilarity(points, there, [...Array(10).keys()])!;
+  expect(found.scale).toBeCloseTo(turned.scale, 12);
+  found.rotation.forEach((each, index) => expect(each).toBeCloseTo(turned.rotation[index], 12));
+  found.translation.forEach((each, index) => expect(each).toBeCloseTo(turned.translation[index], 12));
+  expect(fittedSimilarity([1, 1, 1, 1, 1, 1], points, [0, 1])).toBeNull();
+});
+
+test('appended Gaussians survive the loss of a fifth, in any order, and no more than they can', async () => {
+  const [model, wanted] = [await modelOf('appended.ply'), OPENED.find((each) => each.file === 'appended.ply' && each.payload)!];
+  const derive = remembered(here);
+  const content = await AppendedReader.of(some(model, 0.8, 7))!.open(wanted.key, derive);
+  expect(digest(content!.data)).toBe(wanted.payload);
+  await expect(AppendedReader.of(some(model, 0.2, 8))!.open(wanted.key, derive)).rejects.toThrow(/^The key is right/);
+  expect(await AppendedReader.of(model)!.open('another key', derive)).toBeNull();
+  expect(AppendedReader.of(selected(model, [...Array(120).keys()]))).toBeNull(); // the cover alone
+});
+
+test('colours survive another scale, another order and the loss of a fifth', async () => {
+  const model = await modelOf(NOTE.file);
+  const derive = remembered(here);
+  const fewer = some(model, 0.8, 9);
+  const larger = { ...fewer, logScales: fewer.logScales.map((each) => each + Math.log(1.37)) };
+  for (const changed of [fewer, larger]) {
+    const content = await ColoursReader.of(changed).open(NOTE.key, derive);
+    expect(digest(content!.data)).toBe(NOTE.payload);
+  }
+});
+
+test('another key opens nothing in colours, nor in models that have none', async () => {
+  const model = await modelOf(NOTE.file);
+  expect(await ColoursReader.of(model).open('another key', quick)).toBeNull();
+  for (const count of [0, 1, 20]) {
+    expect(await ColoursReader.of(selected(model, [...Array(count).keys()])).open(NOTE.key, quick)).toBeNull();
+  }
+  const broken = { ...model, logScales: model.logScales.map((each, at) => (at % 5 ? each : NaN)) };
+  expect(await ColoursReader.of(broken).open(NOTE.key, quick)).toBeNull();
+});
+
+test('all channels derive as many keys as they say, whatever opens', async () => {
+  for (const [file, channels] of Object.entries({ 'appended.ply': 3, 'colours.spz': 2, 'carried.ply': 2 })) {
+    const readers = readersOf(await modelOf(file));
+    expect(readers.length).toBe(channels);
+    let asked = 0;
+    const channel = new Channels(readers);
+    await channel.open('any key', async (key, salt) => {
+      asked++;
+      return quick(key, salt);
+    });
+    expect(asked).toBe(channel.derivations);
+  }
+});
+
+test('the first channel that opens counts, and the others are looked through', async () => {
+  const asked: string[] = [];
+  const reader = (name: string, found: Content | null | Error): Reader => ({
+    derivations: 1,
+    open: async () => {
+      asked.push(name);
+      if (found instanceof Error) throw found;
+      return found;
+    },
+  });
+  const content = (method: string): Content => ({ service: 'payload', method, data: new Uint8Array(0) });
+  const [none, first, second] = [reader('none', null), reader('first', content('first')), reader('second', content('second'))];
+  expect((await new Channels([none, first, second]).open('key'))?.method).toBe('first');
+  expect(asked).toEqual(['none', 'first', 'second']);
+  await expect(new Channels([reader('damaged', new Error('damaged.')), first]).open('key')).rejects.toThrow('damaged.');
+  expect(await new Channels([none]).open('key')).toBeNull();
+});
+
+test('keys are derived one by one, and by each of several in turn', async () => {
+  let [running, most] = [0, 0];
+  const slow: Derive = async (key, salt) => {
+    most = Math.max(most, ++running);
+    await new Promise((resolve) => setTimeout(resolve, 5));
+    running--;
+    if (key === 'bad') throw new Error('no memory');
+    return salt;
+  };
+  const salts = Array.from({ length: 6 }, (_, index) => Uint8Array.of(index));
+  const single = oneByOne(slow);
+  const bad = expect(single('bad', salts[0])).rejects.toThrow();
+  expect(await Promise.all(salts.map((salt) => single('key', salt)))).toEqual(salts);
+  await bad;
+  expect(most).toBe(1);
+  const several = inTurn([oneByOne(slow), oneByOne(slow)]);
+  expect(await Promise.all(salts.map((salt) => several('key', salt)))).toEqual(salts);
+  expect(most).toBe(2);
+});
+
+test('packed payloads', () => {
+  const packed = hex('0866696c65616263'); // 2 x 4: not compressed; "file"; "abc"
+  expect(unpackPayload(packed)).toEqual({ service: 'payload', method: 'file', data: hex('616263') });
+  for (const damaged of ['', '00', '0866', '09' + '66696c65' + '00', '4066696c65', '0880696c65']) {
+    expect(() => unpackPayload(hex(damaged))).toThrow(/damaged\.$/);
+  }
+});
