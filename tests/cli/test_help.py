@@ -40,8 +40,19 @@ class TestHelp:
         said = keyss("--help")
         assert said.status == 0
         assert all(f"• {name}" in said.out for name in COMMANDS)
-        making = ["keygen", "fit", "hide", "reveal", "verify", "render", "convert", "view", "export-html"]
-        judging = ["evaluate", "audit", "report", "compare", "steganalyze", "info", "demo", "doctor"]
+        making = [
+            "keygen",
+            "key-of",
+            "fit",
+            "hide",
+            "reveal",
+            "verify",
+            "render",
+            "convert",
+            "view",
+            "export-html",
+        ]
+        judging = ["sweep", "evaluate", "audit", "report", "compare", "steganalyze", "info", "demo", "doctor"]
         assert [*making, *judging, "completion", "version"] == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)

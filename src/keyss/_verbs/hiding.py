@@ -168,7 +168,7 @@ def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussi
     """32 bytes that nobody knows without the keys; other inputs or options have others."""
     seed = options.fit.known_seed
     salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
-    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys]
+    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys if key]
     parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 

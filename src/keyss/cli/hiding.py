@@ -177,7 +177,7 @@ def hide(
     if batch is not None:
         one: dict[str, object] = {"--cover": cover, "--secret": secret, "--secret-file": secret_file}
         one |= {"--key-file": key_file, "--cover-model": cover_model, "--secret-model": secret_model}
-        one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--resume": resume}
+        one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--live": live, "--resume": resume}
         if given_too := [flag for flag, value in one.items() if value]:
             raise UsageError(
                 f"--batch: {given_too[0]} is for a single hiding; a batch that was interrupted goes on "

@@ -16,6 +16,7 @@ from keyss.files.atomic import write_bytes
 from keyss.keys.generation import generate_key
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
+from keyss.methods import registry
 from keyss.runs.config import PathLike
 from keyss.sweeps.job import Job, checksum, result_of
 from keyss.sweeps.running import PRIVATE, Ended, How, Planned, claimed, make_private, run_all
@@ -160,8 +161,9 @@ def estimates(
 def _planned(cell: Cell) -> tuple[float, int, str | None]:
     job = cell.planned.job
     models = job.secret_models or (None,) * len(job.secrets)
+    has_keys = registry.get(job.method).capabilities.keys
     secrets = [
-        Secret(scene, f"key {index}", model)
+        Secret(scene, f"key {index}" if has_keys else "", model)
         for index, (scene, model) in enumerate(zip(job.secrets, models, strict=True))
     ]
     try:

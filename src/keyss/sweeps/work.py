@@ -76,7 +76,9 @@ def options_of(job: Job) -> MethodOptions:
 
 
 def keys_of(job: Job) -> list[str]:
-    """A key for each secret. Raises InputError for a file that holds none."""
+    """A key for each secret, or "" where the method has none. Raises InputError for a file without a key."""
+    if job.secrets and not registry.get(job.method).capabilities.keys:
+        return [""] * len(job.secrets)
     if job.master_key_file is None:
         return [read_key_file(Path(each))[0] for each in job.key_files]
     master = MasterKey(read_key_file(Path(job.master_key_file))[0])
