@@ -15,7 +15,6 @@ that such differences have.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -125,15 +124,15 @@ class Likeness:
     ) -> Doubles:
         """[R, F] of rows whose number in this column is `values` [R]."""
         another = 3 - column
-        found: list[npt.NDArray[Any]] = []
+        found: list[Doubles] = []
         for which, other in around:
             apart = values[which] - colours[other, column]
             own = rows[which]
             red, third = (colours[own, each] - colours[other, each] for each in (0, another))
             for each in (apart, apart - red, apart - third):
-                found += [np.bincount(which, _log(each, size), len(rows)) for size in _SIZES]
+                found += [_sums(which, _log(each, size), len(rows)) for size in _SIZES]
             relative = apart / self.usual[own]
-            found += [np.bincount(which, _log(relative, size), len(rows)) for size in _RELATIVE]
+            found += [_sums(which, _log(relative, size), len(rows)) for size in _RELATIVE]
         for own_channel in (0, another):
             inside = values - colours[rows, own_channel]
             found += [_log(inside, size) for size in _SIZES]
@@ -165,6 +164,11 @@ def _usual(colours: Doubles, every: tuple[_Pairs, ...]) -> Doubles:
         counts += np.bincount(which, minlength=len(logs))
     found: Doubles = np.exp(logs / counts.clip(1)) + _LEAST_RED
     return found
+
+
+def _sums(which: Rows, values: Doubles, count: int) -> Doubles:
+    """[count] of the values [p] of each."""
+    return np.bincount(which, values, count).astype(np.float64)
 
 
 def _log(apart: Doubles, size: float) -> Doubles:
