@@ -9,6 +9,7 @@ export interface Question {
   readonly name?: string; // of the file; some formats are known by it only
   readonly keyless?: boolean; // no key will be tried on these bytes
   readonly key?: string;
+  readonly colours?: boolean; // whether the key is tried on these, too
 }
 
 export interface Answer {

@@ -1,6 +1,6 @@
 /** What takes time: files into models, and what keys open in them. Nothing of it outlives the page. */
 import type { Content, Reader } from './channels/content.ts';
-import { readerOf } from './channels/opening.ts';
+import { preparedFor } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel, type ReadModel } from './files/models.ts';
@@ -11,7 +11,7 @@ import type { Answer, Question } from './protocol.ts';
 
 let derive: Derive = here;
 let stego: Gaussians | null = null;
-let prepared: Promise<Reader | null> = Promise.resolve(null);
+let prepared: Promise<((colours: boolean) => Reader) | null> = Promise.resolve(null);
 
 function answer(message: Answer, moved: Transferable[] = []): void {
   (self as unknown as Worker).postMessage(message, moved);
@@ -24,20 +24,20 @@ async function load({ id, name, keyless }: Question, bytes: Uint8Array): Promise
   if (keyless) return;
   stego = model;
   // Afterwards: the picture comes first.
-  prepared = new Promise((resolve) => setTimeout(() => resolve(readerWhereThereIsMemory(read)), 0));
+  prepared = new Promise((resolve) => setTimeout(() => resolve(preparedWhereThereIsMemory(read)), 0));
 }
 
-function readerWhereThereIsMemory(model: ReadModel): Reader | null {
+function preparedWhereThereIsMemory(model: ReadModel): ((colours: boolean) => Reader) | null {
   try {
-    return readerOf(model);
+    return preparedFor(model);
   } catch {
     return null; // it opens nothing, and the page goes on
   }
 }
 
-async function unlock(id: number, key: string): Promise<void> {
-  const reader = await prepared;
-  const content = reader === null ? null : await reader.open(key, counted(id, reader.derivations));
+async function unlock(id: number, key: string, colours: boolean): Promise<void> {
+  const reader = (await prepared)?.(colours);
+  const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
   const model = content && stego && secretOf(content, stego)?.gaussians;
   if (model) answer({ id, model }, buffersOf(model));
   else answer({ id, file: content ? fileOf(content) : undefined });
@@ -68,7 +68,7 @@ self.onmessage = async ({ data }: MessageEvent<Question>) => {
   }
   try {
     if (data.bytes) await load(data, data.bytes);
-    else await unlock(data.id, data.key ?? '');
+    else await unlock(data.id, data.key ?? '', data.colours ?? false);
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';
     // A key's failures say no more than a key that opens nothing does.

@@ -2,7 +2,8 @@
  * Opening with a key, in whichever channel of a model the secret lies; `keyss.channels.opening` on the other side.
  *
  * All channels are looked through for every key, also when one of them has opened already: how long it takes tells
- * neither whether a key opens something nor where.
+ * neither whether a key opens something nor where. Colours are looked through when that is asked for, with whatever key:
+ * they take four times as long as all others together.
  */
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/derivation.ts';
@@ -12,15 +13,21 @@ import { ColoursReader } from './colours/reader.ts';
 import type { Content, Reader } from './content.ts';
 import { LowBitsReader } from './low_bits/reader.ts';
 
-/** The channels of a model, prepared for any number of keys. */
-export function readerOf(model: ReadModel): Reader {
-  return new Channels(readersOf(model));
+/** A model's channels, prepared for any number of keys; with `colours`, as soon as that is asked for, these too. */
+export function preparedFor(model: ReadModel): (colours: boolean) => Reader {
+  const quick = quickReadersOf(model);
+  let all: Reader[] | null = null;
+  return (colours) => new Channels(colours ? (all ??= [...quick, ColoursReader.of(model)]) : quick);
 }
 
 /** One for each channel that a model has, those that come first counting most. */
 export function readersOf(model: ReadModel): Reader[] {
+  return [...quickReadersOf(model), ColoursReader.of(model)];
+}
+
+function quickReadersOf(model: ReadModel): Reader[] {
   const exact = model.codes ? CodesReader.of(model.codes) : LowBitsReader.of(model);
-  return [exact, AppendedReader.of(model), ColoursReader.of(model)].filter((each) => each !== null);
+  return [exact, AppendedReader.of(model)].filter((each) => each !== null);
 }
 
 /** Several channels, of which the first one that opens counts. */

@@ -13,6 +13,7 @@ export const page = {
   controls: element('controls'),
   file: element<HTMLInputElement>('file'),
   form: element<HTMLFormElement>('key-form'),
+  colours: element<HTMLInputElement>('colours'),
   key: element<HTMLInputElement>('key'),
   show: element<HTMLButtonElement>('show'),
   open: element<HTMLButtonElement>('open'),

@@ -25,7 +25,7 @@ class Page {
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
   private addressTimer = 0;
   private loads = 0;
-  private longest = 0; // milliseconds that a key took so far
+  private readonly longest = new Map<boolean, number>(); // milliseconds that a key took so far, without and with colours
 
   constructor(private readonly viewer: Viewer) {
     this.controls = new Controls(page.canvas, this.pose, (pose) => this.moved(pose), () => this.firstPose());
@@ -95,7 +95,7 @@ class Page {
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [name, model];
     this.hideSecret();
-    this.longest = 0;
+    this.longest.clear();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
     document.title = `${name} · keyss viewer`;
@@ -139,7 +139,7 @@ class Page {
    * the worker makes the same passes, what is there is drawn anew, and no attempt ends sooner than those before it.
    */
   private async unlock(): Promise<void> {
-    const key = page.key.value;
+    const [key, colours] = [page.key.value, page.colours.checked];
     if (!key || this.published === null || page.open.disabled) return;
     const [own, start] = [this.loads, performance.now()];
     page.open.disabled = true;
@@ -147,7 +147,7 @@ class Page {
     this.say('Trying the key …');
     page.progress.value = 0;
     page.progress.hidden = false;
-    const { model, file } = await this.opener.unlock(key);
+    const { model, file } = await this.opener.unlock(key, colours);
     page.key.value = '';
     showKey(false);
     let found = '';
@@ -156,9 +156,9 @@ class Page {
       else if (this.secret) this.viewer.show(this.secret, 'right');
       else this.showPublished();
       await this.picture();
-      const left = this.longest - (performance.now() - start);
+      const left = (this.longest.get(colours) ?? 0) - (performance.now() - start);
       if (left > 0) await new Promise((resolve) => setTimeout(resolve, left));
-      this.longest = performance.now() - start;
+      this.longest.set(colours, performance.now() - start);
       if (model) found = `The secret is shown: ${count(model.count)} Gaussians.`;
     }
     if (file) {

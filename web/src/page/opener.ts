@@ -41,9 +41,9 @@ export class Opener {
     return this.ask({ id: this.next++, bytes, name, keyless: true }, [bytes.buffer as ArrayBuffer]);
   }
 
-  /** What a key opens. */
-  unlock(key: string): Promise<Answer> {
-    return this.ask({ id: this.next++, key });
+  /** What a key opens; in colours, too, where these are to be looked through. */
+  unlock(key: string, colours: boolean): Promise<Answer> {
+    return this.ask({ id: this.next++, key, colours });
   }
 
   private ask(question: Question, moved: Transferable[] = []): Promise<Answer> {
