@@ -1,0 +1,94 @@
+"""How long the viewer's page takes in headless Chromium without a GPU: the table of docs/viewer.md.
+
+    python benchmarks/page.py [--count 100000] [--runs 3]
+
+A model of so many Gaussians of SH degree 3 that carries a secret of nine tenths as many of degree 0, in one
+page from disk: seconds to the first picture; from a key to the picture, wrong and right keys in turn; the same
+with the box for colours checked; frames per second while the camera turns; memory of the tab.
+Needs playwright (the `test` extra) and Chromium.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+import keyss
+from keyss.methods.carry.options import CarryOptions
+from keyss.viewer.page import export_html
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from viewer.browser import PROGRAM, SWITCHES, Visit, made, visit
+
+WIDTH, HEIGHT = 800, 600
+KEY = "correct horse battery staple 99"
+TURN = """() => new Promise((resolve) => {
+    const [start, main] = [performance.now(), document.getElementById('main')];
+    let [frames, angle] = [0, 0];
+    const turn = () => {
+        angle += 0.03;
+        const eye = [7 * Math.sin(angle), -1, -7 * Math.cos(angle)].map((each) => each.toFixed(3)).join(',');
+        location.hash = `#eye=${eye}&target=0,0,0`;
+        frames++;
+        if (performance.now() - start < 5000) requestAnimationFrame(turn);
+        else resolve((1000 * frames) / (performance.now() - start));
+    };
+    turn();
+})"""
+
+
+def page_of(count: int, folder: Path) -> Path:
+    """One page with a model that carries."""
+    cover, secret = made(count, 0), made(count * 9 // 10, 1).with_sh_degree(0)
+    hidden = keyss.hide(
+        cover, [keyss.Secret(secret, KEY)], method=CarryOptions(), width=32, min_psnr=0, out=folder / "run"
+    )
+    print(f"{len(hidden.stego):,} Gaussians carry {len(secret):,}", flush=True)
+    return export_html(folder / "run/publish/stego.ply", folder / "page.html")[0]
+
+
+def memory(tab: Visit) -> float:
+    """MiB of JavaScript's heap and its buffers."""
+    client = tab.page.context.new_cdp_session(tab.page)
+    client.send("HeapProfiler.collectGarbage")
+    used = client.send("Runtime.getHeapUsage")
+    return float(used["usedSize"] + used.get("backingStorageSize", 0)) / 2**20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--runs", type=int, default=3)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page = page_of(asked.count, Path(folder))
+        print(f"one page of {page.stat().st_size / 1e6:.1f} MB", flush=True)
+        browser = playwright.chromium.launch(executable_path=PROGRAM, args=SWITCHES)
+        for run in range(asked.runs):
+            with visit(browser) as tab:
+                tab.page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
+                start = time.monotonic()
+                tab.goto(page.as_uri())
+                print(f"run {run}: first picture {time.monotonic() - start:.1f} s", flush=True)
+                tab.page.wait_for_timeout(5000)  # about as long as it takes to type a key
+                for word in ("wrong", "right", "wrong", "right"):
+                    took = tab.try_key(KEY if word == "right" else "another key") / 1000
+                    print(f"  {word} key {took:.1f} s, {memory(tab):.0f} MiB in JavaScript", flush=True)
+                tab.page.check("#colours")
+                for word in ("wrong", "right"):
+                    took = tab.try_key(KEY if word == "right" else "another key") / 1000
+                    print(f"  {word} key, colours too: {took:.1f} s, {memory(tab):.0f} MiB", flush=True)
+                print(
+                    f"  {tab.page.evaluate(TURN):.1f} frames asked for per second while turning", flush=True
+                )
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
