@@ -3,7 +3,7 @@
     python benchmarks/page.py [--count 100000] [--runs 3]
 
 A model of so many Gaussians of SH degree 3 that carries a secret of nine tenths as many of degree 0, in one
-page from disk: seconds to the first picture; from a key to the picture, wrong and right keys in turn; the same
+page from disk: seconds to the first picture; from a key to the picture, wrong and right in turn; the same
 with the box for colours checked; frames per second while the camera turns; memory of the tab.
 Needs playwright (the `test` extra) and Chromium.
 """

@@ -70,7 +70,7 @@ def test_what_does_not_go_together_is_refused(
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
     stego, key = folder / "out" / "publish" / "stego.ply", ("--key-file", folder / "key0")
     assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 4, "a file of 3,000 bytes")
-    assert_refused(keyss("reveal", stego, *key, "-o", back, "--decoy"), 2, "no --decoy")
+    assert_refused(keyss("reveal", stego, *key, "-o", back, "--decoy"), 2, "there is no --handed, --decoy")
     assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
     assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
     assert listing(tmp_path) == {}

@@ -35,6 +35,7 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 
 MOST_BYTES = 1 << 20  # of the file
+MOST_DEEP = 20  # brackets in brackets
 MOST_CELLS = 100_000
 _FIT = "fit"  # the options of training lie below it
 
@@ -94,9 +95,16 @@ def read_spec(path: Path) -> SweepSpec:
         raise BackendError(f"sweeps need the package pyyaml (pip install 'keyss[sweep]'): {error}") from error
     text = read_text(path, MOST_BYTES)
     try:
-        # A few aliases of aliases stand for more than memory holds.
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text, yaml.SafeLoader)):
-            raise InputError(f"{path}: aliases (*name) are not read: write it out")
+        opening = (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken)
+        closing = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken)
+        depth = 0
+        for token in yaml.scan(text, yaml.SafeLoader):
+            # A few aliases of aliases stand for more than memory holds.
+            if isinstance(token, yaml.AliasToken):
+                raise InputError(f"{path}: aliases (*name) are not read: write it out")
+            depth += isinstance(token, opening) - isinstance(token, closing)
+            if depth > MOST_DEEP:  # of which the time grows with the square
+                raise InputError(f"{path}: brackets are nested more than {MOST_DEEP} deep")
         data = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error

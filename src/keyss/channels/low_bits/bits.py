@@ -93,8 +93,8 @@ def bytes_per_gaussian(sh_degree: int) -> int:
 def coarse_lengths(quats: Words) -> npt.NDArray[np.float64]:
     """[N] of quaternions [N, 4] with the middle of all low bits that they could have."""
     low = np.uint32((1 << UNUSED_BITS + GEOMETRY_BITS) - 1)
-    middle = (quats & ~low | (low + 1) >> 1).view(np.float32).astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
+        middle = (quats & ~low | (low + 1) >> 1).view(np.float32).astype(np.float64)
         lengths: npt.NDArray[np.float64] = np.sqrt((middle * middle).sum(axis=1))
     return lengths
 
