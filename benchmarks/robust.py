@@ -1,10 +1,11 @@
 """What the robust channel carries, what that costs, and what of it survives.
 
 python benchmarks/robust.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
-                                [--only FORMAT]
+                                [--only FORMAT] [--size BYTES]
 python benchmarks/robust.py MODEL.ply ... --payloads N --log FILE [--gaussians N] [--foreign-each M]
 python benchmarks/robust.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
 python benchmarks/robust.py MODEL.ply --speed [--gaussians N]
+python benchmarks/robust.py MODEL.ply ... --repair [--gaussians N]
 
 For each model and strength: net bits per Gaussian and the cost of a full model, and how many of P payloads,
 each with a new key and new entropy, do not come back from each format, alone and with a quarter of the
@@ -42,7 +43,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from keyss.channels.robust import RobustCover, embed, extract
+from keyss.channels.robust import RobustCover, embed, extract, repaired
 from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -50,7 +51,8 @@ from keyss.files.models import read_model, write_model
 from keyss.keys import DerivedKey
 from keyss.measure.robustness import changes
 from keyss.measure.robustness.conversions import converters
-from keyss.rendering.difference import cost
+from keyss.rendering.difference import Viewpoints, cost
+from keyss.rendering.orbit import orbit
 from robust_payloads import run_payloads
 
 Change = Callable[[Gaussians], Gaussians]
@@ -66,11 +68,13 @@ def main() -> None:
     parser.add_argument("--foreign-each", type=int, default=10)
     parser.add_argument("--strengths", type=float, nargs="+", default=[45.0])
     parser.add_argument("--seed", type=int, default=0, help="of keys, payloads and what is removed")
+    parser.add_argument("--size", type=int, help="bytes of a payload, instead of all that a model holds")
     parser.add_argument("--changes", action="store_true")
     parser.add_argument("--only", default="", help="formats with this in their name")
     parser.add_argument("--pairs", type=Path, metavar="FOLDER")
     parser.add_argument("--shares", type=float, nargs="+", default=[1.0, 0.5, 0.2, 0.05])
     parser.add_argument("--speed", action="store_true")
+    parser.add_argument("--repair", action="store_true", help="what a fit after writing gives")
     asked = parser.parse_args()
     if asked.pairs:
         for strength in asked.strengths:
@@ -78,6 +82,9 @@ def main() -> None:
         return
     if asked.speed:
         _measure_speed(asked.models, asked.gaussians)
+        return
+    if asked.repair:
+        _measure_repair(asked.models, asked.gaussians, asked.strengths[0])
         return
     if asked.log:
         run_payloads(
@@ -94,11 +101,12 @@ def main() -> None:
     print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for path in asked.models:
-        prepared = RobustCover.of(_drawn(read_model(path), asked.gaussians))
+        prepared = RobustCover.of(_of_file(path, asked.gaussians))
         for strength in asked.strengths:
             name = f"{path.stem} | {len(prepared.model):,} | {strength:.0f}"
             formats = {what: change for what, change in FORMATS.items() if asked.only in what}
-            _measure(prepared, strength, name, formats, asked.payloads, asked.seed, pruned=True)
+            share = 1.0 if asked.size is None else asked.size / prepared.capacity(strength)
+            _measure(prepared, strength, name, formats, asked.payloads, asked.seed, share, pruned=True)
             if asked.changes:
                 _measure(prepared, strength, name, OTHERS, asked.payloads, asked.seed)
                 _measure(prepared, strength, name, OTHERS, asked.payloads, asked.seed, FIFTH)
@@ -125,7 +133,7 @@ def _measure(
     pruned: bool = False,
 ) -> None:
     """Prints a row for each change in `wanted`."""
-    size, failures, costs = int(share * prepared.capacity(strength)), Counter[str](), []
+    size, failures, costs = round(share * prepared.capacity(strength)), Counter[str](), []
     missing: set[str] = set()
     for seed in range(first, first + payloads):
         data = np.random.default_rng(seed).bytes(size)
@@ -196,6 +204,30 @@ def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
             seconds.append(f"{time.monotonic() - start:.1f} s")
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
+
+
+def _measure_repair(models: Sequence[Path], gaussians: int | None, strength: float) -> None:
+    """In four views from around, and in seven others that were not looked at either."""
+    print("| model | Gaussians | bytes | written, dB | repaired, dB | seconds | opens, 25 % removed |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for path in models:
+        prepared = RobustCover.of(_of_file(path, gaussians))
+        data = np.random.default_rng(0).bytes(prepared.capacity(strength))
+        stego = _embedded(prepared, strength, 0, data)
+        start = time.monotonic()
+        fitted = repaired(prepared.model, stego)
+        seconds = time.monotonic() - start
+        others = Viewpoints(orbit(prepared.model, 256, 7))
+        before, after = (
+            ", ".join(f"{cost(prepared.model, each, views):.1f}" for views in (None, others))
+            for each in (stego, fitted)
+        )
+        opened = _opens(changes.random_pruning(0.25, 0)(fitted), 0, data)
+        print(
+            f"| {path.stem} | {len(stego):,} | {len(data):,} | {before} | {after} | {seconds:.0f} "
+            f"| {'yes' if opened else 'no'} |",
+            flush=True,
+        )
 
 
 def _drawn(model: Gaussians, count: int | None) -> Gaussians:

@@ -125,6 +125,8 @@ def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path
         "none": b"",
     }.items():
         (tmp_path / name).write_bytes(content)
+        # What was said of the file before stays until this one is read.
+        tab.page.evaluate("() => { document.getElementById('problem').textContent = ''; }")
         tab.page.set_input_files("#file", tmp_path / name)
         tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
         said = tab.page.locator("#problem").inner_text()

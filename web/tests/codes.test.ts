@@ -3,7 +3,7 @@ import { log2 } from '../src/channels/codes/fields.ts';
 import { Room } from '../src/channels/codes/layout.ts';
 import { lastBits } from '../src/channels/codes/order.ts';
 import { CodesReader } from '../src/channels/codes/reader.ts';
-import { sortingOrder } from '../src/channels/codes/sorting.ts';
+import { sortingOrder } from '../src/core/sorting.ts';
 import type { Codes } from '../src/files/models.ts';
 import { digest, jsonVector, modelOf } from './vectors.ts';
 

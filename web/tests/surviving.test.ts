@@ -9,7 +9,8 @@ import { mixed } from '../src/channels/mixing.ts';
 import { Channels, readersOf } from '../src/channels/opening.ts';
 import { unpackPayload } from '../src/channels/packing.ts';
 import { type Gaussians, selected } from '../src/core/gaussians.ts';
-import { namesakes, sortingOrder } from '../src/core/words.ts';
+import { sortingOrderOfPairs } from '../src/core/sorting.ts';
+import { namesakes } from '../src/core/words.ts';
 import { type Derive, expand } from '../src/keys/derivation.ts';
 import { here, inTurn, oneByOne } from '../src/keys/pool.ts';
 import { digest, hex, jsonVector, modelOf } from './vectors.ts';
@@ -59,7 +60,7 @@ test('words are sorted as BigInt sorts them, equal ones in their order', () => {
   const numbers = Array.from({ length: 300 }, () => BigInt(Math.floor(draw() * 40)) << BigInt(Math.floor(draw() * 59)));
   const words = new Uint32Array(new BigUint64Array(numbers).buffer);
   const expected = [...numbers.keys()].sort((a, b) => (numbers[a] < numbers[b] ? -1 : numbers[a] > numbers[b] ? 1 : a - b));
-  expect([...sortingOrder(words)]).toEqual(expected);
+  expect([...sortingOrderOfPairs(words)]).toEqual(expected);
   expect([...namesakes(words)]).toEqual(numbers.map((each) => numbers.filter((other) => other === each).length));
 });
 

@@ -69,6 +69,7 @@ class _Appended:
 class _Colours:
     cover: robust.RobustCover
     strength: float
+    repair: bool
     overhead: int = 16
     grows: bool = False
 
@@ -78,18 +79,27 @@ class _Colours:
 
     def embed(self, secrets: Secrets, *, entropy: bytes | None = None) -> Gaussians:
         packed = [(key, pack_payload(payload)) for key, payload in secrets]
-        return self.cover.embed(packed, strength=self.strength, entropy=entropy)
+        stego = self.cover.embed(packed, strength=self.strength, entropy=entropy)
+        return robust.repaired(self.cover.model, stego) if self.repair else stego
 
 
 def room_in(
-    cover: Gaussians, publish: Publish, channel: AnyChannel, strength: float = robust.STRENGTH
+    cover: Gaussians,
+    publish: Publish,
+    channel: AnyChannel,
+    *,
+    strength: float = robust.STRENGTH,
+    repair: bool = False,
 ) -> Room:
-    """The room in a cover that is not published as `ply`; `strength` (dB) is that of colours.
+    """The room in a cover that is not published as `ply`; `strength` (dB) and `repair` are those of colours.
 
-    Raises InputError for a cover that has none, OutputError for one that the format does not hold.
+    Raises UsageError for a `repair` of a model without harmonics, InputError for a cover that has no room,
+    OutputError for one that the format does not hold.
     """
     if publish == "any":
         if channel == "appended":
             return _Appended(cover)
-        return _Colours(robust.RobustCover.of(cover), strength)
+        if repair:
+            robust.check_repairable(cover)
+        return _Colours(robust.RobustCover.of(cover), strength, repair)
     return _Codes(published.prepare(cover, publish))

@@ -81,19 +81,18 @@ def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
         assert opened(_turned(scale)(stego)) == b"a note"
 
 
-@pytest.mark.alone
 @pytest.mark.argon2
 def test_a_wrong_key_opens_nothing_in_about_the_same_time(cover: Gaussians) -> None:
     reader = AppendedReader.of(embed(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
     assert reader is not None
 
     def seconds(key: str) -> float:
-        start = time.perf_counter()
+        start = time.process_time()  # of all threads; others may keep the machine busy
         try:
             reader.open(key)
         except WrongKeyError:
             assert key != KEY
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     least = [min(seconds(key) for _ in range(3)) for key in (KEY, "Rosebud, 1942")]
     assert least[0] < 2 * least[1]

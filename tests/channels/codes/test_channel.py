@@ -50,7 +50,7 @@ def test_a_file_opens_with_each_of_its_keys(suffix: str) -> None:
 
 
 @EVERY
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(data=st.data())
 def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
     cover = CodesCover.of(codes_of(suffix, 3000), model_of(3000) if data.draw(st.booleans()) else None)

@@ -41,13 +41,12 @@ def test_random_codes_open_nothing(seed: int, kind: str) -> None:
     assert CodesReader.of(file).extract(key(0)).data == b"data"
 
 
-@pytest.mark.alone
 @EVERY
 def test_mutated_files_open_or_are_refused(suffix: str) -> None:
     format_, rng = FORMATS[suffix], np.random.default_rng(0)
     cover = CodesCover.of(codes_of(suffix, 2500))
     file = format_.serialise(written(cover, bytes(range(200))))
-    start = time.monotonic()
+    start = time.process_time()  # others may keep the machine busy
     for _ in range(60):
         changed = bytearray(file)
         for at in rng.integers(0, len(file), int(rng.integers(1, 4))):
@@ -59,7 +58,7 @@ def test_mutated_files_open_or_are_refused(suffix: str) -> None:
         except (InputError, WrongKeyError):
             continue
         assert found.data == bytes(range(200))
-    assert time.monotonic() - start < 60
+    assert time.process_time() - start < 60
 
 
 @pytest.mark.parametrize(

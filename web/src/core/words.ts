@@ -1,3 +1,5 @@
+import { sortingOrderOfPairs } from './sorting.ts';
+
 /**
  * Numbers of 64 bits, as their low and their high 32 bits beside each other in a Uint32Array [2 N]: as the bytes of a
  * stream are read on every machine that has a browser, and many times faster than BigInt.
@@ -9,28 +11,9 @@ export function wordsOf(bytes: Uint8Array): Words {
   return new Uint32Array(bytes.buffer, bytes.byteOffset, bytes.length >> 2);
 }
 
-/** The order [N] that sorts words ascending; equal ones stay in theirs (radix sort, 16 bits at a time). */
-export function sortingOrder(words: Words): Uint32Array {
-  const count = words.length >> 1;
-  let [order, sorted] = [new Uint32Array(count), new Uint32Array(count)];
-  for (let row = 0; row < count; row++) order[row] = row;
-  for (let digit = 0; digit < 4; digit++) {
-    const [half, shift] = [digit >> 1, 16 * (digit & 1)];
-    const ends = new Uint32Array((1 << 16) + 1);
-    for (let row = 0; row < count; row++) ends[((words[2 * row + half] >>> shift) & 0xffff) + 1]++;
-    for (let value = 0; value < 1 << 16; value++) ends[value + 1] += ends[value];
-    for (let at = 0; at < count; at++) {
-      const row = order[at];
-      sorted[ends[(words[2 * row + half] >>> shift) & 0xffff]++] = row;
-    }
-    [order, sorted] = [sorted, order];
-  }
-  return order;
-}
-
 /** [N] how many of the words are equal to each, itself included. */
 export function namesakes(words: Words): Uint32Array {
-  const order = sortingOrder(words);
+  const order = sortingOrderOfPairs(words);
   const found = new Uint32Array(order.length);
   for (let first = 0, end = 0; first < order.length; first = end) {
     while (end < order.length && same(words, order[first], order[end])) end++;

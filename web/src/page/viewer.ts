@@ -10,7 +10,7 @@ const NEAREST = 1e-3; // of the distance of what the camera looks at
 const FURTHEST = 1e4;
 const SLOW = 120; // milliseconds of a frame beyond which pictures in motion are coarser
 const COARSE = 0.5; // of the resolution, then
-const COARSE_COUNT = 30_000; // and so many Gaussians at most, those that are seen most
+const COARSE_COUNT = 15_000; // and so many Gaussians at most, those that are seen most
 const POLL = 4; // milliseconds
 const AT_REST = 250; // milliseconds without a change after which pictures are fine
 const ASLEEP = 500; // milliseconds without a frame after which the engine has no more to do
@@ -30,10 +30,12 @@ export class Viewer {
   private moving = false;
   private lastChange = 0;
   private inFlight = false; // a frame that is being drawn
+  private drawing = false; // in the frame of the engine that is going on
   private wanted = false; // another one after it
   private started = 0;
   private asleep = false; // without a GPU the engine's empty frames alone would take half of two cores
   private slowFrames = 0;
+  private slow = false; // the last picture at rest took so long that motion is coarse from its beginning on
   private split = 1; // share of the width that the left model has
   private whenReady: (() => void)[] = [];
   private ready = false;
@@ -44,7 +46,10 @@ export class Viewer {
     const system = app.systems.gsplat as GSplatComponentSystem;
     system.on('frame:request', () => this.draw());
     system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
-    app.on('frameend', () => this.afterFrame());
+    app.on('framerender', () => (this.drawing = app.renderNextFrame)); // the engine's other frames draw nothing
+    app.on('frameend', () => {
+      if (this.drawing) this.afterFrame();
+    });
     app.on('update', () => this.rest());
     app.start();
     new ResizeObserver(() => this.resize()).observe(canvas);
@@ -114,6 +119,7 @@ export class Viewer {
     camera.setRotation(new Quat().setFromMat4(matrix));
     camera.camera!.nearClip = NEAREST * distance;
     camera.camera!.farClip = FURTHEST * distance;
+    if (this.slow) this.setScale(COARSE);
     this.touch();
   }
 
@@ -223,6 +229,7 @@ export class Viewer {
     const now = performance.now();
     this.inFlight = false;
     this.canvas.dataset.frames = String(Number(this.canvas.dataset.frames ?? 0) + 1);
+    if (!this.moving) this.slow = now - this.started > SLOW;
     if (this.moving) {
       this.slowFrames = now - this.started > SLOW ? this.slowFrames + 1 : 0;
       if (this.slowFrames > 1 && now - this.lastChange < AT_REST) this.setScale(COARSE);

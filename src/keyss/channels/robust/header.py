@@ -241,6 +241,8 @@ def read_header(
 
 def header_agreement(header: Header, check: bytes, secrets: Sequence[bytes], index: Index) -> float:
     """How far what lies under these secrets agrees with the header: 0 by chance."""
+    if not len(index) or not secrets:
+        return 0.0
     parts = index.parts(secrets, header.kind, _USUAL, header.kind.places)
     bits = _fountain().encode(header.pack(check), parts.seeds.ravel()).reshape(parts.seeds.shape)
     return float((parts.hints * (1 - 2.0 * bits)).sum() + parts.pilots.sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import itemgetter
 
 import numpy as np
 
@@ -41,6 +42,8 @@ _CELLS_AROUND = (0, 1, -1, 2, -2, 3, -3, 4, -4)  # where a writer may have had i
 _CELLS_SCALED = (0, 1, -1)  # in a model that was scaled
 _ALIGNMENTS = 7  # of borders of cells: in a model that was scaled names are wrong by a fifth at most
 _BEST = 3  # of all these, that are looked at more closely
+# What a key that opens nothing looks for.
+_NOTHING = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 0, 1, 0, SHARES // 4 - 1, 64, 0)
 _REFINED = ((0.02, 0.004), (0.004, 0.001))  # where it is looked for once a header is found
 
 
@@ -62,18 +65,24 @@ class Reader:
     def read(self, key: Key) -> bytes:
         """See `extract`."""
         static, secrets = derived(key, Salts.of(self._numbers))
-        check, found = check_secret(static), None
+        check = check_secret(static)
         promises = [(index.promise(secrets), offset) for offset, index in self._indices()]
-        for _, offset in sorted(promises, reverse=True)[:_BEST]:  # all, as a key that opens nothing does
-            index = Index(self._numbers.carriers(offset))
-            for kind, view in VIEWS:
-                header = read_header(secrets, check, index, kind, view)
-                found = found or ((header, offset) if header is not None else None)
-        if found is None:  # about the work that there is where there is something
-            header = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 0, 1, 0, SHARES // 4 - 1, 64, 0)
-            _payload(header, static, self._numbers.carriers(0.0), _CHANGED, _ROUNDS // 4)
+        best = [offset for _, offset in sorted(promises, reverse=True)[:_BEST]]
+        indices = [Index(self._numbers.carriers(offset)) for offset in best]
+        attempts = [  # all, as a key that opens nothing does
+            read_header(secrets, check, index, kind, view) for index in indices for kind, view in VIEWS
+        ]
+        found = list(dict.fromkeys(header for header in attempts if header is not None))
+        agreements = [
+            (header_agreement(header, check, secrets, index), header, offset)
+            for header in found or [_NOTHING]
+            for offset, index in zip(best, indices, strict=True)
+        ]
+        if not found:  # about the work that there is where there is something
+            _payload(_NOTHING, static, self._numbers.carriers(0.0), _CHANGED, _ROUNDS // 4)
             raise WrongKeyError(_OPENS_NOTHING)
-        header, offset = found
+        # An attempt makes a header up by chance, 2^-16, and the right one can be read where names are wrong.
+        _, header, offset = max(agreements, key=itemgetter(0))
         carriers = self._refined(header, check, secrets, offset)
         free = np.ones(len(carriers), bool)
         index = Index(carriers)

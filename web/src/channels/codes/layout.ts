@@ -4,7 +4,7 @@ import { ascii, viewOf } from '../../core/bytes.ts';
 import { InputError } from '../../core/errors.ts';
 import { expand, SALT_BYTES, streamWords } from '../../keys/derivation.ts';
 import { damaged } from '../../keys/encryption.ts';
-import { sortingOrder } from './sorting.ts';
+import { sortingOrder } from '../../core/sorting.ts';
 import { BLOCK } from './syndromes.ts';
 
 const VERSION = 1;

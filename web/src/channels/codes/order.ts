@@ -7,7 +7,7 @@
 import type { Codes } from '../../files/models.ts';
 import { LARGEST, type SogCodes } from '../../files/sog.ts';
 import { type Field, fieldsOf, sogDistance } from './fields.ts';
-import { sortingOrder } from './sorting.ts';
+import { sortingOrder } from '../../core/sorting.ts';
 
 const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
 

@@ -2,7 +2,8 @@
  * Which intermediate bits each code bit of the fountain code is the sum of; `keyss.channels.robust.fountain` on the
  * other side.
  */
-import { sortingOrder, type Words } from '../../core/words.ts';
+import { sortingOrderOfPairs } from '../../core/sorting.ts';
+import type { Words } from '../../core/words.ts';
 import { mixAt, mixed } from '../mixing.ts';
 
 /** Shares of code bits that are sums of so many. */
@@ -71,7 +72,7 @@ export function parityChecks(size: number, parity: number): Equations {
     keys[2 * at + 1] = high;
   }
   const check = new Uint32Array(count);
-  sortingOrder(mixed(keys)).forEach((row, at) => (check[row] = at % parity));
+  sortingOrderOfPairs(mixed(keys)).forEach((row, at) => (check[row] = at % parity));
   const starts = new Uint32Array(parity + 1);
   for (const row of check) starts[row + 1]++;
   for (let row = 0; row < parity; row++) starts[row + 1] += starts[row] + (row ? 2 : 1);

@@ -12,7 +12,7 @@ export const SHARES = 256; // parts of the carriers, of which a payload has some
 export const IDLE = 1 / 32; // unit of the share of carriers that were left alone
 const PARTITION_BYTES = 2;
 const CHECK_BYTES = 2;
-const BYTES = 14;
+export const HEADER_BYTES = 14;
 const ROUNDS = 20;
 const TRIES = 3; // to tell salts that were lost
 const [LEAST_TRUST, MOST_TRUST] = [0.02, 0.95];
@@ -23,7 +23,7 @@ export const VIEWS: readonly (readonly [Kind, readonly number[]])[] = [
   [KINDS[0], USUAL], [KINDS[1], USUAL], [KINDS[1], MERGED],
 ];
 
-const fountain = new Fountain(8 * BYTES, NOISY);
+const fountain = new Fountain(8 * HEADER_BYTES, NOISY);
 
 /** How a payload is read. */
 export interface Header {
@@ -97,9 +97,9 @@ export function headerAgreement(header: Header, secrets: readonly Uint8Array[], 
 /** null where it is not one: by chance one of 2^16 is, and opens nothing. */
 function unpackHeader(bits: Uint8Array, check: Uint8Array): Header | null {
   const data = packBits(bits);
-  const plain = data.subarray(0, BYTES - CHECK_BYTES);
+  const plain = data.subarray(0, HEADER_BYTES - CHECK_BYTES);
   const tag = hmac(sha256, check, plain);
-  if (data[BYTES - 2] !== tag[0] || data[BYTES - 1] !== tag[1]) return null;
+  if (data[HEADER_BYTES - 2] !== tag[0] || data[HEADER_BYTES - 1] !== tag[1]) return null;
   const [a, b, c, d, e] = data.subarray(FILE_KEY_BYTES + PARTITION_BYTES);
   const found = {
     fileKey: data.slice(0, FILE_KEY_BYTES),

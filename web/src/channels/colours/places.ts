@@ -2,7 +2,8 @@
 import { chacha20 } from '@noble/ciphers/chacha.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii } from '../../core/bytes.ts';
-import { same, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
+import { sortingOrderOfPairs } from '../../core/sorting.ts';
+import { same, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
 import { mixAt } from '../mixing.ts';
 import { type Carriers, chosen } from './carriers.ts';
@@ -43,7 +44,7 @@ export class Index {
     const { lattice } = KINDS[KINDS.length - 1];
     const bits = bitsOf(lattice, carriers);
     const hashes = rank(PUBLIC, 'places', carriers.names);
-    const order = sortingOrder(hashes).filter((row) => bits[row] === lattice.depth); // all but impossible sizes
+    const order = sortingOrderOfPairs(hashes).filter((row) => bits[row] === lattice.depth); // all but impossible sizes
     const [first, alike] = [new Uint32Array(order.length), new Uint32Array(order.length)];
     let size = 0;
     for (let at = 0; at < order.length; at++) {

@@ -15,7 +15,7 @@ import { unpackPayload } from '../packing.ts';
 import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
 import { Fountain } from './fountain.ts';
 import {
-  bucketBytes, FILE_KEY_BYTES, type Header, headerAgreement, IDLE, kindOf, ownRows, packBits, readHeader, SHARES, VIEWS,
+  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, kindOf, ownRows, packBits, readHeader, SHARES, VIEWS,
 } from './header.ts';
 import { bitsOf, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf, SPACINGS } from './lattice.ts';
 import { Index } from './places.ts';
@@ -67,20 +67,27 @@ export class ColoursReader implements Reader {
     const promises: { offset: number; promise: number }[] = [];
     for (const [offset, index] of this.indices()) promises.push({ offset, promise: index.promise(secrets) });
     promises.sort((a, b) => b.promise - a.promise || b.offset - a.offset);
-    let found: { header: Header; offset: number } | null = null;
-    for (const { offset } of promises.slice(0, BEST)) {
-      const index = new Index(carriersOf(this.numbers, offset));
+    const best = promises.slice(0, BEST).map(({ offset }) => ({ offset, index: new Index(carriersOf(this.numbers, offset)) }));
+    const found = new Map<string, Header>();
+    for (const { index } of best) {
       for (const [kind, view] of VIEWS) {
         const header = readHeader(secrets, check, index, kind, view);
-        if (header !== null) found ??= { header, offset };
+        if (header !== null) found.set(header.bits.join(''), header);
       }
     }
-    if (found === null) {
+    // An attempt makes a header up by chance, 2^-16, and the right one can be read where names are wrong.
+    let [header, offset, most] = [NOTHING, 0, -Infinity];
+    for (const each of found.size ? found.values() : [NOTHING]) {
+      for (const place of best) {
+        const agreement = headerAgreement(each, secrets, place.index);
+        if (agreement > most) [header, offset, most] = [each, place.offset, agreement];
+      }
+    }
+    if (found.size === 0) {
       payload(NOTHING, derived.fixed, carriersOf(this.numbers, 0), CHANGED[0], ROUNDS / 4);
       return null;
     }
-    const { header } = found;
-    const carriers = this.refined(header, secrets, found.offset);
+    const carriers = this.refined(header, secrets, offset);
     const index = new Index(carriers);
     const taken = new Set(secrets.flatMap((each) => [...index.rows(index.places(each, kindOf(header).places))]));
     const free = chosen(carriers, Uint32Array.from({ length: carriers.count }, (_, row) => row).filter((row) => !taken.has(row)));
@@ -130,7 +137,7 @@ const NOTHING: Header = {
   last: SHARES / 4 - 1,
   bucket: 64,
   idle: 0,
-  bits: new Uint8Array(0),
+  bits: new Uint8Array(8 * HEADER_BYTES),
 };
 
 /** What the header's data key decrypts, or null. */

@@ -1,7 +1,8 @@
 /** The Gaussians that serve as salts of Argon2id; `keyss.channels.robust.salts` on the other side. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined } from '../../core/bytes.ts';
-import { same, sortingOrder } from '../../core/words.ts';
+import { sortingOrderOfPairs } from '../../core/sorting.ts';
+import { same } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/derivation.ts';
 import { COLOUR_NOISE, COLOUR_STEP, NAME, type Numbers, OPACITY_NOISE, OPACITY_STEP, SCALE_STEP } from './carriers.ts';
 import { rank } from './lattice.ts';
@@ -34,7 +35,7 @@ export function saltsOf(numbers: Numbers): Uint8Array[] {
       names.set(cells.subarray(STEPS.length * row, STEPS.length * row + UNCHANGED), NAME * to);
     });
     const ranks = rank(PUBLIC, 'salt', names);
-    const order = sortingOrder(ranks);
+    const order = sortingOrderOfPairs(ranks);
     const listed = [...order.filter((row, at) => at === 0 || !same(ranks, row, order[at - 1]))];
     for (const at of listed.slice(0, SALTS / stable.length)) {
       const own = cells.slice(STEPS.length * rows[at], STEPS.length * (rows[at] + 1));
