@@ -70,19 +70,22 @@ def parts(gaussians: Gaussians, depth: int) -> list[Gaussians]:
     return parts(gaussians[order[:half]], depth - 1) + parts(gaussians[order[half:]], depth - 1)
 
 
-def held_out_auc(x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64]) -> dict[str, float]:
+def held_out_auc(
+    x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64], trees: int = 300
+) -> dict[str, float]:
     """AUC of two classifiers on groups (scenes) that they were not trained on."""
-    return {name: float(roc_auc_score(y, scores)) for name, scores in held_out_scores(x, y, groups).items()}
+    found = held_out_scores(x, y, groups, trees)
+    return {name: float(roc_auc_score(y, scores)) for name, scores in found.items()}
 
 
 def held_out_scores(
-    x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64]
+    x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64], trees: int = 300
 ) -> dict[str, Numbers]:
     """[N] probabilities of being embedded, from two classifiers trained on the other groups."""
     result = {}
     for name, make in (
         ("logistic", lambda: make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=2000))),
-        ("forest", lambda: RandomForestClassifier(300, min_samples_leaf=2, random_state=0)),
+        ("forest", lambda: RandomForestClassifier(trees, min_samples_leaf=2, random_state=0)),
     ):
         scores = np.zeros(len(y))
         for group in np.unique(groups):

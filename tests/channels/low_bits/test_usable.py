@@ -163,3 +163,15 @@ def test_short_values_count_only_where_there_are_more_than_by_chance() -> None:
     assert usable_carriers(trained_like(2000))[0]
     assert usable_carriers(one)[0]
     assert not usable_carriers(many)[:40].any()
+
+
+def test_a_cover_that_was_changed_in_place_is_looked_at_again() -> None:
+    """What was found is kept as long as the cover is as it was."""
+    cover = trained_like(1000)
+    before = LOW_BITS.prepare(cover)
+    assert LOW_BITS.prepare(cover).usable is before.usable
+    assert before.usable[:10].any()
+    cover.log_scales[:10] = 0.5
+    after = LOW_BITS.prepare(cover)
+    assert not after.usable[:10].any()
+    assert (after.names[:10] != before.names[:10]).any()

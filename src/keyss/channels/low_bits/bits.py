@@ -15,7 +15,7 @@ order. Sign and exponent never change. Which Gaussians can be written: `usable`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +35,7 @@ UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5
 
 KERNEL_BLOCK = 1 << 14  # Gaussians that a thread takes at a time
 _BLOCK = 1 << 16  # Gaussians at a time
+_WRITTEN = 1 << 11  # the same where they should stay in the cache
 
 Words = npt.NDArray[np.uint32]
 Bytes = npt.NDArray[np.uint8]
@@ -127,15 +128,29 @@ def write_low_bits(gaussians: Gaussians, rows: npt.NDArray[np.int64], data: Byte
 
     Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
     """
-    layout = Layout.of(gaussians)
-    written = gaussians.detach().map(lambda values: values.clone(memory_format=torch.contiguous_format))
-    written = replace(written.to("cpu"), means=gaussians.means)
-    _, *fields = words_of(written)
-    in_blocks(
-        lambda start, stop: kernels.unpack(start, stop, rows, data, *fields, layout.quats),
-        len(rows),
-        KERNEL_BLOCK,
-    )
+    return with_low_bits(gaussians, Layout.of(gaussians), [(rows, data)])
+
+
+def with_low_bits(
+    gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[npt.NDArray[np.int64], Bytes]]
+) -> Gaussians:
+    """`write_low_bits` for several (rows, data)."""
+    source = gaussians.detach().to("cpu").map(torch.Tensor.contiguous)
+    written = replace(source.map(torch.empty_like), means=source.means)
+    before, after = words_of(source)[1:], words_of(written)[1:]
+    choices = []
+    for rows, data in parts:  # each Gaussian has more lines in the cache than its bits
+        chosen = np.full(len(gaussians), -1, np.int64)
+        chosen[rows] = np.arange(len(rows))
+        choices.append((chosen, data))
+
+    def write(start: int, stop: int) -> None:
+        for old, new in zip(before, after, strict=True):
+            new[start:stop] = old[start:stop]
+        for chosen, data in choices:
+            kernels.unpack(start, stop, chosen, data, *after, layout.quats)
+
+    in_blocks(write, len(gaussians), _WRITTEN)
     return written.to(gaussians.device)
 
 

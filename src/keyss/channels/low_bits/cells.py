@@ -26,7 +26,9 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
+from keyss.channels.low_bits import cell_kernels as kernels
 from keyss.keys.derivation import expand
+from keyss.rendering.cpu.parallel import in_blocks
 
 TAG_BYTES = 4  # unless more are asked for
 _BLOCK = 16
@@ -58,47 +60,59 @@ class CellCipher:
         """
         if data.shape != (len(identities), self.size):
             raise ValueError(f"expected data of shape {(len(identities), self.size)}, got {data.shape}")
-        numbers: Bytes = np.broadcast_to(np.asarray(slots, np.uint8), len(identities))
+        numbers = np.atleast_1d(np.asarray(slots, np.uint8))
         cells = np.empty((len(data), self.cell_bytes), np.uint8)
-        for start in range(0, len(data), _CELLS):
-            part = slice(start, start + _CELLS)
-            tags = self._tags(identities[part], numbers[part], data[part])
-            cells[part, : self._tag] = tags
-            cells[part, self._tag :] = data[part] ^ self._stream(identities[part], numbers[part], tags)
+
+        def work(start: int, stop: int) -> None:
+            names, own, out = identities[start:stop], data[start:stop], cells[start:stop]
+            which = numbers[start:stop] if len(numbers) > 1 else numbers
+            messages = self._messages(len(own))
+            kernels.begin(which, own, messages)
+            tags = self._tags(names, messages)
+            out[:, : self._tag] = tags[:, : self._tag]
+            kernels.cover(own, 0, self._stream(names, which, tags), out, self._tag)
+
+        in_blocks(work, len(data), _CELLS)
         return cells
 
     def decrypt(self, identities: Bytes, cells: Bytes, slot: int = 0) -> tuple[Flags, Bytes]:
         """[N] which of the cells [N, cell_bytes or more] fit this secret, and the data [M, size] of these."""
-        fits, found = [np.zeros(0, bool)], [np.zeros((0, self.size), np.uint8)]
-        for start in range(0, len(cells), _CELLS):
-            part = slice(start, start + _CELLS)
-            tags, hidden = cells[part, : self._tag], cells[part, self._tag : self.cell_bytes]
-            slots = np.full(len(tags), slot, np.uint8)
-            data = hidden ^ self._stream(identities[part], slots, tags)
-            fit = (self._tags(identities[part], slots, data) == tags).all(axis=1)
-            fits.append(fit)
-            found.append(data[fit])
-        return np.concatenate(fits), np.concatenate(found)
+        fits, which = np.zeros(len(cells), bool), np.array([slot], np.uint8)
 
-    def _tags(self, identities: Bytes, slots: Bytes, data: Bytes) -> Bytes:
-        message = np.zeros((len(data), -(-(1 + self.size) // _BLOCK) * _BLOCK), np.uint8)
-        message[:, 0] = slots
-        message[:, 1 : 1 + self.size] = data
-        state = _encrypt(self._tag_key, identities)
-        for start in range(0, message.shape[1], _BLOCK):
-            state = _encrypt(self._tag_key, state ^ message[:, start : start + _BLOCK])
-        return state[:, : self._tag]
+        def work(start: int, stop: int) -> Bytes:
+            names = identities[start:stop]
+            hidden = np.ascontiguousarray(cells[start:stop, : self.cell_bytes])
+            messages = self._messages(len(names))
+            messages[:, 0], messages[:, 1 + self.size :] = slot, 0
+            kernels.cover(hidden, self._tag, self._stream(names, which, hidden), messages, 1)
+            rows, opened = np.empty(len(names), np.int64), np.empty((len(names), self.size), np.uint8)
+            tags = self._tags(names, messages)
+            count = kernels.fit(tags, hidden, self._tag, messages, self.size, rows, opened)
+            fits[start + rows[:count]] = True
+            return opened[:count].copy()
+
+        return fits, np.concatenate(
+            [np.zeros((0, self.size), np.uint8), *in_blocks(work, len(cells), _CELLS)]
+        )
+
+    def _messages(self, count: int) -> Bytes:
+        return np.empty((count, -(-(1 + self.size) // _BLOCK) * _BLOCK), np.uint8)
+
+    def _tags(self, identities: Bytes, messages: Bytes) -> Bytes:
+        """[N, 16] of which a tag is the first bytes."""
+        states = _encrypt(self._tag_key, identities)
+        for block in range(messages.shape[1] // _BLOCK):
+            kernels.chain(states, messages, block)
+            states = _encrypt(self._tag_key, states)
+        return states
 
     def _stream(self, identities: Bytes, slots: Bytes, tags: Bytes) -> Bytes:
-        """[N, size] the key streams."""
-        seeds = identities.copy()
-        seeds[:, : self._tag] ^= tags
-        seeds[:, self._tag] ^= slots
-        seeds = _encrypt(self._seed_key, seeds)
-        blocks = -(-self.size // _BLOCK)
-        counted = np.repeat(seeds[:, None], blocks, axis=1)
-        counted[:, :, -1] ^= np.arange(blocks, dtype=np.uint8)
-        return _encrypt(self._stream_key, counted).reshape(len(tags), -1)[:, : self.size]
+        """[N, size or more] the key streams; `tags` [N, tag bytes or more]."""
+        seeds = np.empty((len(identities), _BLOCK), np.uint8)
+        kernels.seed(identities, slots, tags, self._tag, seeds)
+        counted = np.empty((len(seeds), -(-self.size // _BLOCK), _BLOCK), np.uint8)
+        kernels.count(_encrypt(self._seed_key, seeds), counted)
+        return _encrypt(self._stream_key, counted).reshape(len(seeds), -1)
 
 
 def _encrypt(key: bytes, blocks: Bytes) -> Bytes:

@@ -22,15 +22,25 @@ from __future__ import annotations
 
 import hashlib
 import os
+import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from keyss.channels.base import Bytes, Content, Payload, RecordPlan, RecordRequest, Records
-from keyss.channels.low_bits.bits import Flags, bytes_per_gaussian, identities, read_low_bits, write_low_bits
+from keyss.channels.low_bits.bits import (
+    Flags,
+    Layout,
+    bytes_per_gaussian,
+    identities,
+    read_low_bits,
+    with_low_bits,
+)
 from keyss.channels.low_bits.layout import Room
 from keyss.channels.low_bits.reading import LowBitsReader
 from keyss.channels.low_bits.salts import salt, salt_rows
@@ -39,19 +49,47 @@ from keyss.channels.low_bits.writing import Writer, digest
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation, stream
+from keyss.rendering.cpu.parallel import in_blocks
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What preparing a cover found, as long as the cover lives and nobody changes it."""
+
+    cover: weakref.ref[Gaussians]
+    versions: tuple[int, ...]
+    usable: Flags
+    names: Bytes
+
+    def of(self, cover: Gaussians) -> bool:
+        return self.cover() is cover and self.versions == _versions(cover)
+
+
+def _versions(model: Gaussians) -> tuple[int, ...]:
+    """How often each tensor was changed in place."""
+    tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
+    return tuple(0 if each.is_inference() else each._version for each in tensors)
 
 
 class LowBits:
     """The channel; see `keyss.channels.base.Channel`."""
 
+    def __init__(self) -> None:
+        self._found: dict[int, _Found] = {}  # by the identity of covers that live
+
     def largest_record(self, sh_degree: int) -> int:
         return Room(0, bytes_per_gaussian(sh_degree)).record_bytes(1)
 
     def prepare(self, cover: Gaussians) -> LowBitsCover:
-        names = identities(cover)
-        usable = usable_carriers(cover, names)
-        check_usable(cover, usable)
-        return LowBitsCover(cover, usable, names)
+        layout, found = Layout.of(cover), self._found.get(id(cover))
+        if found is None or not found.of(cover):  # whoever hides in a cover asked before whether it will do
+            names = identities(cover, layout)
+            usable = usable_carriers(cover, names, layout)
+            check_usable(cover, usable, layout)
+            number = id(cover)
+            gone = weakref.ref(cover, lambda _: self._found.pop(number, None))
+            found = self._found[number] = _Found(gone, _versions(cover), usable, names)
+        return LowBitsCover(cover, layout, found.usable, found.names)
 
     def extract(self, stego: Gaussians, key: str) -> Content:
         """See `Channel` and `LowBitsReader.open`."""
@@ -66,6 +104,7 @@ class LowBitsCover:
     """A cover and which of its Gaussians can be written; see `keyss.channels.base.PreparedCover`."""
 
     cover: Gaussians
+    layout: Layout
     usable: Flags  # [N]
     names: Bytes  # [N, 16] identities
 
@@ -83,7 +122,7 @@ class LowBitsCover:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
         mixed = _mixed(entropy, [content for _, content in contents])
         derivations = [KeyDerivation(salt=each) for each in self._salts(mixed)[1]]
-        derived = [([DerivedKey(key, each) for each in derivations], content) for key, content in contents]
+        derived = [(_derived(key, derivations), content) for key, content in contents]
         return self._embed(derived, mixed)
 
     def embed_derived(
@@ -106,17 +145,13 @@ class LowBitsCover:
             writer.payloads(payloads, len(self.cover))
         else:
             writer.records(records)
-        rows = np.concatenate([self._fresh_rows, self._rows[writer.order]])
-        return write_low_bits(self.cover, rows, np.concatenate([fresh, writer.table]))
-
-    @cached_property
-    def _low(self) -> Bytes:
-        return read_low_bits(self.cover)
+        parts = [(self._fresh_rows, fresh), (self._rows[writer.order], writer.table)]
+        return with_low_bits(self.cover, self.layout, parts)
 
     @cached_property
     def _salt_rows(self) -> npt.NDArray[np.int64]:
         """[S] in the order of salts."""
-        return salt_rows(self.cover, self.names, self._low)
+        return salt_rows(self.cover, self.names, layout=self.layout)
 
     @property
     def _fresh_rows(self) -> npt.NDArray[np.int64]:
@@ -132,15 +167,20 @@ class LowBitsCover:
 
     @property
     def _room(self) -> Room:
-        return Room(self.carriers, self._low.shape[1])
+        return Room(self.carriers, self.layout.width)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
         """New low bits [F, B] of `_fresh_rows`, and all salts with them."""
-        noise = stream(entropy, "low-bits/salts", len(self._fresh_rows) * self._low.shape[1])
+        noise = stream(entropy, "low-bits/salts", len(self._fresh_rows) * self.layout.width)
         fresh = np.frombuffer(noise, np.uint8).reshape(len(self._fresh_rows), -1)
-        low = self._low[self._salt_rows].copy()
+        low = read_low_bits(self.cover[torch.from_numpy(self._salt_rows)], self.layout)
         low[self.usable[self._salt_rows]] = fresh
         return fresh, [salt(*each) for each in zip(self.names[self._salt_rows], low, strict=True)]
+
+
+def _derived(key: str, derivations: Sequence[KeyDerivation]) -> list[DerivedKey]:
+    """What `key` becomes under each, several at a time."""
+    return in_blocks(lambda index, _: DerivedKey(key, derivations[index]), len(derivations), 1)
 
 
 def _mixed(entropy: bytes | None, contents: Sequence[Content]) -> bytes:

@@ -13,6 +13,7 @@ import numpy as np
 from keyss.rendering.cpu.jit import exact_inlined, exact_kernel
 
 IDENTITY_BYTES = 16
+LANES = 32  # rows that are hashed side by side, for vector instructions
 PERSONALISATION = b"keyss/identity"
 
 _IV = np.array(
@@ -49,50 +50,48 @@ _BACK = tuple(np.uint64(64 - int(each)) for each in _ROTATE)
 
 
 @exact_inlined
-def _mix(a, b, c, d, x, y):
-    """The function G of RFC 7693, 3.1."""
-    a = a + b + x
-    d = d ^ a
-    d = (d >> _ROTATE[0]) | (d << _BACK[0])
-    c = c + d
-    b = b ^ c
-    b = (b >> _ROTATE[1]) | (b << _BACK[1])
-    a = a + b + y
-    d = d ^ a
-    d = (d >> _ROTATE[2]) | (d << _BACK[2])
-    c = c + d
-    b = b ^ c
-    b = (b >> _ROTATE[3]) | (b << _BACK[3])
-    return a, b, c, d
+def _mix(v, a, b, c, d, m, x, y):
+    """The function G of RFC 7693, 3.1, of all lanes."""
+    for lane in range(LANES):
+        p = v[a, lane] + v[b, lane] + m[x, lane]
+        s = v[d, lane] ^ p
+        s = (s >> _ROTATE[0]) | (s << _BACK[0])
+        r = v[c, lane] + s
+        q = v[b, lane] ^ r
+        q = (q >> _ROTATE[1]) | (q << _BACK[1])
+        p = p + q + m[y, lane]
+        s = s ^ p
+        s = (s >> _ROTATE[2]) | (s << _BACK[2])
+        r = r + s
+        q = q ^ r
+        v[a, lane], v[c, lane], v[d, lane] = p, r, s
+        v[b, lane] = (q >> _ROTATE[3]) | (q << _BACK[3])
 
 
 @exact_inlined
-def _compress(h, m, length, last):
-    """One block of 16 words `m` into the state `h` [8] (RFC 7693, 3.2); `length`: bytes up to its end."""
-    v0, v1, v2, v3 = h[0], h[1], h[2], h[3]
-    v4, v5, v6, v7 = h[4], h[5], h[6], h[7]
-    v8, v9, v10, v11 = _IV[0], _IV[1], _IV[2], _IV[3]
-    v12, v13, v14, v15 = _IV[4] ^ length, _IV[5], _IV[6], _IV[7]
-    if last:
-        v14 = ~v14
+def _compress(h, v, m, length, last):
+    """One block of 16 words `m` into the states `h` (RFC 7693, 3.2); `length`: bytes up to its end."""
+    for i in range(8):
+        for lane in range(LANES):
+            v[i, lane] = h[i, lane]
+            v[8 + i, lane] = _IV[i]
+    for lane in range(LANES):
+        v[12, lane] ^= length
+        if last:
+            v[14, lane] = ~v[14, lane]
     for turn in range(12):
         s = _SIGMA[turn]
-        v0, v4, v8, v12 = _mix(v0, v4, v8, v12, m[s[0]], m[s[1]])
-        v1, v5, v9, v13 = _mix(v1, v5, v9, v13, m[s[2]], m[s[3]])
-        v2, v6, v10, v14 = _mix(v2, v6, v10, v14, m[s[4]], m[s[5]])
-        v3, v7, v11, v15 = _mix(v3, v7, v11, v15, m[s[6]], m[s[7]])
-        v0, v5, v10, v15 = _mix(v0, v5, v10, v15, m[s[8]], m[s[9]])
-        v1, v6, v11, v12 = _mix(v1, v6, v11, v12, m[s[10]], m[s[11]])
-        v2, v7, v8, v13 = _mix(v2, v7, v8, v13, m[s[12]], m[s[13]])
-        v3, v4, v9, v14 = _mix(v3, v4, v9, v14, m[s[14]], m[s[15]])
-    h[0] ^= v0 ^ v8
-    h[1] ^= v1 ^ v9
-    h[2] ^= v2 ^ v10
-    h[3] ^= v3 ^ v11
-    h[4] ^= v4 ^ v12
-    h[5] ^= v5 ^ v13
-    h[6] ^= v6 ^ v14
-    h[7] ^= v7 ^ v15
+        _mix(v, 0, 4, 8, 12, m, s[0], s[1])
+        _mix(v, 1, 5, 9, 13, m, s[2], s[3])
+        _mix(v, 2, 6, 10, 14, m, s[4], s[5])
+        _mix(v, 3, 7, 11, 15, m, s[6], s[7])
+        _mix(v, 0, 5, 10, 15, m, s[8], s[9])
+        _mix(v, 1, 6, 11, 12, m, s[10], s[11])
+        _mix(v, 2, 7, 8, 13, m, s[12], s[13])
+        _mix(v, 3, 4, 9, 14, m, s[14], s[15])
+    for i in range(8):
+        for lane in range(LANES):
+            h[i, lane] ^= v[i, lane] ^ v[8 + i, lane]
 
 
 @exact_kernel
@@ -103,22 +102,29 @@ def identify(start, stop, means, scales, quats, opacities, sh, mask, hashes):
     blocks = (4 * words + 127) // 128
     message = np.zeros(32 * blocks, np.uint32)
     pairs = message.view(np.uint64)  # little-endian
-    h = np.empty(8, np.uint64)
-    for row in range(start, stop):
-        for i in range(3):
-            message[i] = means[row, i]
-        for i in range(3):
-            message[3 + i] = scales[row, i] & ~mask[i]
-        for i in range(4):
-            message[6 + i] = quats[row, i] & ~mask[3 + i]
-        message[10] = opacities[row] & ~mask[7]
-        for i in range(3, sh.shape[1]):
-            message[8 + i] = sh[row, i] & ~mask[5 + i]
+    messages = np.zeros((16 * blocks, LANES), np.uint64)
+    h, v = np.empty((8, LANES), np.uint64), np.empty((16, LANES), np.uint64)
+    for first in range(start, stop, LANES):
+        rows = min(LANES, stop - first)
+        for lane in range(rows):
+            row = first + lane
+            for i in range(3):
+                message[i] = means[row, i]
+                message[3 + i] = scales[row, i] & ~mask[i]
+            for i in range(4):
+                message[6 + i] = quats[row, i] & ~mask[3 + i]
+            message[10] = opacities[row] & ~mask[7]
+            for i in range(3, sh.shape[1]):
+                message[8 + i] = sh[row, i] & ~mask[5 + i]
+            for i in range(len(pairs)):
+                messages[i, lane] = pairs[i]
         for i in range(8):
-            h[i] = _START[i]
+            for lane in range(LANES):
+                h[i, lane] = _START[i]
         for block in range(blocks):
             last = block == blocks - 1
             length = np.uint64(4 * words if last else 128 * (block + 1))
-            _compress(h, pairs[16 * block : 16 * block + 16], length, last)
-        hashes[row, 0] = h[0]
-        hashes[row, 1] = h[1]
+            _compress(h, v, messages[16 * block : 16 * block + 16], length, last)
+        for lane in range(rows):
+            hashes[first + lane, 0] = h[0, lane]
+            hashes[first + lane, 1] = h[1, lane]

@@ -63,15 +63,17 @@ def pack(start, stop, scales, quats, opacities, sh, with_quats, out):
 
 
 @exact_kernel
-def unpack(start, stop, rows, data, scales, quats, opacities, sh, with_quats):
-    """Replace the low bits of the Gaussians `rows` [R] by `data` [R, B], for R from `start` to `stop`.
+def unpack(start, stop, chosen, data, scales, quats, opacities, sh, with_quats):
+    """Replace the low bits of Gaussians by the `chosen` [N] rows of `data` [R, B]; of those with -1 none.
 
     Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
     """
     used = np.empty(5 + sh.shape[1], np.uint32)
     width = data.shape[1]
-    for index in range(start, stop):
-        row, at = rows[index], 0
+    for row in range(start, stop):
+        index, at = chosen[row], 0
+        if index < 0:
+            continue
         _fields(scales, quats, opacities, sh, row, used)
         for i in range(GEOMETRY):
             if with_quats or i < 3 or i == 7:
@@ -136,15 +138,20 @@ def _near_equal(used, shifts, with_quats, high):
 
 
 @exact_kernel
-def ranks(start, stop, scales, quats, opacities, sh, mask, shifts, with_quats, unit_tolerance, out):
-    """`out` [N] uint64: 256 for what may well be left alone, and less the larger the least harmonic is."""
+def ranks(
+    start, stop, scales, quats, opacities, sh, mask, shifts, with_quats, unit_tolerance, coincidences, out
+):  # fmt: skip
+    """`out` [N] uint64: 256 for what may well be left alone, and less the larger the least harmonic is.
+
+    Without `coincidences` what nearly equal numbers tell is left out.
+    """
     fields = len(mask)
     used, high = np.empty(fields, np.uint32), np.empty(fields, np.int32)
     middle = np.empty(4, np.uint32)
     floats = middle.view(np.float32)
     for row in range(start, stop):
         _fields(scales, quats, opacities, sh, row, used)
-        doubtful = _near_equal(used, shifts, with_quats, high)
+        doubtful = coincidences and _near_equal(used, shifts, with_quats, high)
         least = _EXPONENT
         for i in range(fields):
             if i < 3 or i > 6 or with_quats:
@@ -172,13 +179,62 @@ def tally(start, stop, values, first, shift, times):
 
 
 @exact_kernel
-def crowded(values, first, shift, places, out):
-    """`out` [N, C - first]: which of the values have one of the `places`, which are bits of bytes."""
-    for row in range(values.shape[0]):
+def crowded(start, stop, values, first, shift, places, out):
+    """Put values on one of the `places`, which are bits of bytes, in `out`; returns how many."""
+    found = 0
+    for row in range(start, stop):
         for column in range(first, values.shape[1]):
             place = np.uint64(values[row, column]) * _HASH >> shift
-            bit = places[place >> np.uint64(3)] >> (place & np.uint64(7)) & np.uint64(1)
-            out[row, column - first] = bit != 0
+            out[found] = values[row, column]
+            found += np.int64(places[place >> np.uint64(3)] >> (place & np.uint64(7)) & np.uint64(1))
+    return found
+
+
+@exact_kernel
+def meet(values, shift, seen, twice):
+    """Put the rows of those `values` [N] that fall on places in `twice` in `rows`; returns how many."""
+    for value in values:
+        place = value * _HASH >> shift
+        word, bit = place >> np.uint64(6), np.uint64(1) << (place & np.uint64(63))
+        twice[word] |= seen[word] & bit
+        seen[word] |= bit
+
+
+@exact_kernel
+def met(values, shift, twice, rows):
+    """Put the rows of those of the `values` [N] that fall on places in `twice` in `rows`; the count."""
+    found = 0
+    for row in range(len(values)):
+        place = values[row] * _HASH >> shift
+        rows[found] = row
+        found += np.int64(twice[place >> np.uint64(6)] >> (place & np.uint64(63)) & np.uint64(1))
+    return found
+
+
+@exact_kernel
+def order(numbers, rows):
+    """`rows` [N]: what sorts uniformly random `numbers` [N] of 64 bits; equal ones by row."""
+    bits = 0
+    while 2 << bits <= len(numbers):
+        bits += 1
+    shift = np.uint64(63 - bits)  # twice as many places as numbers, at most
+    ends = np.zeros((2 << bits) + 1, np.int64)
+    for number in numbers:
+        ends[(number >> shift) + np.uint64(1)] += 1
+    for place in range(1, len(ends)):
+        ends[place] += ends[place - 1]
+    ordered = np.empty(len(numbers), np.uint64)
+    for row in range(len(numbers)):
+        number = numbers[row]
+        place = number >> shift
+        ordered[ends[place]], rows[ends[place]] = number, row
+        ends[place] += 1
+    for last in range(1, len(numbers)):  # those on one place
+        number, row, at = ordered[last], rows[last], last
+        while at > 0 and ordered[at - 1] > number:
+            ordered[at], rows[at] = ordered[at - 1], rows[at - 1]
+            at -= 1
+        ordered[at], rows[at] = number, row
 
 
 @exact_kernel

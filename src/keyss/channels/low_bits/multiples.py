@@ -5,7 +5,6 @@ Numbers are counted by a hash of a few bits first: only where enough fall to one
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,52 +15,53 @@ from keyss.channels.low_bits import kernels
 from keyss.channels.low_bits.bits import KERNEL_BLOCK, Flags
 from keyss.rendering.cpu.parallel import in_blocks
 
-Integers = npt.NDArray[np.unsignedinteger[Any]]
-
-_LEAST_BITS, _MOST_BITS = 10, 27  # of places
+_LEAST_BITS, _MOST_BITS = 10, 27  # of the number of places
 _MOST_TIMES = 255  # that are counted
 
 
 def repeated(values: npt.NDArray[np.uint64]) -> Flags:
-    """[N] which of the values [N] occur at least twice."""
-    parts = _crowded(values[:, None], 0, 2, 8, lambda _, found: found[:, 0])
-    found: Flags = np.concatenate([np.zeros(0, bool), *parts])
-    rows = np.flatnonzero(found)
-    _, inverse, times = np.unique(values[rows], return_inverse=True, return_counts=True)
-    found[rows] = times[inverse] > 1
+    """[N] which of the values [N] occur at least twice. On one thread."""
+    shift, places = _places(8, len(values))
+    seen, twice = (np.zeros(places // 64, np.uint64) for _ in range(2))  # a bit for each place
+    kernels.meet(values, shift, seen, twice)
+    rows = np.empty(len(values), np.int64)
+    rows = rows[: kernels.met(values, shift, twice, rows)]
+    some = values[rows]
+    ordered = np.sort(some)
+    equal = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
+    found = np.zeros(len(values), bool)
+    if len(equal):
+        found[rows] = equal[np.searchsorted(equal, some).clip(max=len(equal) - 1)] == some
     return found
 
 
 def crowded(values: npt.NDArray[np.uint32], first: int, least: int) -> npt.NDArray[np.uint32]:
     """Of the values [N, C] from column `first` on all that occur `least` times or more, and some others."""
-    parts = _crowded(values, first, least, 0.2, lambda part, found: part[:, first:][found])
-    return np.concatenate([np.zeros(0, np.uint32), *parts])
-
-
-def _crowded(
-    values: Integers, first: int, least: int, places_each: float, chosen: Callable[[Any, Flags], Any]
-) -> list[Any]:
-    """For some rows at a time what is `chosen` of them and [n, C - first] which of their values share their
-    place with enough others. There are `places_each` for each of the values.
-    """
-    count = values[:, first:].size
-    bits = min(max(int(places_each * count).bit_length(), _LEAST_BITS), _MOST_BITS)
-    shift, rows = np.uint64(64 - bits), max(1, len(values))
+    columns = values.shape[1] - first
+    shift, places = _places(0.1, len(values) * columns)
 
     def tally(start: int, stop: int) -> npt.NDArray[np.uint8]:
-        times = np.zeros(1 << bits, np.uint8)
+        times = np.zeros(places, np.uint8)
         kernels.tally(start, min(stop, len(values)), values, first, shift, times)
         return times
 
+    rows = max(1, len(values))
     times, *others = in_blocks(tally, rows, -(-rows // torch.get_num_threads()))  # a table for each thread
     for each in others:
         times += np.minimum(each, _MOST_TIMES - times)
-    places = np.packbits(times >= min(least, _MOST_TIMES), bitorder="little")
+    enough = np.packbits(times >= min(least, _MOST_TIMES), bitorder="little")
 
     def choose(start: int, stop: int) -> Any:
-        part = values[start:stop]
-        found = np.empty((len(part), values.shape[1] - first), bool)
-        kernels.crowded(part, first, shift, places, found)
-        return chosen(part, found)
+        chosen = np.empty((stop - start) * columns, np.uint32)
+        return chosen[: kernels.crowded(start, stop, values, first, shift, enough, chosen)].copy()
 
-    return in_blocks(choose, len(values), KERNEL_BLOCK)
+    return np.concatenate([np.zeros(0, np.uint32), *in_blocks(choose, len(values), KERNEL_BLOCK)])
+
+
+def _places(each: float, count: int) -> tuple[np.uint64, int]:
+    """By how much a hash of 64 bits is shifted to tell its place, and how many places there are.
+
+    At least `each` of them for each of `count` values, as far as there may be so many.
+    """
+    bits = min(max(int(each * count).bit_length(), _LEAST_BITS), _MOST_BITS)
+    return np.uint64(64 - bits), 1 << bits

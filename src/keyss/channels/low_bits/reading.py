@@ -14,7 +14,7 @@ import torch
 
 from keyss.channels.base import Bytes, Content, Payload, RecordPlan, Records
 from keyss.channels.low_bits import parameters
-from keyss.channels.low_bits.bits import Flags, Layout, identities, read_low_bits
+from keyss.channels.low_bits.bits import KERNEL_BLOCK, Flags, Layout, identities, read_low_bits
 from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
 from keyss.channels.low_bits.ciphers import (
     ASSOCIATED,
@@ -33,6 +33,7 @@ from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation
 from keyss.keys.encryption import decrypt
+from keyss.rendering.cpu.parallel import in_blocks
 
 SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
 _OPENS_NOTHING = "this key opens nothing here"
@@ -131,8 +132,14 @@ class LowBitsReader:
             cipher.decrypt(self.identities, self.low[:, slot * size : (slot + 1) * size], slot)
             for slot in range(cells)
         ]
-        origin = np.concatenate([np.flatnonzero(fits) for fits, _ in found])
-        return np.concatenate([data for _, data in found])[np.argsort(origin, kind="stable")]
+        if cells == 1:
+            return found[0][1]
+        fits = np.stack([each for each, _ in found], axis=1)
+        places = np.cumsum(fits).reshape(fits.shape) - 1
+        rows = np.empty((int(places[-1, -1]) + 1 if fits.size else 0, cipher.size), np.uint8)
+        for slot, (fit, data) in enumerate(found):
+            rows[places[fit, slot]] = data
+        return rows
 
     def _warn_of_others(
         self,
@@ -176,8 +183,9 @@ def _first_of_each(names: Bytes, low: Bytes) -> npt.NDArray[np.int64]:
 def _are_among(rows: Bytes, others: Bytes) -> Flags:
     """[R] which of the rows [R, C] are there among the others [O, C]."""
     own, theirs = _hashes(rows), _hashes(others)
-    order = np.argsort(theirs)
-    place = np.searchsorted(theirs, own, sorter=order).clip(max=max(0, len(theirs) - 1))
+    order, mine = np.argsort(theirs), np.argsort(own)
+    place = np.empty(len(own), np.int64)
+    place[mine] = np.searchsorted(theirs[order], own[mine]).clip(max=max(0, len(theirs) - 1))
     maybe = np.flatnonzero(theirs[order[place]] == own) if len(theirs) else np.zeros(0, np.int64)
     found = np.zeros(len(rows), bool)
     found[maybe] = (rows[maybe] == others[order[place[maybe]]]).all(axis=1)
@@ -190,9 +198,13 @@ def _are_among(rows: Bytes, others: Bytes) -> Flags:
 
 def _hashes(rows: Bytes) -> npt.NDArray[np.uint64]:
     """[R] of rows [R, C]."""
-    padded = np.zeros((len(rows), -(-rows.shape[1] // 8) * 8), np.uint8)
-    padded[:, : rows.shape[1]] = rows
-    state = np.zeros(len(rows), np.uint64)
-    for word in padded.view("<u8").T:
-        state = mixed(state ^ word)
-    return state
+    states = np.zeros(len(rows), np.uint64)
+
+    def hash_some(start: int, stop: int) -> None:
+        padded = np.zeros((stop - start, -(-rows.shape[1] // 8) * 8), np.uint8)
+        padded[:, : rows.shape[1]] = rows[start:stop]
+        for word in padded.view("<u8").T:
+            states[start:stop] = mixed(states[start:stop] ^ word)
+
+    in_blocks(hash_some, len(rows), KERNEL_BLOCK)
+    return states

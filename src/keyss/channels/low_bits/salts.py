@@ -12,26 +12,40 @@ import hashlib
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from keyss.channels.low_bits import kernels
-from keyss.channels.low_bits.bits import KERNEL_BLOCK, UNIT_TOLERANCE, Bytes, Layout, words_of
+from keyss.channels.low_bits.bits import KERNEL_BLOCK, UNIT_TOLERANCE, Bytes, Layout, read_low_bits, words_of
 from keyss.channels.low_bits.layout import SALTS
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES
 from keyss.rendering.cpu.parallel import in_blocks
 
 _LABEL = b"keyss/v2/salt"
+_LOOKED_AT = 4096  # Gaussians that are looked at closely
 
 
 def salt_rows(
-    gaussians: Gaussians, names: Bytes, low: Bytes, layout: Layout | None = None
+    gaussians: Gaussians, names: Bytes, low: Bytes | None = None, layout: Layout | None = None
 ) -> npt.NDArray[np.int64]:
-    """[SALTS or less] the Gaussians, the first first, of identities `names` [N, 16] and `low` bits [N, B]."""
-    ranks = _ranks(gaussians, layout or Layout.of(gaussians))
-    keys = ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
-    some = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
-    order = sorted(some.tolist(), key=lambda row: (int(keys[row]), names[row].tobytes(), low[row].tobytes()))
-    return np.array(order, np.int64)
+    """[SALTS or less] the Gaussians, the first first, of identities `names` [N, 16].
+
+    `low` [N, B]: their low bits, where they are known.
+    """
+    layout = layout or Layout.of(gaussians)
+    # Coincidences take long to find, and make a key larger: those with the smallest keys without are enough.
+    keys = _keys(gaussians, names, layout, coincidences=False)
+    some = np.argpartition(keys, _LOOKED_AT)[:_LOOKED_AT] if len(keys) > _LOOKED_AT else np.arange(len(keys))
+    bound = keys[some].max(initial=0)
+    own = _keys(gaussians[torch.from_numpy(some)], names[some], layout)
+    if len(some) < len(keys) and np.partition(own, SALTS - 1)[SALTS - 1] >= bound:
+        some, own = np.arange(len(keys)), _keys(gaussians, names, layout)
+    if len(own) > SALTS:
+        best = np.argpartition(own, SALTS - 1)[:SALTS]
+        some, own = some[best], own[best]
+    bits = read_low_bits(gaussians[torch.from_numpy(some)], layout) if low is None else low[some]
+    order = sorted(range(len(some)), key=lambda i: (own[i], names[some[i]].tobytes(), bits[i].tobytes()))
+    return some[order]
 
 
 def salt(identity: Bytes, low: Bytes) -> bytes:
@@ -39,22 +53,20 @@ def salt(identity: Bytes, low: Bytes) -> bytes:
     return hashlib.sha256(_LABEL + identity.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
 
 
-def _ranks(gaussians: Gaussians, layout: Layout) -> npt.NDArray[np.uint64]:
+def _keys(
+    gaussians: Gaussians, names: Bytes, layout: Layout, coincidences: bool = True
+) -> npt.NDArray[np.uint64]:
+    """[N] what salts are sorted by: 9 bits of rank, 55 of the identity."""
+    ranks = _ranks(gaussians, layout, coincidences)
+    return ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
+
+
+def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> npt.NDArray[np.uint64]:
     """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is."""
     _, *fields = words_of(gaussians)
     ranks = np.empty(len(gaussians), np.uint64)
+    of_fields = (layout.mask, layout.shifts, layout.quats, UNIT_TOLERANCE, coincidences, ranks)
     in_blocks(
-        lambda start, stop: kernels.ranks(
-            start,
-            stop,
-            *fields,
-            layout.mask,
-            layout.shifts,
-            layout.quats,
-            UNIT_TOLERANCE,
-            ranks,
-        ),
-        len(gaussians),
-        KERNEL_BLOCK,
+        lambda start, stop: kernels.ranks(start, stop, *fields, *of_fields), len(gaussians), KERNEL_BLOCK
     )
     return ranks

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from keyss.channels.low_bits import kernels
 from keyss.channels.low_bits.bits import (
@@ -72,12 +72,12 @@ _LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in traine
 _CHANCE = 1e-6  # that a model with uniform bits is refused
 
 
-def usable_carriers(gaussians: Gaussians, names: Bytes | None = None) -> Flags:
+def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: Layout | None = None) -> Flags:
     """[N] which Gaussians have low bits that look like those of trained values, and can be replaced.
 
     `names` [N, 16]: their identities, where they are known.
     """
-    layout = Layout.of(gaussians)
+    layout = layout or Layout.of(gaussians)
     fields, count = words_of(gaussians)[1:], len(gaussians)
     usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
     frequent = _frequent_values(gaussians)
@@ -105,7 +105,7 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None) -> Flags:
     return usable
 
 
-def check_usable(gaussians: Gaussians, usable: Flags) -> None:
+def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
     """Raise InputError unless half of the Gaussians are `usable` [N], with uniform low bits in every field.
 
     Uniform: chi-square of the frequencies of two overlapping bytes, and every bit given the field's exponent,
@@ -118,7 +118,7 @@ def check_usable(gaussians: Gaussians, usable: Flags) -> None:
             "predictable values: the model was quantised or hardly trained, and what is put there could be "
             "seen"
         )
-    layout, rows = Layout.of(gaussians), np.flatnonzero(usable)
+    layout, rows = layout or Layout.of(gaussians), np.flatnonzero(usable)
     rows = rows[:: max(1, len(rows) // _SAMPLE)]
     used = used_words(gaussians[torch.from_numpy(rows)])
     for column in layout.columns:
@@ -161,7 +161,7 @@ def chance_of_bits(words: Words, bits: int) -> float:
         ones = np.bincount((context | below)[(flat >> np.uint32(bit) & 1) == 1], minlength=1024)
         ones, times = ones[times > 0], times[times > 0]
         smaller = np.minimum(ones, times - ones)
-        chances.append(np.minimum(1, 2 * binom.cdf(smaller, times, 0.5)))
+        chances.append(np.minimum(1, 2 * bdtr(smaller.astype(np.float64), times, 0.5)))
     every = np.concatenate(chances)
     return min(1.0, float(every.min() * len(every)))
 
@@ -178,15 +178,14 @@ def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, b
     embedding leaves. Then whether there are more short values than by chance.
     """
     fields, count = words_of(gaussians)[1:], len(gaussians)
-    keys = np.empty((1 + layout.quats + (len(layout.mask) - GEOMETRY) // 6, count), np.uint64)
+    keys = np.empty((2 + layout.quats + (len(layout.mask) - GEOMETRY) // 6, count), np.uint64)
+    keys[-1] = names.view("<u8")[:, 0]
     short = in_blocks(
-        lambda start, stop: kernels.triples(start, stop, *fields, layout.mask, layout.quats, keys),
+        lambda start, stop: kernels.triples(start, stop, *fields, layout.mask, layout.quats, keys[:-1]),
         count,
         KERNEL_BLOCK,
     )
-    apart = ~repeated(names.view("<u8")[:, 0])
-    for key in keys:
-        apart &= ~repeated(key)
+    apart = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
     expected = count * len(layout.columns) / 2.0**_SHORT_BITS
     return apart, bool(sum(short) > expected + 5 * (expected + 1) ** 0.5)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import as_strided
 
 from keyss.channels.base import Bytes, Content, Payload, RecordRequest, Records
-from keyss.channels.low_bits import parameters, spread
+from keyss.channels.low_bits import kernels, parameters, spread
 from keyss.channels.low_bits.cells import CellCipher
 from keyss.channels.low_bits.ciphers import (
     ASSOCIATED,
@@ -25,7 +26,9 @@ from keyss.channels.low_bits.parameters import PayloadParameters, RecordParamete
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.keys.derivation import DerivedKey, expand, fill, stream
 from keyss.keys.encryption import compressed_size, encrypt, encrypted_size
+from keyss.rendering.cpu.parallel import in_blocks
 
+_BLOCK = 1 << 13  # records at a time
 _NOTICED = (
     "the secrets are too large, or too many, to lie in this cover as each would alone: who holds one of the "
     "keys can notice that there are other secrets"
@@ -94,8 +97,9 @@ class Writer:
             for index in divided:
                 count = len(contents[index][1].records) + len(contents[index][1].copied)
                 own, free = free[:count], free[count:]
-                self._place(index, contents[index][1], carriers[own // cells], own % cells)
-                touched[own // cells] = True
+                order, slots = np.divmod(own, cells)
+                self._place(index, contents[index][1], carriers[order], slots)
+                touched[order] = True
             carriers = carriers[~touched]
         for index in whole:
             count = len(contents[index][1].records) + len(contents[index][1].copied)
@@ -111,17 +115,36 @@ class Writer:
         count, width = content.plan.cells_per_carrier, self._room.width
         cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
         split = len(content.records)
-        for label, records, part in (
-            ("record", content.records, slice(split)),
-            ("copy", content.records[content.copied], slice(split, None)),
+        every = np.arange(split)
+        for label, chosen, part in (
+            ("record", every, slice(split)),
+            ("copy", content.copied, slice(split, None)),
         ):
-            cipher = CellCipher(self._data_key(index), label, records.shape[1])
-            encrypted = cipher.encrypt(self._names[rows[part]], records, slots[part])
-            cells[rows[part], slots[part], : cipher.cell_bytes] = encrypted
+            cipher = CellCipher(self._data_key(index), label, content.records.shape[1])
+            place = partial(self._place_some, cipher, content.records, chosen, cells, rows[part], slots[part])
+            in_blocks(place, len(chosen), _BLOCK)
+
+    def _place_some(
+        self,
+        cipher: CellCipher,
+        records: Bytes,
+        chosen: npt.NDArray[np.int64],
+        cells: Bytes,
+        rows: npt.NDArray[np.int64],
+        slots: npt.NDArray[np.int64],
+        start: int,
+        stop: int,
+    ) -> None:
+        """From `start` to `stop` of the `chosen` [R] records, in `cells` [carriers, slots, bytes]."""
+        own, which = rows[start:stop], slots[start:stop]
+        encrypted = cipher.encrypt(self._names[own], records[chosen[start:stop]], which)
+        cells[own, which, : cipher.cell_bytes] = encrypted
 
     def _shuffled(self, label: str, count: int) -> npt.NDArray[np.int64]:
         """[count] the numbers from 0 on in random order."""
-        return np.argsort(np.frombuffer(stream(self._entropy, f"low-bits/{label}", 8 * count), "<u8"))
+        rows = np.empty(count, np.int64)
+        kernels.order(np.frombuffer(stream(self._entropy, f"low-bits/{label}", 8 * count), "<u8"), rows)
+        return rows
 
     def _data_key(self, index: int) -> bytes:
         return expand(self._entropy, f"low-bits/data-key/{index}", DATA_KEY_BYTES)

@@ -76,15 +76,14 @@ def numbers_of(start, stop, means, scales, opacities, sh, overflow, limits, oppo
 
 
 @exact_kernel
-def beyond(start, stop, means, scales, opacities, sh, overflow, limits, opponent, line_of, ends, out):
-    """`out` [N]: which Gaussians have a number outside of the `ends` [L, 2] of its line."""
-    numbers = np.empty(len(line_of))
+def beyond(start, stop, means, scales, opacities, sh, overflow, limits, opponent, least, largest, out):
+    """`out` [N]: which Gaussians have a number below its `least` [M] or above its `largest` [M] one."""
+    numbers = np.empty(len(least))
     for row in range(start, stop):
         _numbers(row, means, scales, opacities, sh, overflow, limits, opponent, numbers)
         found = False
-        for i in range(len(line_of)):
-            line = line_of[i]
-            found |= numbers[i] < ends[line, 0] or numbers[i] > ends[line, 1]
+        for i in range(len(least)):
+            found |= (numbers[i] < least[i]) | (numbers[i] > largest[i])
         out[row] = found
 
 
@@ -96,16 +95,30 @@ def reaches(
     without outliers; least and largest number of these.
     """
     numbers = np.empty(len(line_of))
-    found[:, 0], found[:, 1], found[:, 2], found[:, 3], found[:, 4] = np.inf, -np.inf, 0.0, np.inf, -np.inf
+    ends = np.empty((4, len(line_of)))  # of each number, which is faster than of each line
+    ends[0], ends[1], ends[2], ends[3] = np.inf, -np.inf, np.inf, -np.inf
+    found[:, 2] = 0.0
     for row in range(start, stop):
         _numbers(row, means, scales, opacities, sh, overflow, limits, opponent, numbers)
-        at = 3 if outlier[row] else 0
+        least, largest = (ends[2], ends[3]) if outlier[row] else (ends[0], ends[1])
         for i in range(len(line_of)):
-            line, value = line_of[i], numbers[i]
-            found[line, at] = min(found[line, at], value)
-            found[line, at + 1] = max(found[line, at + 1], value)
-            if not outlier[row]:
-                found[line, 2] += abs(value - centres[line])
+            least[i] = min(least[i], numbers[i])
+            largest[i] = max(largest[i], numbers[i])
+        if outlier[row]:
+            continue
+        first = 0
+        while first < len(line_of):  # the numbers of a line are neighbours, mostly
+            line, i = line_of[first], first
+            total = found[line, 2]
+            while i < len(line_of) and line_of[i] == line:
+                total += abs(numbers[i] - centres[line])
+                i += 1
+            found[line, 2], first = total, i
+    found[:, 0], found[:, 1], found[:, 3], found[:, 4] = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(len(line_of)):
+        line = line_of[i]
+        found[line, 0], found[line, 1] = min(found[line, 0], ends[0, i]), max(found[line, 1], ends[1, i])
+        found[line, 3], found[line, 4] = min(found[line, 3], ends[2, i]), max(found[line, 4], ends[3, i])
 
 
 @exact_inlined

@@ -41,8 +41,15 @@ class Line:
 
     def encode(self, values: Floats, bits: int) -> Codes:
         """Of each value the nearest code; of those beyond the ends the last one."""
+        return self.codes(self.positions(values), bits)
+
+    def positions(self, values: Floats) -> Floats:
+        """Where values lie, whatever the reach is."""
         offset: Floats = values - self.centre
-        position: Floats = np.arcsinh(offset / self.spread) if self.spread > 0 else offset
+        return np.arcsinh(offset / self.spread) if self.spread > 0 else offset
+
+    def codes(self, position: Floats, bits: int) -> Codes:
+        """`encode` of values at these positions."""
         last = (1 << bits) - 1
         codes = np.rint((position / self.reach + 1) * (last / 2)).clip(0, last)
         return codes.astype(np.uint32)
@@ -118,10 +125,14 @@ def reaching(line: Line, extent: Extent) -> Line:
 def _best_line(sample: Floats, bits: int, furthest: float, centre: float, spread: float) -> Line:
     """Of some lines that reach to the furthest value or less far the one with the least error."""
     best, least = _line(centre, spread, float(np.arcsinh(furthest / spread))), np.inf
+    every = np.arange(1 << bits, dtype=np.uint32)
     for scale in (0.5, 1.0, 2.0, 4.0):
+        positions = _line(centre, scale * spread, 1.0).positions(sample)
         for reach in np.geomspace(min(0.5 * spread, furthest), furthest, 12):
             line = _line(centre, scale * spread, float(np.arcsinh(reach / (scale * spread))))
-            error = line.decode(line.encode(sample, bits), bits) - sample
+            codes = line.codes(positions, bits)
+            some = len(every) < len(codes)  # fewer hyperbolic sines
+            error = (line.decode(every, bits)[codes] if some else line.decode(codes, bits)) - sample
             shrinking = float((error * (sample - centre)).mean()) ** 2 / spread**2
             cost = float(np.square(error).mean()) + _SHRINKING_WEIGHT * shrinking
             if cost < least:

@@ -31,7 +31,8 @@ def outlook_whole(inputs: Sequence[SceneInput], options: MethodOptions) -> Outlo
         bits = _BITS_IN_COLOURS if options.publish == "any" else _BITS_IN_CODES
         room, how = count * bits // 8, "about"
     else:
-        room, how = room_in(cover.model, options.publish, options.channel).capacity, "exactly"
+        exactly = room_in(cover.model, options.publish, options.channel, repair=options.repair)
+        room, how = exactly.capacity, "exactly"
     where = "colours" if options.publish == "any" else f"codes of the {options.publish} file"
     note = f"the {where} have room for {how} {room:,} bytes"
     return Outlook(count, degree, asked, min(asked, room * asked // sum(needed)), notes=(note,))

@@ -19,7 +19,7 @@ clamped.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,13 +82,7 @@ class Codec:
         outlier = outliers(gaussians)
         kinds, line_of = _kinds(table.sh_degree), _line_of(table.sh_degree)
         numbers = _numbers(gaussians)
-        centres = np.zeros(len(kinds))
-        uncentred = [line for line, kind in enumerate(kinds) if not kind.even and not kind.centred]
-        for line in uncentred:
-            chosen = np.flatnonzero(line_of == line)
-            values = np.empty((len(chosen), len(gaussians)))
-            _for_all(gaussians, kernels.numbers_of, *numbers, chosen, values)
-            centres[line] = np.median(values[:, ~outlier])
+        centres = _centres(numbers, kinds, line_of, ~outlier)
 
         def measured(start: int, stop: int) -> Floats:
             found = np.empty((len(kinds), 5))
@@ -100,13 +94,17 @@ class Codec:
         distances = parts[:, :, 2].sum(axis=0)
         rows = np.flatnonzero(~outlier)
         sample = list(_sampled(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])]))
-        lines, far = [], []
-        for line, (kind, bits) in enumerate(zip(kinds, _bits(table), strict=True)):
+        bits = _bits(table)
+
+        def fit_line(line: int, _: int) -> tuple[Line, Line]:
             inner, outer = (Extent(least[line, i], largest[line, i]) for i in range(2))
             spread = distances[line] / (len(rows) * int((line_of == line).sum()))
-            lines.append(fitted(kind, bits, sample[line].ravel(), inner, centres[line], spread))
-            far.append(reaching(lines[-1], outer))
-        return Codec(table, tuple(lines), tuple(far))
+            values = sample[line].ravel()
+            found = fitted(kinds[line], int(bits[line]), values, inner, centres[line], spread)
+            return found, reaching(found, outer)
+
+        lines, far = zip(*in_blocks(fit_line, len(kinds), 1), strict=True)
+        return Codec(table, lines, far)
 
     def encode(self, gaussians: Gaussians) -> Bytes:
         """[N, record_bytes] the records of N Gaussians; the bits left over are zero."""
@@ -182,8 +180,9 @@ def outliers(gaussians: Gaussians) -> Mask:
     sample = _sampled(gaussians[:: max(1, len(gaussians) // _SAMPLE)])
     kinds = _kinds(gaussians.sh_degree)
     ends = np.array([neighbourhood(values, kind) for values, kind in zip(sample, kinds, strict=True)])
+    least, largest = ends.T[:, _line_of(gaussians.sh_degree)]
     found = np.empty(len(gaussians), bool)
-    _for_all(gaussians, kernels.beyond, *_numbers(gaussians), _line_of(gaussians.sh_degree), ends, found)
+    _for_all(gaussians, kernels.beyond, *_numbers(gaussians), least, largest, found)
     return found if not found.all() else ~found
 
 
@@ -191,6 +190,25 @@ def out_of_range(gaussians: Gaussians) -> int:
     """How many Gaussians have a number that a record cannot hold, and that nothing drawn depends on."""
     beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
     return int((beyond | (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)).sum())
+
+
+def _centres(
+    numbers: tuple[Any, ...], kinds: Sequence[Kind], line_of: npt.NDArray[np.int64], counted: Mask
+) -> Floats:
+    """[L] the median of each line that has a centre of its own, of the `counted` [N] Gaussians; else 0."""
+    means, scales, opacities, sh, *others = numbers
+    constant = np.ascontiguousarray(sh[:, :1])  # the lines in question are those of positions and colours
+    numbers = (means, scales, opacities, constant, *others)
+
+    def centre(line: int, _: int) -> float:
+        if kinds[line].even or kinds[line].centred:
+            return 0.0
+        chosen = np.flatnonzero(line_of == line)
+        values = np.empty((len(chosen), len(means)))
+        kernels.numbers_of(0, len(means), *numbers, chosen, values)
+        return float(np.median(values[:, counted], overwrite_input=True))
+
+    return np.array(in_blocks(centre, len(kinds), 1))
 
 
 def _kinds(sh_degree: int) -> list[Kind]:
