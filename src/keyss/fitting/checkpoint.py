@@ -20,9 +20,24 @@ State = dict[str, Tensor]
 
 
 def save_checkpoint(path: Path, tensors: State, meta: Mapping[str, Any]) -> None:
-    """Atomically write `tensors` and the JSON-able `meta`. Raises OutputError."""
+    """Atomically write `tensors` and the JSON-able `meta`. Raises OutputError.
+
+    The file does not depend on the device: a run goes on from it wherever it is loaded.
+    """
+    write_bytes(path, pack_state(tensors, meta))
+
+
+def pack_state(tensors: State, meta: Mapping[str, Any]) -> bytes:
+    """`tensors` and the JSON-able `meta` in one string of bytes."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    write_bytes(path, safetensors.torch.save(contiguous, {"meta": json.dumps(meta)}))
+    return safetensors.torch.save(contiguous, {"meta": json.dumps(meta)})
+
+
+def unpack_state(data: bytes) -> tuple[State, dict[str, Any]]:
+    """What `pack_state` gave, on the CPU."""
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    return safetensors.torch.load(data), json.loads(header["__metadata__"]["meta"])
 
 
 def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from keyss.core.errors import UsageError
 
 MOST_SEED = 2**48 - 1  # every reader of JSON takes it as it is
+MOST_VIEWS = 10**4  # of a step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +26,9 @@ class FitConfig:
     ssim_weight: float = 0.2  # lambda of the photometric loss
     # Without one, a run draws its own from the system when it begins: nobody else can repeat that run.
     seed: int | None = None
+    # Views of a step, of whose losses the mean is minimised, on all processes together (`fitting.ranks`);
+    # None: one on each. Rates are per step whatever their number (docs/scaling.md).
+    views_per_step: int | None = None
 
     means_rate: float = 1.6e-4  # times the scene's extent, decays to 1 % of it
     scales_rate: float = 5e-3
@@ -32,6 +36,11 @@ class FitConfig:
     opacities_rate: float = 5e-2
     sh0_rate: float = 2.5e-3
     shN_rate: float = 1.25e-4
+
+    # Share of the run, at its end, over which all rates fall to a tenth: at constant ones Gaussians jitter
+    # around their optimum. A model that is trained on, and does not grow, gains by it; others do not
+    # (docs/method.md).
+    settle: float = 0.0
 
     grow_start: float = 1 / 6  # densification begins here, or at 500 iterations if that is earlier
     grow_stop: float = 0.6
@@ -43,11 +52,14 @@ class FitConfig:
     checkpoint_seconds: float = 180.0
 
     def __post_init__(self) -> None:
+        if self.views_per_step is not None and not 1 <= self.views_per_step <= MOST_VIEWS:
+            raise UsageError(f"`views_per_step`: expected 1 to {MOST_VIEWS}, got {self.views_per_step}")
         for name, low, high in (
             ("iterations", 1, 10**7),
             ("max_gaussians", 16, 10**8),
             ("sh_degree", 0, 3),
             ("ssim_weight", 0, 1),
+            ("settle", 0, 1),
         ):
             value = getattr(self, name)
             if not low <= value <= high:

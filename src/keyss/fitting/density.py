@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -12,9 +12,14 @@ from torch import Tensor
 
 from keyss.fitting.config import FitConfig
 from keyss.fitting.parameters import Optimizers, Parameters
+from keyss.fitting.ranks import here
 
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
+
+# What a DefaultStrategy sums up from step to step: norms of screen-space gradients [N], and of how many
+# renders [N].
+_STATISTICS = ("grad2d", "count")
 
 
 class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
@@ -45,6 +50,34 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         self.max_gaussians = config.max_gaussians
         self.opacity_for_pruning = opacity_for_pruning
         self.freeze = freeze
+
+    def over_ranks(
+        self, loss: Tensor, trained: Iterable[Tensor], params: Parameters, info: dict[str, Any] | None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """After backward: the gradients of all ranks in `trained`, and the sum of their losses.
+
+        And `info`, the meta of this rank's renders, as `step_post_backward` takes it, with what all ranks
+        have seen; None: nothing grows.
+        """
+        ranks = here()
+        if ranks.count == 1:
+            return loss, info or {}
+        if info is None:
+            return ranks.sum(trained, [loss])[0], {}
+        found: dict[str, Any] = dict.fromkeys(_STATISTICS)
+        super()._update_state(params, found, info)
+        loss, *sums = ranks.sum(trained, [loss, *(found[name] for name in _STATISTICS)])
+        return loss, dict(zip(_STATISTICS, sums, strict=True))
+
+    def _update_state(
+        self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
+    ) -> None:
+        """By the meta of renders, or by the statistics of all ranks' renders."""
+        if not set(_STATISTICS) <= set(info):
+            super()._update_state(params, state, info, packed)
+            return
+        for name in _STATISTICS:
+            state[name] = info[name] if state[name] is None else state[name] + info[name]
 
     @torch.no_grad()
     def _grow_gs(
@@ -78,6 +111,8 @@ def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
     `count`), and the weight of its loss, by which its gradients are divided to be as large as those that
     the thresholds of plain 3DGS are meant for.
     """
+    if len(drawn) == 1 and drawn[0][1] is None and drawn[0][2] == 1:
+        return drawn[0][0]  # as plain 3DGS has it
     device = drawn[0][0]["means2d"].device
     gradients = torch.zeros(len(drawn), count, 2, device=device)
     radii = torch.zeros(len(drawn), count, 2, device=device)

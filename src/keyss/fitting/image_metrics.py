@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -28,16 +29,27 @@ def psnr(image: Tensor, reference: Tensor) -> float:
     return float(-10 * torch.log10(error.clamp_min(1e-12)))
 
 
+def view_quality(image: Tensor, photo: Tensor) -> ImageQuality:
+    """Of a picture [H, W, 3] beside its photo, both in [0, 1]."""
+    return ImageQuality(psnr(image, photo), float(ssim(image, Target.of(photo))))
+
+
 @torch.no_grad()
 def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> ImageQuality:
     """Mean PSNR and SSIM of the views' renders, rounded to no fewer than 32 bits, against their photos."""
-    psnrs, ssims = [], []
-    for view in views:
-        photo = view.image.to(gaussians.device).float() / 255
-        image = render(gaussians, view.camera, background).clamp(0, 1)
-        psnrs.append(psnr(image, photo))
-        ssims.append(float(ssim(image, Target.of(photo))))
-    return ImageQuality(sum(psnrs) / len(psnrs), sum(ssims) / len(ssims))
+    found = [
+        view_quality(
+            render(gaussians, view.camera, background).clamp(0, 1),
+            view.image.to(gaussians.device).float() / 255,
+        )
+        for view in views
+    ]
+    return mean_quality(found)
+
+
+def mean_quality(views: Sequence[ImageQuality]) -> ImageQuality:
+    """The means over the views."""
+    return ImageQuality(fmean(each.psnr for each in views), fmean(each.ssim for each in views))
 
 
 @torch.no_grad()

@@ -1,4 +1,7 @@
-"""The loop around every training run: progress, checkpoints, Ctrl-C and other signals, resume."""
+"""The loop around every training run: progress, checkpoints, Ctrl-C and other signals, resume.
+
+And of several processes, see `keyss.fitting.ranks`.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,19 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, OtherProcessError
 from keyss.core.errors import Interrupted as Interrupted
 from keyss.core.gaussians import Gaussians
-from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
+from keyss.fitting.checkpoint import State, load_checkpoint, pack_state, save_checkpoint, unpack_state
+from keyss.fitting.ranks import here
+from keyss.fitting.sampling import own_randomness
 
 _ENDING = tuple(
     signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
 )
+
+
+_REMEDY = "continue with the same command and `resume=True`"
 
 
 class TrainingRun(Protocol):
@@ -34,12 +42,17 @@ class TrainingRun(Protocol):
         """That of the last step."""
 
     def step(self) -> None:
-        """One optimisation step; increases `iteration`."""
+        """One optimisation step; increases `iteration`.
+
+        What waits for other processes comes before parameters change: where one has ended, only the order
+        of views and `iteration` are ahead.
+        """
 
     def evaluate(self) -> dict[str, float]:
         """The numbers a person watches, on held-out views."""
 
-    def state(self) -> tuple[State, dict[str, Any]]: ...
+    def state(self) -> tuple[State, dict[str, Any]]:
+        """Its tensors are those of the run, not copies, but for the order of views."""
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None: ...
 
@@ -125,13 +138,19 @@ def train(
     another one raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global
     random state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given
     back to the caller.
+
+    Of several processes the first has the `checkpoint`, the `reporter` and the numbers; the others begin with
+    its state. A signal to one of them interrupts all. Where one ends, the first saves, and all raise
+    OtherProcessError.
     """
+    ranks = here()
+    if not ranks.first:
+        checkpoint, reporter, evaluate_every = None, None, 0
     reporter = reporter or SilentReporter()
     spent = 0.0
     # Those that end a process are left to do so where there is nothing to save.
-    signals = (signal.SIGINT,) if checkpoint is None else _ENDING
-    with _deferred(signals) as interrupted, torch.random.fork_rng():
-        torch.manual_seed(seed)
+    signals = (signal.SIGINT,) if checkpoint is None and ranks.count == 1 else _ENDING
+    with _deferred(signals) as interrupted, own_randomness(seed):
         if checkpoint is not None and resume and checkpoint.exists():
             tensors, meta = load_checkpoint(checkpoint)
             if meta.get("fingerprint") != fingerprint:
@@ -143,23 +162,33 @@ def train(
                 spent = float(meta["seconds"])
             except KeyError as error:
                 raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
+        if ranks.count > 1:
+            tensors, meta = run.state()
+            given = ranks.from_first(pack_state(tensors | {"rng": torch.get_rng_state()}, meta))
+            if not ranks.first:
+                tensors, meta = unpack_state(given)
+                torch.set_rng_state(tensors.pop("rng"))
+                run.load(tensors, meta)
         started = saved = time.monotonic()
         numbers: dict[str, float] = {}
         look = reporter.look if isinstance(reporter, ModelReporter) else None
         model = run.gaussians if isinstance(run, Modelled) else None
         reporter.start(title, run.iterations, run.iteration)
 
-        def save() -> None:
+        def save(state: tuple[State, dict[str, Any]] | None = None) -> None:
             if checkpoint is None:
                 return
-            tensors, meta = run.state()
+            tensors, meta = state or run.state()
             tensors["rng"] = torch.get_rng_state()
             seconds = spent + time.monotonic() - started
             save_checkpoint(checkpoint, tensors, {**meta, "fingerprint": fingerprint, "seconds": seconds})
 
+        before = None  # a step that needs other processes
         try:
             while run.iteration < run.iterations:
+                before = run.state() if ranks.count > 1 else None
                 run.step()
+                before = None
                 if evaluate_every and run.iteration % evaluate_every == 0:
                     numbers = run.evaluate()
                 told = numbers
@@ -168,13 +197,17 @@ def train(
                 reporter.update(run.iteration, len(run), told)
                 if look and model:
                     look(model)
-                if (signum := interrupted()) is not None:
+                if signum := ranks.agree(interrupted() or 0, len(run)):
                     save()
-                    raise Interrupted(checkpoint, run.iteration, signum)
+                    raise Interrupted(checkpoint, run.iteration, signal.Signals(signum))
                 if time.monotonic() - saved > checkpoint_seconds:
                     save()
                     saved = time.monotonic()
             save()
+        except OtherProcessError as error:
+            save(before)
+            saved_to = "nothing was saved" if checkpoint is None else _REMEDY
+            raise OtherProcessError(f"{error}; {saved_to}") from error
         finally:
             reporter.finish()
         return spent + time.monotonic() - started

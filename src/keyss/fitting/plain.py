@@ -13,7 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy
+from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import Reporter, train
 from keyss.fitting.losses import Target, photometric_loss
@@ -24,10 +24,12 @@ from keyss.fitting.parameters import (
     to_gaussians,
     to_parameters,
 )
+from keyss.fitting.ranks import here
 from keyss.fitting.sampling import Shuffle
 from keyss.rendering import render_with_meta
 
-LAST_RATE = 0.1  # of the rates of a model trained on, reached over the second half of the run
+LAST_RATE = 0.1  # of the rates, reached over the end of a run that settles
+REFIT_SETTLE = 0.5  # share of the run over which a model that is trained on settles
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class PlainRun:
         self.background = scene.background.to(device)
         self.iterations = config.iterations
         self.iteration = 0
+        self.views_per_step = here().views(config.views_per_step)
         self.generator = torch.Generator().manual_seed(config.known_seed)
         if model is None:
             points, colors = initial_points(scene, config.max_gaussians, self.generator)
@@ -72,31 +75,35 @@ class PlainRun:
 
     def step(self) -> None:
         config = self.config
-        view = self.views[self.shuffle.draw()]
+        views = [self.views[self.shuffle.draw()] for _ in range(self.views_per_step)]
         self.iteration += 1
         degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
-        model = to_gaussians(self.parameters)
-        image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
-        loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
-        if self.grows:
-            self.strategy.step_pre_backward(
-                self.parameters, self.optimizers, self.density, self.iteration, meta
-            )
-        loss.backward()
-        self.loss = loss.detach()
+        share = 1 / len(views)
+        total = torch.zeros((), device=self.device)
+        drawn: list[Drawn] = []
+        for view in here().mine(views):
+            model = to_gaussians(self.parameters)
+            image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
+            loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
+            meta["means2d"].retain_grad()
+            (share * loss).backward()
+            total += share * loss.detach()
+            drawn.append((meta, None, share))
+        seen = combine_densification(drawn, len(self)) if self.grows else None
+        self.loss, seen = self.strategy.over_ranks(total, self.parameters.values(), self.parameters, seen)
         self._set_rates()
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         if self.grows:
             self.strategy.step_post_backward(
-                self.parameters, self.optimizers, self.density, self.iteration, meta
+                self.parameters, self.optimizers, self.density, self.iteration, seen
             )
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.config.iterations
-        # At constant rates Gaussians jitter around their optimum; where none are added, they can settle.
-        late = 1.0 if self.grows else LAST_RATE ** max(0.0, 2 * progress - 1)
+        settle = self.config.settle
+        late = LAST_RATE ** max(0.0, progress / settle - (1 / settle - 1)) if settle else 1.0
         for name, optimizer in self.optimizers.items():
             decay = 0.01**progress if name == "means" else late
             optimizer.param_groups[0]["lr"] = self.rates[name] * decay
@@ -157,7 +164,7 @@ def refit_model(
     `rate`: a factor on all rates of `config`, whose degree and cap do not count. Raises as `fit_scene`.
     """
     rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
-    config = replace(config.seeded(), sh_degree=model.sh_degree, **rates)
+    config = replace(config.seeded(), sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
     run = PlainRun(scene, config, torch.device(device), model)
     digest = hashlib.sha256(b"".join(values.numpy().tobytes() for values in vars(model).values()))
     inputs = {"scene": scene.digest(), "model": digest.hexdigest()}
@@ -178,7 +185,7 @@ def _train(
     return train(
         run,
         title,
-        fingerprint={**inputs, "config": asdict(config), "device": str(run.device)},
+        fingerprint={**inputs, "config": asdict(config)},
         seed=config.known_seed,
         checkpoint=checkpoint,
         resume=resume,

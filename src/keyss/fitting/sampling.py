@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
+
+
+@contextmanager
+def own_randomness(seed: int) -> Iterator[None]:
+    """torch's global generators begin at `seed` while the block runs, and go on as they were afterwards.
+
+    Of several GPUs it is that of the one in use.
+    """
+    gpus = [torch.cuda.current_device()] if torch.cuda.is_available() else []
+    with torch.random.fork_rng(gpus):
+        torch.manual_seed(seed)
+        yield
 
 
 class Shuffle:

@@ -1,0 +1,62 @@
+"""A checkpoint made on one device goes on on another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from fitting.test_plain import InterruptAt
+from fitting.training_together import FIT, RUNS, trained
+from keyss.core.errors import Interrupted
+from keyss.fitting.checkpoint import load_checkpoint
+from keyss.fitting.plain import PlainRun, fit_scene
+from tiny_scenes import tiny_scene
+
+
+def test_what_a_checkpoint_is_for_does_not_depend_on_the_device(tmp_path: Path) -> None:
+    """ "cpu:0" is another name of the same device: a run that went by names would refuse it."""
+    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
+    with pytest.raises(Interrupted):
+        fit_scene(scene, FIT, checkpoint=path, reporter=InterruptAt(25))
+    there = torch.device("cpu", 0)
+    resumed = fit_scene(scene, FIT, device=there, checkpoint=path, resume=True).gaussians
+    assert torch.equal(resumed.means, fit_scene(scene, FIT).gaussians.means)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_everything_of_a_checkpoint_goes_to_the_device_of_the_run(tmp_path: Path, fused: bool) -> None:
+    """By the device "meta", which every build of torch has; CUDA's fused Adam counts its steps there."""
+    path = tmp_path / "checkpoint.safetensors"
+    made = trained("plain", FIT, checkpoint=path)
+    tensors, meta = load_checkpoint(path)
+    assert all(tensor.device.type == "cpu" for tensor in tensors.values())
+    tensors.pop("rng")
+    there = PlainRun(tiny_scene(), FIT, torch.device("meta"))
+    for optimizer in there.optimizers.values():
+        optimizer.param_groups[0]["fused"] = fused
+    there.load(tensors, meta)
+    found, expected = there.state()[0], made.state()[0]
+    assert found.keys() == expected.keys()
+    for name, tensor in found.items():
+        assert tensor.shape == expected[name].shape, name
+        stays = name in ("order", "generator") or (name.endswith(".step") and not fused)
+        assert tensor.device.type == ("cpu" if stays else "meta"), name
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_goes_from_the_cpu_to_a_gpu_and_back(tmp_path: Path, name: str) -> None:
+    """It comes out about as well as one that stayed; sums on a GPU have another order every time."""
+    path, fit = tmp_path / "checkpoint.safetensors", replace(FIT, iterations=60)
+    with pytest.raises(Interrupted):
+        trained(name, fit, checkpoint=path, reporter=InterruptAt(25))
+    with pytest.raises(Interrupted):
+        trained(name, fit, "cuda", checkpoint=path, resume=True, reporter=InterruptAt(45))
+    found = trained(name, fit, checkpoint=path, resume=True)
+    stayed = trained(name, fit)
+    assert abs(len(found) - len(stayed)) <= 0.05 * len(stayed)
+    for what, psnr in stayed.evaluate().items():
+        assert found.evaluate()[what] > psnr - 0.5, what

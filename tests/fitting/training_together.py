@@ -1,0 +1,87 @@
+"""Small trainings, and a program that torchrun starts twice to do them in two processes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import keyss  # noqa: F401  before anything imports torch
+from keyss.core.similarity import Similarity
+from keyss.fitting.checkpoint import save_checkpoint
+from keyss.fitting.config import FitConfig
+from keyss.fitting.loop import TrainingRun, train
+from keyss.fitting.plain import PlainRun
+from keyss.fitting.ranks import here, joined
+from keyss.keys import random_embeddings
+from keyss.methods.learned.joint import JointRun
+from keyss.methods.learned.options import LearnedOptions
+from keyss.methods.peers.watergs import WaterGsOptions, WaterGsRun
+from keyss.methods.poses import PlacedScene
+from tiny_scenes import random_gaussians, tiny_scene
+
+SEED = 3
+# Densified at 20 and 30 of 50 steps; WaterGS trains its autoencoder from step 35 on.
+FIT = FitConfig(
+    iterations=50, max_gaussians=600, sh_degree=1, grow_start=0.2, grow_stop=0.7, grow_every=10, seed=SEED
+)
+
+
+def plain(fit: FitConfig, device: torch.device) -> PlainRun:
+    return PlainRun(tiny_scene(), fit, device)
+
+
+def joint(fit: FitConfig, device: torch.device) -> JointRun:
+    """With wrong keys, poses of both scenes, and all attributes decoded."""
+    options = LearnedOptions(
+        fit=fit,
+        start="points",
+        mask=("op", "ro", "sc", "xyz", "sh"),
+        conditioning="bias",
+        common_poses=0.5,
+        hidden=(16, 16),
+        branch=8,
+    )
+    return JointRun(_placed(), list(random_embeddings(1, torch.Generator().manual_seed(0))), options, device)
+
+
+def watergs(fit: FitConfig, device: torch.device) -> WaterGsRun:
+    """A peer with a network, and with parameters that have no gradients at the end."""
+    return WaterGsRun(_placed(), WaterGsOptions(fit=fit, common_poses=0.5), device)
+
+
+RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
+    "plain": plain,
+    "joint": joint,
+    "watergs": watergs,
+}
+
+
+def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
+    """One of RUNS, at its end."""
+    run: TrainingRun = RUNS[name](fit, torch.device(device))
+    train(run, name, fingerprint={}, seed=fit.known_seed, evaluate_every=0, **options)
+    return run
+
+
+def _placed() -> list[PlacedScene]:
+    scenes = [tiny_scene(0), tiny_scene(1)]
+    models = [random_gaussians(seed=seed, sh_degree=1) for seed in (0, 1)]
+    return [PlacedScene.of(*each, Similarity.identity()) for each in zip(scenes, models, strict=True)]
+
+
+def main(folder: Path, device: str) -> None:
+    """Each process writes what it has come to; others than the first begin with a seed of their own."""
+    with joined(device):
+        for name in RUNS:
+            rank = here().rank
+            run = trained(name, replace(FIT, seed=SEED + rank), device)
+            save_checkpoint(folder / f"{name}-{rank}", *run.state())
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2])
