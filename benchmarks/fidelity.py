@@ -51,6 +51,8 @@ TIMED_STEPS = 40
 class Watch:
     """A reporter that remembers when each evaluation was made."""
 
+    loss_every = 0
+
     def __init__(self) -> None:
         self.shown = reporter()
         self.history: list[tuple[int, float, dict[str, float]]] = []
@@ -64,6 +66,9 @@ class Watch:
         if self.title == "hide" and numbers and (not self.history or self.history[-1][2] != numbers):
             self.history.append((iteration, time.monotonic() - self.began, dict(numbers)))
         self.shown.update(iteration, gaussians, numbers)
+
+    def note(self, line: str) -> None:
+        self.shown.note(line)
 
     def finish(self) -> None:
         self.shown.finish()
@@ -122,6 +127,7 @@ def measure(names: Sequence[str], preset: str, seed: int, settings: argparse.Nam
         method=config,
         width=settings.width,
         cover_model=models[0],
+        bound=True,
         out=out,
         overwrite=True,
         reporter=watch,

@@ -39,6 +39,16 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
+    secret = Secret(tiny_scene(1), KEY)
+    for bound, steps in ((False, []), (True, [150])):
+        options = LearnedOptions(fit=FIT, iterations=90, publish="any")
+        plan = api.plan(tiny_scene(0), [secret], method=options, bound=bound)
+        stages = [stage for stage in plan.stages if stage.name.startswith("bound")]
+        assert [stage.steps for stage in stages] == steps
+        assert {stage.name for stage in stages} <= {"bound of the secret"}  # the cover's is its plain model
+
+
 @pytest.mark.alone
 @pytest.mark.argon2
 @pytest.mark.parametrize("given", [True, False])

@@ -27,7 +27,9 @@ FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)
 METHODS = {
     "learned": LearnedOptions(fit=FIT, iterations=4),
     "learned for any format": LearnedOptions(fit=FIT, iterations=4, publish="any"),
-    "paper": replace(PRESETS["paper"], fit=FIT, hidden=(8, 8), branch=8),
+    "paper": replace(
+        PRESETS["paper"], fit=replace(FIT, iterations=16, seed=2_718_281_828), hidden=(8, 8), branch=8
+    ),
     "carry": CarryOptions(fit=FIT),
 }
 

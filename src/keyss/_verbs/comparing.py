@@ -4,45 +4,46 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from typing import Any, TypeVar
 
 from keyss._verbs.asking import Secret
 from keyss._verbs.fitting import fit
 from keyss._verbs.hiding import hide
-from keyss.core.errors import KeyssError, OutputError, UsageError
+from keyss.comparison.measuring import PlainCovers, measured
+from keyss.comparison.record import ComparedMethod, Comparison
+from keyss.comparison.sheet import sheet
+from keyss.comparison.tables import markdown
+from keyss.core.errors import InputError, KeyssError, OutputError, UsageError
 from keyss.files.atomic import write_bytes
-from keyss.files.images import picture_name
+from keyss.files.models import read_model
 from keyss.files.reading import read_text
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.keys import generate_key
-from keyss.measure.images import compare_images, renders_of
-from keyss.measure.robustness.changes import random_pruning
-from keyss.measure.robustness.survival import ChangedQuality
-from keyss.measure.robustness.survival import robustness as after_changes
-from keyss.measure.speed import render_time
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
-from keyss.runs.comparison import ComparedMethod, Comparison, SceneScores, markdown
 from keyss.runs.config import PathLike
-from keyss.runs.files import HANDED, MODEL, is_run, stego_in
+from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
-from keyss.runs.opening import HidingRun, open_run
+from keyss.runs.opening import HidingRun, as_scene, open_run
 from keyss.runs.records import read_record, write_record
 
 RECORD, TABLE, PICTURE, KEY = "comparison.json", "comparison.md", "comparison.png", "key.txt"
+CONTROLS = 2  # plain models of the cover from other seeds, beside which published ones are judged
 _BEGUN = "arguments.json"
-_LOST = 0.25  # of the Gaussians
-_ROUNDS = 5  # of timing pictures
+_ROLES = ("cover", "secret")
+# Every method with its first preset; `learned` as KeySS was published too, which is another training.
+EVERY = tuple(
+    name for each in registry.METHODS for name in ((each, f"{each}:paper") if each == "learned" else (each,))
+)
+
+OptionsT = TypeVar("OptionsT", bound=MethodOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +53,44 @@ class _Begun:
     version: int = 1
     told: dict[str, Any]
     seed: int
+
+
+@dataclass(frozen=True)
+class _PlainModels:
+    """Plain models in a comparison's folder, each fitted when it is asked for, and once."""
+
+    folder: Path
+    scenes: Mapping[str, PathLike]  # by role
+    config: FitConfig
+    width: int | None
+    device: Backend
+    reporter: Reporter | None
+
+    def of(self, role: str, iterations: int) -> Path:
+        """That of the cover or the secret after so many steps, from the seed of all methods."""
+        steps = "" if iterations == self.config.iterations else f"-{iterations}"
+        return self._fitted(f"{role}{steps}", self.scenes[role], replace(self.config, iterations=iterations))
+
+    @cached_property
+    def judging(self) -> PlainCovers:
+        """What published models are held against."""
+        names = [f"control-{number}" for number in range(1, CONTROLS + 1)]
+        paths = [self.of("cover", self.config.iterations)]
+        for name in names:
+            config = replace(self.config, seed=self.config.seed_of(name))
+            paths.append(self._fitted(name, self.scenes["cover"], config))
+        scene = as_scene(self.scenes["cover"], self.width, None)
+        return PlainCovers(scene, [read_model(path).to(resolve_device(self.device)) for path in paths])
+
+    def _fitted(self, name: str, scene: PathLike, config: FitConfig) -> Path:
+        return fitted_once(
+            self.folder / f"plain-{name}",
+            scene,
+            config,
+            width=self.width,
+            device=self.device,
+            reporter=self.reporter,
+        )
 
 
 def compare(
@@ -68,36 +107,43 @@ def compare(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Comparison:
-    """Hide one scene in another by each of the `methods` (all by default), and lay out what they come to.
+    """Hide one scene in another by each of the `methods` (by default `EVERY`), and lay out what they come to.
 
-    A method is a name, or METHOD:PRESET. Plain models of both scenes are fitted once, by the steps, Gaussians
-    and seed that all methods get. `out` gets them, the folder of a run for each method, a key for those that
-    have keys, and `comparison.json`, `.md` and `.png` (a row for each method: cover, secret, and the secret's
-    error). What was finished is not done again with `resume`. What a method cannot do is its row.
+    A method is a name, or METHOD:PRESET; all get the steps and Gaussians that are given, else those of the
+    first one's preset. Plain models of both scenes are fitted once. Steps are counted for each scene, in all:
+    a method that trains a plain model on gets one of half as many steps, and the other half for itself. So
+    `3dgs` is the bound of all: plain 3DGS of as many Gaussians and as many training steps.
+
+    `out` gets them, the folder of a run for each method, a key for those that have keys, and
+    `comparison.json`, `.md` and `.png` (a row for each method: cover, secret, and the secret's error). What
+    was finished is not done again with `resume`. What a method cannot do is its row.
     Raises KeyssError for scenes that cannot be read and for folders that hold something else; Interrupted.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
-    chosen = [_named(name) for name in methods or registry.METHODS]
+    chosen = [_named(name) for name in methods or EVERY]
     folder, budget = Path(out), {"iterations": iterations, "max_gaussians": max_gaussians}
     told: dict[str, Any] = {"cover": os.path.realpath(cover), "secret": os.path.realpath(secret)}
     told |= {**budget, "width": width}
     seed = _begin(folder, told, seed, resume)
     key = read_text(folder / KEY).strip()
-    changes = {name: value for name, value in {**budget, "seed": seed}.items() if value is not None}
-    plain = [
-        _plain(folder / name, scene, replace(chosen[0][2].fit, **changes), width, device, reporter)
-        for name, scene in (("plain-cover", cover), ("plain-secret", secret))
-    ]
+    fit = replace(
+        chosen[0][2].fit, seed=seed, **{name: each for name, each in budget.items() if each is not None}
+    )
+    changes = {"max_gaussians": fit.max_gaussians, "seed": seed}
+    plain_models = _PlainModels(folder, {"cover": cover, "secret": secret}, fit, width, device, reporter)
     rows = []
     for name, method, options in chosen:
         place = folder / name.replace(":", "-")
-        if (done := folder / f"{place.name}.json").exists():
-            rows.append(read_record(done, ComparedMethod))
+        done = folder / f"{place.name}.json"
+        if (row := _row(done)) is not None:
+            rows.append(row)
             continue
         own = key if method.capabilities.keys else ""
+        options, steps = within(fit.iterations, options)
+        plain = [] if is_run(place) else [plain_models.of(*each) for each in zip(_ROLES, steps, strict=True)]
         try:
-            if not is_run(place):
+            if plain:
                 hide(
                     cover,
                     [Secret(secret, own, plain[1])],
@@ -110,7 +156,8 @@ def compare(
                     resume=read_manifest(place).running is not None,
                     reporter=reporter,
                 )
-            rows.append(_measured(name, method, open_run(place, [own] if own else []), device))
+            run = open_run(place, [own] if own else [])
+            rows.append(measured(name, run, plain_models.judging, device))
             write_record(done, rows[-1])
         except KeyssError as error:
             rows.append(ComparedMethod(name=name, error=str(error), capabilities=method.capabilities))
@@ -118,9 +165,25 @@ def compare(
     write_record(folder / RECORD, found)
     write_bytes(folder / TABLE, markdown(found).encode())
     picture = io.BytesIO()
-    _sheet(_runs(folder, found), device).save(picture, "PNG", optimize=True)
+    sheet(_runs(folder, found), device).save(picture, "PNG", optimize=True)
     write_bytes(folder / PICTURE, picture.getvalue())
     return found
+
+
+def _row(path: Path) -> ComparedMethod | None:
+    """What was measured before; None where nothing was, or by a version that measured other things."""
+    try:
+        return read_record(path, ComparedMethod) if path.exists() else None
+    except InputError:
+        return None
+
+
+def within(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
+    """Options, and steps of plain models of cover and secret, so that each scene has `iterations` in all."""
+    goes_on = [each.goes_on and each.steps > 0 for each in options.training(2)]
+    plain = iterations - iterations // 2
+    options = options.with_fit(iterations=iterations // 2 if any(goes_on) else iterations)
+    return options, [plain if each else iterations for each in goes_on]
 
 
 def _named(text: str) -> tuple[str, Method, MethodOptions]:
@@ -152,59 +215,20 @@ def _begin(folder: Path, told: dict[str, Any], seed: int | None, resume: bool) -
     return seed
 
 
-def _plain(
+def fitted_once(
     out: Path,
     scene: PathLike,
     config: FitConfig,
+    *,
     width: int | None,
     device: Backend,
     reporter: Reporter | None,
 ) -> Path:
-    """A plain model, fitted once."""
+    """A plain model in `out`, which is fitted or gone on with unless it is there."""
     if not (out / MODEL).exists():
         resume = read_manifest(out).running is not None
         fit(scene, config=config, width=width, device=device, out=out, resume=resume, reporter=reporter)
     return out / MODEL
-
-
-def _measured(name: str, method: Method, run: HidingRun, device: Backend) -> ComparedMethod:
-    """The row of a finished run."""
-    target = resolve_device(device)
-    scenes, stego = run.scenes(train_pictures=False), run.stego.to(target)
-    models = [stego, run.opened[0].reveal(stego).to(target)]
-    plains = run.plain_models()
-    changed = after_changes(stego, run.reopeners, scenes[0], scenes[1:], changes=[random_pruning(_LOST)])
-    pruned = [changed[-1].cover, *changed[-1].secrets]
-    metrics = run.metrics
-    quality = [metrics.cover, metrics.secrets[0]]
-    found = []
-    for index, (scene, model, plain) in enumerate(zip(scenes, models, plains, strict=True)):
-        photos = [(picture_name(view.camera), view.image) for view in scene.test]
-        pictures = renders_of(model, scene, scene.test)
-        beside = plain.to(target) if plain is not None else model
-        after: ChangedQuality | None = pruned[index]
-        found.append(
-            SceneScores(
-                psnr=quality[index].psnr,
-                ssim=quality[index].ssim,
-                lpips=compare_images(photos, pictures, flip=False).mean.lpips_alex,
-                render_ratio=render_time(name, model, beside, scene, rounds=_ROUNDS).ratio,
-                pruned_loss=after.loss if after is not None and after.opens else None,
-            )
-        )
-    return ComparedMethod(
-        name=name,
-        capabilities=method.capabilities,
-        most_secrets=method.most_secrets,
-        cover=found[0],
-        secret=found[1],
-        wrong_keys=None if metrics.wrong_key is None else metrics.wrong_key.vs_cover.mean,
-        steps=metrics.iterations,
-        gaussians=metrics.gaussians,
-        published_bytes=stego_in(run.folder).stat().st_size,
-        handed_bytes=sum(path.stat().st_size for path in (run.folder / HANDED).glob("*")),
-        seconds=metrics.seconds,
-    )
 
 
 def _runs(folder: Path, found: Comparison) -> list[tuple[str, HidingRun]]:
@@ -215,45 +239,3 @@ def _runs(folder: Path, found: Comparison) -> list[tuple[str, HidingRun]]:
         for each in found.methods
         if each.error is None
     ]
-
-
-def _sheet(runs: Sequence[tuple[str, HidingRun]], device: Backend) -> Image.Image:
-    """A row for each method: cover, secret and its error (times 4) from the middle test camera."""
-    target = resolve_device(device)
-    rows: list[tuple[str, list[NDArray[np.uint8]]]] = []
-    for name, run in runs:
-        stego = run.stego.to(target)
-        shown = []
-        for scene, model in zip(
-            run.scenes(train_pictures=False), [stego, run.opened[0].reveal(stego).to(target)], strict=True
-        ):
-            view = scene.test[len(scene.test) // 2]
-            shown.append((view.image.numpy(), renders_of(model, scene, [view])[0][1].numpy()))
-        error = np.abs(shown[1][0].astype(int) - shown[1][1]).clip(0, 63).astype(np.uint8) * 4
-        if not rows:
-            rows.append(("photos", [shown[0][0], shown[1][0], np.zeros_like(error)]))
-        rows.append((name, [shown[0][1], shown[1][1], error]))
-    return _drawn(rows)
-
-
-def _drawn(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], cell: int = 200) -> Image.Image:
-    """Rows of pictures [H, W, 3], each `cell` pixels high, beside their names."""
-    gap, label, head = cell // 40, cell // 2, cell // 8
-    pictures = [[Image.fromarray(each) for each in own] for _, own in rows]
-    scaled = [
-        [each.resize((max(1, round(each.width * cell / each.height)), cell)) for each in own]
-        for own in pictures
-    ]
-    widths = [max(each.width for each in column) for column in zip(*scaled, strict=True)]
-    size = label + sum(widths) + gap * (len(widths) + 1), head + (cell + gap) * len(rows) + gap
-    sheet = Image.new("RGB", size, "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(cell // 14)
-    starts = [label + sum(widths[:index]) + gap * index for index in range(len(widths))]
-    for x, text in zip(starts, ("cover", "secret", "error of the secret, x4"), strict=False):
-        draw.text((x, gap), text, fill=(20, 20, 20), font=font)
-    for number, ((name, _), own) in enumerate(zip(rows, scaled, strict=True)):
-        y = head + (cell + gap) * number
-        draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
-        for x, each in zip(starts, own, strict=True):
-            sheet.paste(each, (x, y))
-    return sheet

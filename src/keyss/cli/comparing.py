@@ -20,7 +20,13 @@ def compare(
     cover: Annotated[Path, arg(metavar="SCENE", help="Scene that everybody may see.")],
     secret: Annotated[Path, arg(metavar="SCENE", help="Scene to hide in it.")],
     methods: Annotated[
-        str, optional("NAMES", "Methods, or METHOD:PRESET, with commas between them.", "all")
+        str,
+        optional(
+            "NAMES",
+            "Methods, or METHOD:PRESET, with commas between them. all: each one's first preset, and "
+            "learned:paper, KeySS as published.",
+            "all",
+        ),
     ] = "all",
     out: OutFolder,
     quick: Annotated[
@@ -35,6 +41,9 @@ def compare(
 ) -> None:
     """Hide one scene in another by every method there is, with the same budget: a table and a picture.
 
+    The budget is steps for each scene, in all, and Gaussians. The method 3dgs is the bound: plain 3DGS of as
+    many Gaussians and as many training steps.
+
     A key is made for those methods that have keys. What is done is not done again with --resume.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
@@ -48,7 +57,7 @@ def compare(
     found = api.compare(
         cover,
         secret,
-        methods=() if methods == "all" else [name.strip() for name in methods.split(",")],
+        methods=() if methods.strip() == "all" else [name.strip() for name in methods.split(",")],
         seed=seed,
         device=device,
         out=out,

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from keyss.channels.base import Content, Payload
 from keyss.channels.rooms import AnyChannel, Publish
+from keyss.core.decoded import PictureNetwork
 from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -36,6 +37,14 @@ class SceneInput:
 
 
 @dataclass(frozen=True)
+class Training:
+    """What a method's own training is for one scene: what makes a plain model of it comparable."""
+
+    steps: int = 0  # in which it is drawn
+    goes_on: bool = True  # from its plain model, so that the steps of that one count too
+
+
+@dataclass(frozen=True)
 class Outlook:
     """What is known of a hiding before it begins: of given models exactly, else as much as is allowed."""
 
@@ -46,6 +55,8 @@ class Outlook:
     steps: int = 0  # of the method's own training
     drawn: tuple[int, ...] = ()  # Gaussians of the cover and of each secret that a step of it draws
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each
+    # By way of which pictures of the cover and of each secret are made, untrained; () where there are none.
+    networks: tuple[PictureNetwork | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -169,6 +180,7 @@ class MethodOptions:
     # Of models that may be converted: appended Gaussians hold everything, and everybody can see that they are
     # there; colours hold little and show less.
     channel: AnyChannel = "appended"
+    repair: bool = False  # colours: a short fit of the harmonics afterwards, so that views look as before
 
     def __post_init__(self) -> None:
         """Raise UsageError for what does not go together."""
@@ -176,6 +188,12 @@ class MethodOptions:
             raise UsageError(
                 f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
             )
+        if self.repair and self.channel != "colours":
+            raise UsageError('`repair` is for what is written into colours (`channel="colours"`)')
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """The method's own training of the cover and of each secret; of `scenes` together, prepared."""
+        return (Training(),) * scenes
 
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`."""

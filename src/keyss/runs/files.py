@@ -77,6 +77,11 @@ def plain_names(secrets: int) -> list[str]:
     return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
 
 
+def bound_names(secrets: int) -> list[str]:
+    """Files of plain 3DGS with as many steps as the scenes had, where that is more than plain models had."""
+    return [f"{PRIVATE}/bound-{index}.ply" for index in ("cover", *range(1, secrets + 1))]
+
+
 def handed_names(secrets: int) -> list[str]:
     """Files that are handed over for so many secrets, by methods that do so."""
     return [f"{HANDED}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]

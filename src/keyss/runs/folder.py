@@ -291,8 +291,8 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def recorded_seed(folder: Path, *names: str) -> int | None:
-    """The seed of the interrupted run in a folder, which is this argument of it; None where there is none."""
+def recorded_number(folder: Path, *names: str) -> int | None:
+    """An argument of the interrupted run in a folder, by the names that lead to it; None: it has none."""
     running = read_manifest(folder).running
     found: Any = running and running.arguments
     for name in names:

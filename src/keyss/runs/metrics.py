@@ -22,6 +22,9 @@ class HideMetrics(HidingQuality):
     photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # of the revealed secrets
     iterations: int  # of the method's own training, 0 without one
+    # In which the cover and each secret were drawn, those of the plain model included where training went on
+    # from it; None: that one was given, and nothing is known of it.
+    steps: tuple[int | None, ...] = ()
     seconds: float  # of hiding, without fitting plain models and measuring
     width: int  # pixels of the cover's test views
     seed: int

@@ -24,6 +24,7 @@ from keyss.runs.config import Background, PathLike, RunConfig, read_config, secr
 from keyss.runs.files import (
     CONFIG,
     METRICS,
+    bound_names,
     handed_names,
     is_run,
     model_in,
@@ -81,6 +82,14 @@ class HidingRun:
             path = Path(source) if not path.exists() and is_model(source) else path
             found.append(read_model(path) if path.exists() else None)
         return found
+
+    def baselines(self) -> list[Gaussians | None]:
+        """What cover and secrets are compared with: `plain_models`, or those that were trained for longer."""
+        bounds = [self.folder / name for name in bound_names(len(self.opened))]
+        return [
+            read_model(bound) if bound.exists() else plain
+            for bound, plain in zip(bounds, self.plain_models(), strict=True)
+        ]
 
 
 def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
@@ -153,10 +162,12 @@ def as_scene(
     *,
     train_pictures: bool = True,
     skip_missing: bool = False,
+    model: Gaussians | None = None,
 ) -> Scene:
     """A scene, the photos in a folder, or what a model or the one in its file shows from all around.
 
-    `train_pictures`: see `scene_of_model`. `skip_missing`: see `load_scene`.
+    `train_pictures`: see `scene_of_model`. `skip_missing`: see `load_scene`. `model`: what is in
+    the file of a model, where it has been read.
     """
     if isinstance(source, Scene):
         return source
@@ -173,9 +184,8 @@ def as_scene(
                 raise InputError(f"{source}: expected a scene, found a run; its model is {inside}") from error
             raise
     name = "model" if isinstance(source, Gaussians) else Path(source).stem
-    return scene_of_model(
-        as_model(source), name, size=width, background=background, train_pictures=train_pictures
-    )
+    shown = as_model(source) if model is None else model
+    return scene_of_model(shown, name, size=width, background=background, train_pictures=train_pictures)
 
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:

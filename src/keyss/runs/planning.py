@@ -10,32 +10,23 @@ import os
 import resource
 import shutil
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from keyss.core.errors import OutputError
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
+from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.losses import Target, photometric_loss
-from keyss.fitting.parameters import (
-    initial_gaussians,
-    initial_points,
-    make_optimizers,
-    to_gaussians,
-    to_parameters,
-)
+from keyss.fitting.ranks import here
 from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput
+from keyss.methods.plain_models import Bound
 from keyss.progress import about
-from keyss.rendering import render, render_with_meta
 from keyss.rendering.orbit import TEST_EVERY, VIEWS
+from keyss.runs.probing import Probe
 
 _LONG = 1000  # steps
-_PROBES = 3  # steps that are timed, after one that is not
 _WATCHED = 8  # views that a training looks at every `evaluate_every` steps
 _KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and opening it again
 _CODING_SECONDS = 2e-5  # for each Gaussian of the published model: finding carriers, encrypting, writing
@@ -82,14 +73,25 @@ def plan_hiding(
     scenes: Sequence[Scene],  # of these, at least with their test pictures
     device: torch.device,
     out: Path | None,
+    *,
+    bound: bool = False,
 ) -> Plan:
-    """What hiding `scenes` comes to, after a few steps of training at the sizes to come. Writes nothing."""
+    """What hiding `scenes` comes to, after a few steps of training at the sizes to come. Writes nothing.
+
+    `bound`: with plain 3DGS of as many steps as scenes have, where that is more than plain models have.
+    """
     outlook = method.outlook(inputs, options)
     fits = [each.model is None for each in inputs]
     trains = method.trains or any(fits)
     probes = [
-        _Probe(scene, each.model, options.fit, outlook.sh_degree, device, trains)
+        Probe(scene, each.model, options.fit, outlook.sh_degree, device, trains)
         for scene, each in zip(scenes, inputs, strict=True)
+    ]
+    # As the method itself makes pictures: by way of networks, where it has some.
+    networks = outlook.networks or (None,) * len(inputs)
+    shown = [
+        probe if network is None else probe.through(network)
+        for probe, network in zip(probes, networks, strict=True)
     ]
     sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
     stages = []
@@ -103,11 +105,18 @@ def plan_hiding(
         if each.model is None:
             stages.append(_fitting(f"plain model of the {role}", options.fit, probe, sizes[index]))
     if method.trains:
-        stages.append(_hiding(options.fit, probes, outlook))
+        stages.append(_hiding(options.fit, shown, outlook))
+    for index, (probe, each, training) in enumerate(
+        zip(probes, inputs, options.training(len(inputs)), strict=True)
+    ):
+        longer = Bound.of(training, options.fit.iterations if each.model is None else None)
+        if bound and each.photos and not longer.equal and longer.steps is not None:
+            name = f"bound of the {_role(index, len(inputs))}"
+            stages.append(_fitting(name, longer.config(options.fit), probe, sizes[index]))
     writing = _KEY_SECONDS * len(inputs[1:]) + _CODING_SECONDS * outlook.gaussians
     stages.append(Stage("encrypting, opening again", 0, outlook.gaussians, writing))
     stages.append(
-        Stage("measuring", 0, outlook.gaussians, _measuring(method, probes, scenes, sizes, outlook))
+        Stage("measuring", 0, outlook.gaussians, _measuring(method, probes, shown, scenes, sizes, outlook))
     )
 
     state = outlook.gaussians * _floats(outlook.sh_degree) * 4
@@ -132,7 +141,7 @@ def plan_hiding(
 def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> str:
     """What a plain fit will take, in one line."""
     most = config.max_gaussians
-    stage = _fitting("fit", config, _Probe(scene, None, config, config.sh_degree, device, True), most)
+    stage = _fitting("fit", config, Probe(scene, None, config, config.sh_degree, device, True), most)
     state = most * _floats(config.sh_degree) * 4
     disk = 2 * _STATE_COPIES * state + _file_bytes(most, config.sh_degree) + _OTHER_BYTES
     return _line(stage.seconds, _resident_bytes() + state * (4 + 2 * _STATE_COPIES), disk)
@@ -184,110 +193,30 @@ def check_disk(out: Path, method: Method, options: MethodOptions, inputs: Sequen
         )
 
 
-class _Probe:
-    """Times of one scene's pictures and training steps, for any number of Gaussians."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        model: Gaussians | None,
-        config: FitConfig,
-        sh_degree: int,
-        device: torch.device,
-        trains: bool,
-    ) -> None:
-        self.scene, self.device, self.config = scene, device, config
-        if model is None:
-            self.start = min(config.max_gaussians, len(scene.points) if len(scene.points) >= 100 else 20_000)
-            models = [_made_up(scene, count, config) for count in {self.start, config.max_gaussians}]
-        else:
-            self.start = len(model)
-            models = [model.with_sh_degree(sh_degree) if trains else model]
-        # (Gaussians, seconds of a picture, seconds of a step) in ascending order
-        self.times = sorted(
-            (len(each), self._time_picture(each), self._time_step(each, trains)) for each in models
-        )
-
-    def picture(self, gaussians: float) -> float:
-        """Seconds of one picture."""
-        return self._at(gaussians, 1)
-
-    def step(self, gaussians: float) -> float:
-        """Seconds of one step of training with one picture."""
-        return self._at(gaussians, 2)
-
-    def _at(self, gaussians: float, column: int) -> float:
-        first, last = self.times[0], self.times[-1]
-        if last[0] == first[0]:
-            # Pixels and Gaussians cost about the same.
-            return float(last[column] * (0.5 + 0.5 * gaussians / last[0]))
-        share = (gaussians - first[0]) / (last[0] - first[0])
-        return float(max(0.5 * first[column], first[column] + share * (last[column] - first[column])))
-
-    def _views(self) -> list[View]:
-        views = self.scene.test
-        return [views[index * len(views) // (_PROBES + 1)] for index in range(_PROBES + 1)]
-
-    @torch.no_grad()
-    def _time_picture(self, model: Gaussians) -> float:
-        moved = model.to(self.device)
-        return _timed(lambda view: float(render(moved, view.camera).sum()), self._views())
-
-    def _time_step(self, model: Gaussians, trains: bool) -> float:
-        if not trains:
-            return 0.0
-        parameters = to_parameters(model, self.device)
-        optimizers = make_optimizers(parameters, self.config, self.scene.extent)
-
-        def step(view: View) -> None:
-            image, _ = render_with_meta(to_gaussians(parameters), view.camera)
-            target = Target.of(view.image.to(self.device))
-            photometric_loss(image, target, self.config.ssim_weight).backward()
-            for optimizer in optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
-            float(parameters["means"].detach().sum())
-
-        return _timed(step, self._views())
-
-
-def _timed(work: Callable[[View], object], views: Sequence[View]) -> float:
-    """Mean seconds of `work` on all views but the first."""
-    work(views[0])
-    start = time.perf_counter()
-    for view in views[1:]:
-        work(view)
-    return (time.perf_counter() - start) / len(views[1:])
-
-
-def _made_up(scene: Scene, count: int, config: FitConfig) -> Gaussians:
-    """A model of `count` Gaussians where the sparse points of `scene` are."""
-    generator = torch.Generator().manual_seed(0)
-    points, colors = initial_points(scene, count, generator)
-    times = -(-count // len(points))
-    spread = 0.002 * scene.extent * torch.randn(len(points) * times, 3, generator=generator)
-    copies = points.repeat(times, 1) + (spread if times > 1 else 0)
-    return initial_gaussians(copies, colors.repeat(times, 1), config.sh_degree, count, generator)
-
-
-def _fitting(name: str, config: FitConfig, probe: _Probe, most: int) -> Stage:
+def _fitting(name: str, config: FitConfig, probe: Probe, most: int) -> Stage:
     """A plain fit: as many Gaussians as points at first, growing to the cap while it densifies."""
     grows, grown = config.grow_start, 0.5 * (config.grow_start + config.grow_stop)
     first, last = probe.step(probe.start), probe.step(most)
     each = grows * first + (grown - grows) * 0.5 * (first + last) + (1 - grown) * last
-    return Stage(name, config.iterations, most, config.iterations * each + _watching(config, [probe], [most]))
+    seconds = config.iterations * _views(config) * each + _watching(config, [probe], [most])
+    return Stage(name, config.iterations, most, seconds)
 
 
-def _hiding(config: FitConfig, probes: Sequence[_Probe], outlook: Outlook) -> Stage:
+def _hiding(config: FitConfig, probes: Sequence[Probe], outlook: Outlook) -> Stage:
     """The method's own training: a picture of every scene that it draws in each step."""
     drawn = [(probe, count) for probe, count in zip(probes, outlook.drawn, strict=True) if count]
-    each = sum(probe.step(count) for probe, count in drawn)
+    each = _views(config) * sum(probe.step(count) for probe, count in drawn)
     watching = _watching(config, [probe for probe, _ in drawn], [count for _, count in drawn], outlook.steps)
     return Stage("hiding", outlook.steps, sum(outlook.drawn), outlook.steps * each + watching)
 
 
+def _views(config: FitConfig) -> int:
+    """Views of a step that this process draws."""
+    return here().views(config.views_per_step) // here().count
+
+
 def _watching(
-    config: FitConfig, probes: Sequence[_Probe], sizes: Sequence[float], steps: int | None = None
+    config: FitConfig, probes: Sequence[Probe], sizes: Sequence[float], steps: int | None = None
 ) -> float:
     """Seconds of looking at held-out views during a training."""
     if not config.evaluate_every:
@@ -300,17 +229,26 @@ def _watching(
 
 
 def _measuring(
-    method: Method, probes: Sequence[_Probe], scenes: Sequence[Scene], sizes: Sequence[int], outlook: Outlook
+    method: Method,
+    probes: Sequence[Probe],
+    shown: Sequence[Probe],
+    scenes: Sequence[Scene],
+    sizes: Sequence[int],
+    outlook: Outlook,
 ) -> float:
     """Seconds for all pictures of the results: of each scene its own, the plain model's, and wrong keys'."""
     share = min(1.0, outlook.gaussians / sum(sizes)) if method.trains else 1.0
-    every = [
-        len(scene.test) * probe.picture(share * size)
-        for probe, scene, size in zip(probes, scenes, sizes, strict=True)
-    ]
+    plain, own = (
+        [
+            len(scene.test) * probe.picture(share * size)
+            for probe, scene, size in zip(each, scenes, sizes, strict=True)
+        ]
+        for each in (probes, shown)
+    )
     wrong = 32 if method.trains else 0  # keys, seen from the cameras of the cover and of the secret
-    decoding = sum(every[:1]) * len(every[1:]) + sum(every[1:])
-    return 6 * sum(every) + wrong * decoding
+    wrong *= method.capabilities.keys
+    decoding = sum(own[:1]) * len(own[1:]) + sum(own[1:])
+    return 3 * sum(plain) + 3 * sum(own) + wrong * decoding
 
 
 def _role(index: int, inputs: int) -> str:

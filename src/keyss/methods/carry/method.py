@@ -118,7 +118,7 @@ class CarryMethod:
         start = time.monotonic()
         models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
         if options.publish != "ply":
-            room = room_in(cover.model, options.publish, options.channel)
+            room = room_in(cover.model, options.publish, options.channel, repair=options.repair)
             with advising(UsageError, _PRUNE_OR_PLY):
                 views = [Viewpoints.of(each.source.scene) for each in secrets]
                 written = embed_whole(
@@ -145,7 +145,7 @@ def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> C
     secrets = [model for model in others if model is not None]
     if cover is None or len(secrets) < len(others):
         return replace(options, prune_to_fit=True)
-    room = room_in(cover, options.publish, options.channel)
+    room = room_in(cover, options.publish, options.channel, repair=options.repair)
     with advising(UsageError, _PRUNE_OR_PLY):
         if not options.prune_to_fit:
             for model, share in zip(secrets, shares_of(room, secrets), strict=True):

@@ -22,7 +22,8 @@ from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
-from keyss.fitting.sampling import Shuffle
+from keyss.fitting.ranks import here
+from keyss.fitting.sampling import Shuffle, own_randomness
 from keyss.keys.derivation import random_embeddings
 from keyss.methods.learned.decoder import Decoder
 from keyss.methods.learned.options import LearnedOptions, chosen_scenes, decoder_shape
@@ -47,6 +48,7 @@ class JointRun:
         self.embeddings = [embedding.to(device) for embedding in embeddings]
         self.iterations = config.fit.iterations
         self.iteration = 0
+        self.views_per_step = here().views(config.fit.views_per_step)
         self.generator = torch.Generator().manual_seed(config.fit.known_seed)
         self.poses = CombinedPoses(scenes, device)
         self.watched = [subsample_views(placed.scene.test, 8) for placed in scenes]
@@ -70,8 +72,7 @@ class JointRun:
         self.strategy = CappedStrategy(config.fit, opacities, freeze=config.at_cap == "freeze")
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
 
-        with torch.random.fork_rng():
-            torch.manual_seed(config.fit.known_seed)
+        with own_randomness(config.fit.known_seed):
             # One for each secret: who opens one of them holds no network that knows another.
             self.decoders = [Decoder(decoder_shape(config)).to(device) for _ in embeddings]
         for decoder, embedding in self._keyed_decoders():
@@ -87,8 +88,34 @@ class JointRun:
     def step(self) -> None:
         config = self.config
         self.iteration += 1
+        views = [self._draw_poses() for _ in range(self.views_per_step)]
+        wrong: list[Tensor | None] = [None] * len(views)
+        if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
+            wrong = [random_embeddings(1, self.generator)[0].to(self.device) for _ in views]
+        share = 1 / len(views)
+        total = torch.zeros((), device=self.device)
+        drawn: list[Drawn] = []
+        for poses, other in here().mine(list(zip(views, wrong, strict=True))):
+            loss, pictures = self._loss_at(poses, other)
+            for meta, _, _ in pictures:
+                meta["means2d"].retain_grad()
+            (share * loss).backward()
+            total += share * loss.detach()
+            asking = [pictures[scene] for scene in chosen_scenes(config.densification, len(pictures))]
+            drawn += [(meta, indices, share * weight) for meta, indices, weight in asking]
+        trained = (*self.parameters.values(), *self._all_decoders.parameters())
+        seen = combine_densification(drawn, len(self))
+        self.loss, seen = self.strategy.over_ranks(total, trained, self.parameters, seen)
+        self._set_rates()
+        for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, seen)
+
+    def _loss_at(self, poses: Sequence[tuple[int, int]], wrong: Tensor | None) -> tuple[Tensor, list[Drawn]]:
+        """The losses of all scenes, each at its pose, and what was drawn; `wrong`: a wrong key."""
+        config = self.config
         degree = config.fit.sh_degree_at(self.iteration)
-        poses = self._draw_poses()
 
         def loss_of(drawn: Gaussians, scene: int) -> tuple[Tensor, dict[str, Any]]:
             background, target = self.backgrounds[scene], self.poses.target(scene, *poses[scene])
@@ -105,28 +132,14 @@ class JointRun:
             loss, meta = loss_of(decoder(cover[seen], embedding, cover), scene)
             total = total + config.secret_weight * loss
             drawn.append((meta, seen, config.secret_weight))
-        if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
-            total = total + self._incorrect_loss(cover.detach(), poses[0], loss_of)
+        if wrong is not None:
+            total = total + self._incorrect_loss(cover.detach(), poses[0], wrong, loss_of)
+        return total, drawn
 
-        for meta, _, _ in drawn:
-            meta["means2d"].retain_grad()
-        total.backward()
-        self.loss = total.detach()
-        self._set_rates()
-        for optimizer in (*self.optimizers.values(), self.decoder_optimizer):
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        asking = [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
-        combined = combine_densification(asking, len(self))
-        self.strategy.step_post_backward(
-            self.parameters, self.optimizers, self.density, self.iteration, combined
-        )
-
-    def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], loss_of: Any) -> Tensor:
+    def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], wrong: Tensor, loss_of: Any) -> Tensor:
         """The cover is right already: only the decoders are to learn from wrong keys, in turns."""
         config = self.config
         decoder = self.decoders[self.iteration // config.incorrect_every % len(self.decoders)]
-        wrong = random_embeddings(1, self.generator)[0].to(self.device)
         part = cover[possibly_seen(cover, self.poses.camera(*pose), 0.02 * self.extent)]
         loss: Tensor = loss_of(decoder(part, wrong, cover), 0)[0]
         return config.incorrect_weight * config.incorrect_every * len(self.decoders) * loss

@@ -73,7 +73,9 @@ class LearnedMethod:
         encoder_of(options)  # says what is missing
         if options.publish != "ply":
             if (cover := inputs[0].model) is not None:
-                room_in(cover, options.publish, options.channel)  # says what is missing
+                room_in(
+                    cover, options.publish, options.channel, repair=options.repair
+                )  # says what is missing
         else:
             check_room(options, [each.model for each in inputs])
         return options
@@ -159,7 +161,6 @@ class LearnedMethod:
                     for key, embedding in zip(derived, embeddings, strict=True)
                 ],
                 "options": json.loads(json.dumps(asdict(options))),  # tuples as they are read back
-                "device": context.device.type,
             },
             seed=options.fit.known_seed,
             checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import CommandLineOption, MethodOptions, SceneInput
+from keyss.methods.base import CommandLineOption, MethodOptions, SceneInput, Training
 from keyss.methods.learned.decoder import DecoderShape, Mask, parse_mask
 
 # Of the training of secrets where only models are given: iterations at most, factor on the rates.
@@ -105,6 +105,13 @@ class LearnedOptions(MethodOptions):
                 "secrets that start from plain models have no decoder that a mask or an encoder of keys "
                 'could be for; `start="points"` gives them one'
             )
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Of secrets that go on from plain models, or of all scenes together."""
+        steps = self.iterations or self.fit.iterations
+        if self.start == "points":
+            return (Training(steps, goes_on=False),) * scenes
+        return (Training(), *[Training(steps)] * (scenes - 1))
 
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`; size and length are those of the training too."""

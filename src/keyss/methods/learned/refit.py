@@ -60,7 +60,7 @@ def hide_refitted(
     else:
         model = cover.model.with_sh_degree(min(cover.model.sh_degree, fit.sh_degree))
         views = [Viewpoints.of(each.source.scene) for each in secrets]
-        place = _Whole(room_in(model, options.publish, options.channel), views)
+        place = _Whole(room_in(model, options.publish, options.channel, repair=options.repair), views)
     sizes = place.sizes([each.source.model for each in secrets])
     models, seconds = [], 0.0
     for index, (secret, (size, degree)) in enumerate(zip(secrets, sizes, strict=True), start=1):

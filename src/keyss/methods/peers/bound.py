@@ -8,7 +8,16 @@ from dataclasses import dataclass, fields
 from keyss.channels.base import Content
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Capabilities, Context, KeyedSource, Outlook, SceneInput, Source, Stego
+from keyss.methods.base import (
+    Capabilities,
+    Context,
+    KeyedSource,
+    Outlook,
+    SceneInput,
+    Source,
+    Stego,
+    Training,
+)
 from keyss.methods.peers.options import PeerOptions, presets_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 
@@ -20,12 +29,16 @@ _NAMES = tuple(each.name for each in fields(Gaussians))
 class BoundOptions(PeerOptions):
     """Of plain models; there is no other training."""
 
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """None."""
+        return (Training(),) * scenes
+
 
 class BoundMethod:
     """See `keyss.methods.base.Method`."""
 
     name = NAME
-    summary = "two plain models, the second handed over: nothing is hidden, the bound of all others"
+    summary = "two plain models, the second handed over: nothing is hidden, a bound"
     trains = False
     most_secrets = 1
     capabilities = Capabilities(keys=False, hands_over=True)

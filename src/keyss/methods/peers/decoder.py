@@ -20,7 +20,7 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.parameters import to_gaussians
 from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
-from keyss.methods.peers.networks import Convolutions, network_of, network_tensors
+from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, untrained
 from keyss.methods.peers.options import PeerOptions, presets_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 from keyss.methods.peers.training import PeerRun, Picture
@@ -61,6 +61,7 @@ class DecoderMethod(JointPeer):
     capabilities = Capabilities(keys=False, hands_over=True, models=False)
     options = DecoderOptions
     presets: Mapping[str, PeerOptions] = presets_of(DecoderOptions)
+    networks = (None, untrained(3))
 
     def begin(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> DecoderRun:
         return DecoderRun(scenes, options, device)

@@ -19,7 +19,7 @@ from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
-from keyss.methods.peers.networks import Convolutions, network_of, network_tensors
+from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, untrained
 from keyss.methods.peers.options import PeerOptions, presets_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 from keyss.methods.peers.training import PeerRun, Picture
@@ -69,6 +69,7 @@ class GsHiderMethod(JointPeer):
     capabilities = Capabilities(keys=False, hands_over=True, standard=False, models=False)
     options = GsHiderOptions
     presets: Mapping[str, PeerOptions] = presets_of(GsHiderOptions)
+    networks = (untrained(FEATURES),) * 2
 
     def begin(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> GsHiderRun:
         return GsHiderRun(scenes, options, device)

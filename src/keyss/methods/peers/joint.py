@@ -13,6 +13,7 @@ import torch
 
 from keyss.channels.base import Content
 from keyss.core.alignment import align
+from keyss.core.decoded import PictureNetwork
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.loop import train
@@ -33,6 +34,7 @@ class JointPeer(ABC):
     most_secrets = 1
     options: type[PeerOptions]
     presets: Mapping[str, PeerOptions]
+    networks: tuple[PictureNetwork | None, ...] = ()  # see `Outlook`
 
     @abstractmethod
     def begin(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> PeerRun:
@@ -54,7 +56,8 @@ class JointPeer(ABC):
         """As many Gaussians as a plain model has show both scenes."""
         fit = options.fit
         most = fit.max_gaussians
-        return Outlook(most, fit.sh_degree, most, most, fit.iterations, (most, most))
+        drawn = (most, most)
+        return Outlook(most, fit.sh_degree, most, most, fit.iterations, drawn, networks=self.networks)
 
     def hide(
         self, cover: Source, secrets: Sequence[KeyedSource], options: PeerOptions, context: Context
@@ -75,7 +78,6 @@ class JointPeer(ABC):
                 "scenes": [scene.digest() for scene in scenes],
                 "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
                 "options": json.loads(json.dumps(asdict(options))),
-                "device": context.device.type,
             },
             seed=fit.known_seed,
             checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,

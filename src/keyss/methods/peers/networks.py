@@ -30,6 +30,15 @@ class Convolutions(torch.nn.Module):
         return PictureNetwork(tuple(zip(weights[::2], weights[1::2], strict=True)), background)
 
 
+def untrained(channels: int) -> PictureNetwork:
+    """One of that size, which shows nothing."""
+    widths = [channels, *[WIDTH] * (LAYERS - 1), 3]
+    layers = tuple(
+        (torch.zeros(after, before, 3, 3), torch.zeros(after)) for before, after in pairwise(widths)
+    )
+    return PictureNetwork(layers, torch.zeros(channels))
+
+
 def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
     """By names, to be handed over."""
     tensors = {"background": network.background}

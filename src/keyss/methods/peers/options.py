@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeVar
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import CommandLineOption, MethodOptions
+from keyss.methods.base import CommandLineOption, MethodOptions, Training
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +38,10 @@ class PeerOptions(MethodOptions):
             )
         if not 0 <= self.common_poses <= 1:
             raise UsageError(f"`common_poses`: expected 0 to 1, got {self.common_poses}")
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """From points: both scenes are drawn at every step."""
+        return (Training(self.fit.iterations, goes_on=False),) * scenes
 
 
 OptionsT = TypeVar("OptionsT", bound=PeerOptions)

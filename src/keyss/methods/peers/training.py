@@ -24,7 +24,8 @@ from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_parameters
-from keyss.fitting.sampling import Shuffle
+from keyss.fitting.ranks import here
+from keyss.fitting.sampling import Shuffle, own_randomness
 from keyss.methods.peers.options import PeerOptions
 from keyss.methods.points import combined_points
 from keyss.methods.poses import CombinedPoses, PlacedScene
@@ -42,6 +43,7 @@ class PeerRun:
         fit = options.fit
         self.options, self.device, self.scenes = options, device, scenes
         self.iterations, self.iteration = fit.iterations, 0
+        self.views_per_step = here().views(fit.views_per_step)
         self.weights = (options.cover_weight, options.secret_weight)
         self.generator = torch.Generator().manual_seed(fit.known_seed)
         self.poses = CombinedPoses(scenes, device)
@@ -56,8 +58,7 @@ class PeerRun:
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, fit, self.extent)
         self.networks = torch.nn.ModuleList()
-        with torch.random.fork_rng():
-            torch.manual_seed(fit.known_seed)
+        with own_randomness(fit.known_seed):
             self.prepare(start)
         self.networks.to(device)
         # An optimiser has something to optimise, also where there is no network.
@@ -99,12 +100,34 @@ class PeerRun:
         return len(self.parameters["means"])
 
     def step(self) -> None:
-        options = self.options
         self.iteration += 1
+        views = [self._draw_poses() for _ in range(self.views_per_step)]
+        share = 1 / len(views)
+        total = torch.zeros((), device=self.device)
+        drawn: list[Drawn] = []
+        for view in here().mine(views):
+            loss, pictures = self._loss_at(view)
+            for meta, _, _ in pictures:
+                meta["means2d"].retain_grad()
+            (share * loss).backward()
+            total += share * loss.detach()
+            drawn += [(meta, None, share * weight) for meta, _, weight in pictures]
+        trained = (*self.parameters.values(), *self.networks.parameters())
+        seen = combine_densification(drawn, len(self))
+        self.loss, seen = self.strategy.over_ranks(total, trained, self.parameters, seen)
+        self._set_rates()
+        for optimizer in (*self.optimizers.values(), self.network_optimizer):
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, seen)
+
+    def _loss_at(self, view: Sequence[tuple[list[int], tuple[int, int]]]) -> tuple[Tensor, list[Drawn]]:
+        """The losses of both scenes, and what was drawn for them; see `_draw_poses`."""
+        options = self.options
         degree = options.fit.sh_degree_at(self.iteration)
         total = torch.zeros((), device=self.device)
         drawn: dict[int, Drawn] = {}
-        for scenes, pose in self._draw_poses():
+        for scenes, pose in view:
             pictures = self.draw(scenes, self.poses.camera(*pose), degree)
             for scene, (image, meta) in zip(scenes, pictures, strict=True):
                 target = self.poses.target(scene, *pose)
@@ -112,18 +135,7 @@ class PeerRun:
                 total = total + weight * photometric_loss(image, target, options.fit.ssim_weight)
                 _, _, before = drawn.get(id(meta), (None, None, 0.0))
                 drawn[id(meta)] = (meta, None, before + weight)
-        for meta, _, _ in drawn.values():
-            meta["means2d"].retain_grad()
-        total.backward()
-        self.loss = total.detach()
-        self._set_rates()
-        for optimizer in (*self.optimizers.values(), self.network_optimizer):
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        combined = combine_densification(list(drawn.values()), len(self))
-        self.strategy.step_post_backward(
-            self.parameters, self.optimizers, self.density, self.iteration, combined
-        )
+        return total, list(drawn.values())
 
     def _draw_poses(self) -> list[tuple[list[int], tuple[int, int]]]:
         """Scenes, and the training pose of one of them from which they are drawn."""

@@ -34,6 +34,7 @@ from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.files.formats.common import morton_order
 from keyss.fitting.parameters import make_optimizers
+from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
 from keyss.methods.peers.joint import JointPeer
@@ -221,6 +222,7 @@ class WaterGsRun(PeerRun):
             F.binary_cross_entropy_with_logits(self.mapping(logits), wanted).backward()
             adam.step()
         adam.zero_grad()
+        here().share(self.mapping.parameters())
 
 
 @dataclass(frozen=True, kw_only=True)

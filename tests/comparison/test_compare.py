@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from keyss._verbs.comparing import EVERY, within
 from keyss.cli import main
 from keyss.core import OutputError, UsageError
 from keyss.methods import registry
+from keyss.methods.plain_models import Bound
 from test_api import write_nerfstudio
 from tiny_scenes import tiny_scene
 
@@ -35,12 +37,22 @@ def test_a_table_a_picture_and_a_second_start(
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
     assert main([*command, "--methods", "3dgs,3dgs-sh"]) == 0
     first = (out / "3dgs-sh" / "publish" / "stego.ply").stat().st_mtime_ns
+    before = json.loads((out / "3dgs-sh.json").read_text())
+    older = {"version": 1, "name": "3dgs-sh", "cover": {"pruned_loss": None}}
+    (out / "3dgs-sh.json").write_text(json.dumps(older))  # of a version that measured other things
+    untouched = (out / "3dgs.json").stat().st_mtime_ns
     capsys.readouterr()
     assert main([*command, "--methods", names]) == 5
     assert "--resume" in capsys.readouterr().err
     assert main([*command, "--methods", names, "--resume", "--width", "20"]) == 5
     assert main([*command, "--methods", names, "--resume"]) == 0
     assert (out / "3dgs-sh" / "publish" / "stego.ply").stat().st_mtime_ns == first  # not again
+    assert (out / "3dgs.json").stat().st_mtime_ns == untouched
+    again = json.loads((out / "3dgs-sh.json").read_text())  # measured again, to the same numbers
+    timed = ("measuring_seconds", "cover", "secret")
+    assert {k: v for k, v in again.items() if k not in timed} == {
+        k: v for k, v in before.items() if k not in timed
+    }
     said = capsys.readouterr().out
     assert "learned: not possible" in said  # so small a cover has no room
     found = json.loads((out / "comparison.json").read_text())
@@ -49,16 +61,38 @@ def test_a_table_a_picture_and_a_second_start(
     assert "any" in rows["learned"]["error"]
     assert rows["3dgs"]["cover"]["psnr"] >= rows["watergs"]["cover"]["psnr"] - 1
     assert rows["3dgs-sh"]["handed_bytes"] > rows["3dgs-sh"]["gaussians"] * 16 * 3 * 4
-    assert rows["3dgs-sh"]["secret"]["pruned_loss"] is None  # what is handed over belongs to every row
-    assert rows["3dgs"]["secret"]["pruned_loss"] == pytest.approx(0)
     assert {rows[name]["capabilities"]["keys"] for name in ("3dgs", "3dgs-sh")} == {False}
     assert rows["watergs"]["capabilities"]["keys"]
-    lines = (out / "comparison.md").read_text().splitlines()
-    assert len(lines) == 2 + len(rows)
-    assert len({line.count("|") for line in lines}) == 1
+    assert {tuple(rows[name]["trained"]) for name in names.split(",")[:3]} == {(60, 60)}
+    tried = {
+        name: {each["change"]: each for each in rows[name]["survival"] if not each["skipped"]}
+        for name in rows
+    }
+    # What is handed over belongs to every row, and that of `3dgs` lies elsewhere.
+    assert tried["3dgs-sh"]["pruned"]["secret_loss"] is None
+    assert {"pruned", ".spz", "purified"} <= set(tried["3dgs"])  # and splat-transform's, where it is there
+    assert [each["secret_loss"] for each in tried["3dgs"].values()] == pytest.approx([0] * len(tried["3dgs"]))
+    # What `3dgs` publishes is the plain model that others are held against.
+    secrecy = rows["3dgs"]["secrecy"]
+    for figure in ("classifier", "stealth", "stegexpose"):
+        assert secrecy[figure] == secrecy[f"{figure}_plain"]
+    assert {each["reader"] for each in rows["watergs"]["readers"]} == {"plyfile", "gsply", "splat-transform"}
+    assert all(each["loads"] for each in rows["watergs"]["readers"] if each["loads"] is not None)
+    text = (out / "comparison.md").read_text()
+    assert text.count("\n## ") + text.startswith("## ") == 2
+    assert "- learned: not possible" in text
     with Image.open(out / "comparison.png") as picture:
         assert picture.height > 4 * 200  # photos and three methods
     assert (out / "key.txt").stat().st_mode & 0o77 == 0
+
+
+@pytest.mark.parametrize("name", registry.METHODS)
+@pytest.mark.parametrize("iterations", [61, 3000])
+def test_every_scene_is_drawn_as_often_by_every_method(name: str, iterations: int) -> None:
+    for preset in registry.METHODS[name].presets.values():
+        options, plain = within(iterations, preset)
+        trained = [Bound.of(each, own).steps for each, own in zip(options.training(2), plain, strict=True)]
+        assert trained == [iterations] * 2
 
 
 def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -75,3 +109,11 @@ def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: 
         compare(tmp_path / "a.ply", folders[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "gs-hider", "watergs"}
+
+
+def test_all_is_every_method_and_keyss_as_published() -> None:
+    assert set(EVERY) == {*registry.METHODS, "learned:paper"}
+    assert len(EVERY) == len(set(EVERY))
+    for name in EVERY:  # `paper` is not the first, so that it is another row
+        method, _, preset = name.partition(":")
+        assert preset in ("", *list(registry.METHODS[method].presets)[1:])

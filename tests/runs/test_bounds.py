@@ -1,0 +1,139 @@
+"""What a hidden scene is compared with: plain 3DGS of as many Gaussians and as many training steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+
+import keyss
+from keyss import CarryOptions, FitConfig, LearnedOptions, Secret
+from keyss.fitting import plain
+from keyss.fitting.plain import PlainRun
+from keyss.methods import peers, registry
+from keyss.methods.base import MethodOptions, Training
+from keyss.methods.plain_models import Bound
+from keyss.runs.metrics import HideMetrics
+from test_api import write_nerfstudio
+from tiny_scenes import tiny_scene
+
+FIT = FitConfig(iterations=40, max_gaussians=300, grow_every=20, evaluate_every=0, seed=0)
+KEY = "a key of many characters: 93hXmQ2"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("scenes")
+    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
+
+
+def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """Counts of the steps that each plain training takes from now on."""
+    counts: dict[str, int] = {}
+    step, begin = PlainRun.step, PlainRun.__init__
+
+    def named(self: PlainRun, scene: keyss.Scene, *arguments: object) -> None:
+        begin(self, scene, *arguments)  # type: ignore[arg-type]
+        self.label = f"{scene.name} {len(counts)}"  # type: ignore[attr-defined]
+        counts[self.label] = 0  # type: ignore[attr-defined]
+
+    def counted(self: PlainRun) -> None:
+        counts[self.label] += 1  # type: ignore[attr-defined]
+        step(self)
+
+    monkeypatch.setattr(PlainRun, "__init__", named)
+    monkeypatch.setattr(PlainRun, "step", counted)
+    return counts
+
+
+def test_the_bound_is_drawn_as_often_as_the_scene_was(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted where training happens, not where it is written down."""
+    counts = drawn(monkeypatch)
+    options = replace(LearnedOptions(fit=FIT, publish="any"), iterations=30)
+    result = keyss.hide(
+        folders[0], [Secret(folders[1], KEY)], method=options, bound=True, min_psnr=0, out=tmp_path / "run"
+    )
+    steps = list(counts.values())
+    assert steps == [40, 40, 30, 70]  # both plain models, the secret trained on, and its bound
+    metrics = result.metrics
+    assert metrics.steps == metrics.baseline.steps == (steps[0], steps[1] + steps[2]) == (40, steps[3])
+    assert metrics.baseline.equal == (True, True)
+    assert keyss.evaluate(tmp_path / "run", [KEY]) == metrics
+    before = msgspec.json.decode((tmp_path / "run" / "private" / "metrics.json").read_bytes())
+    assert before["baseline"]["steps"] == [40, 70]
+    longer = keyss.read_model(tmp_path / "run" / "private" / "bound-1.ply")
+    assert metrics.baseline.gaussians[1] == len(longer)
+
+
+def test_without_one_the_start_is_not_called_a_bound(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = drawn(monkeypatch)
+    fitted = keyss.fit(folders[1], config=replace(FIT, iterations=25), out=tmp_path / "plain")
+    secret = Secret(folders[1], KEY, tmp_path / "plain" / "model.ply")
+    options = LearnedOptions(fit=FIT, publish="any")
+    metrics = keyss.hide(folders[0], [secret], method=options, min_psnr=0).metrics
+    assert list(counts.values()) == [25, 40, 40]
+    assert metrics.steps == (40, 65)  # a model of `keyss fit` says how long it was trained
+    assert metrics.baseline.steps == (40, 25)
+    assert metrics.baseline.equal == (True, False)
+    unknown = Secret(folders[1], KEY, fitted.gaussians)
+    metrics = keyss.hide(folders[0], [unknown], method=options, bound=True, min_psnr=0).metrics
+    assert metrics.steps == (40, None)
+    assert metrics.baseline.equal == (True, False)
+    carried = keyss.hide(
+        folders[0], [unknown], method=CarryOptions(fit=FIT, publish="any"), bound=True, min_psnr=0
+    ).metrics
+    assert carried.baseline.equal == (True, True)  # nothing is trained on
+
+
+@pytest.mark.parametrize("name", registry.METHODS)
+def test_what_methods_say_of_their_training(name: str) -> None:
+    method = registry.METHODS[name]
+    for options in method.presets.values():
+        trainings = options.training(2)
+        assert len(trainings) == 2
+        assert any(each.steps for each in trainings) == method.trains
+        for each in trainings:
+            bound = Bound.of(each, options.fit.iterations)
+            assert bound.steps is not None
+            plain_steps = options.fit.iterations if each.goes_on else 0
+            assert bound.steps == plain_steps + each.steps
+            assert bound.config(options.fit).iterations == bound.steps
+
+
+def test_peers_train_both_scenes_at_every_step() -> None:
+    for method in peers.PEERS:
+        options: MethodOptions = next(iter(method.presets.values()))
+        if method.trains:
+            assert options.training(2) == (Training(options.fit.iterations, goes_on=False),) * 2
+            assert Bound.of(options.training(2)[0], options.fit.iterations).equal
+
+
+def test_rates_settle_to_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
+    rates: list[float] = []
+    step = PlainRun.step
+
+    def watched(self: PlainRun) -> None:
+        step(self)
+        rates.append(self.optimizers["opacities"].param_groups[0]["lr"])
+
+    monkeypatch.setattr(PlainRun, "step", watched)
+    plain.fit_scene(tiny_scene(0), replace(FIT, settle=0.25))
+    assert rates[:30] == [FIT.opacities_rate] * 30
+    assert rates[30] < rates[29]
+    assert rates[-1] == pytest.approx(0.1 * FIT.opacities_rate)
+    assert sorted(rates, reverse=True) == rates
+
+
+def test_records_of_before_are_read(folders: tuple[Path, Path]) -> None:
+    metrics = keyss.hide(
+        folders[0], [Secret(folders[1], KEY)], method=CarryOptions(fit=FIT, publish="any"), min_psnr=0
+    ).metrics
+    data = msgspec.to_builtins(metrics)
+    del data["steps"], data["baseline"]["steps"], data["baseline"]["equal"]
+    assert msgspec.convert(data, HideMetrics).baseline.equal == ()
