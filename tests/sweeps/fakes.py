@@ -56,7 +56,7 @@ REAL = (
     "from keyss.sweeps.worker import main; sys.exit(main(sys.argv[1:]))",
 )
 
-# A driver, to be killed: `python -c DRIVER SPEC OUT`.
+# A driver, to be killed: `python -c DRIVER SPEC OUT MASTER real`, or "fake", or "ray" for such on a cluster.
 DRIVER = f"""
 import sys
 sys.path[:0] = [{TESTS!r}]
@@ -64,9 +64,15 @@ import argon2.low_level, cheap_keys
 argon2.low_level.hash_secret_raw = cheap_keys.hash_secret_raw
 from sweeps.fakes import REAL, fake
 from keyss import api
+from keyss.core import BackendError
 from keyss.sweeps.running import How
-command = REAL if sys.argv[4] == "real" else fake(0.15)
-api.sweep(sys.argv[1], sys.argv[2], master_key_file=sys.argv[3], how=How(2, command=command))
+kind = sys.argv[4]
+how = How(2, command=REAL if kind == "real" else fake(0.15), ray="local" if kind == "ray" else None)
+try:
+    api.sweep(sys.argv[1], sys.argv[2], master_key_file=sys.argv[3], how=how)
+except BackendError as error:
+    print("error:", error, file=sys.stderr)
+    sys.exit(error.exit_status)
 """
 
 

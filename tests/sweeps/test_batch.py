@@ -134,6 +134,7 @@ def test_another_master_key_is_refused(folder: Path) -> None:
         hide(folder)
 
 
+@pytest.mark.counted
 def test_the_key_of_an_asset_opens_it_and_no_other(
     tmp_path: Path,
     keyss: Callable[..., Said],  # noqa: F811

@@ -134,9 +134,9 @@ def _print_estimates(found: list[Estimate], jobs: int | None) -> None:
     Console().print(table)
     due = [each for each in found if not each.done and each.refused is None]
     resources = Resources.divided(jobs, max((each.memory for each in due), default=1))
+    cells = f"{len(found)} cell{'s' * (len(found) != 1)}"
     print(
-        f"{len(found)} cells, {len(due)} to do: about {about(sum(each.seconds for each in due))} on this "
-        f"machine, were all its cores at work; {resources.jobs} at once with {resources.threads} thread(s) "
-        "each"
+        f"{cells}, {len(due)} to do: about {about(sum(each.seconds for each in due))} on this machine, were "
+        f"all its cores at work; {resources.jobs} at once with {resources.threads} thread(s) each"
     )
     print("Nothing was written. Times are extrapolated from a few steps, and rough.")

@@ -49,7 +49,7 @@ class RayEngine:
         )
         try:
             ray.init(log_to_driver=False, configure_logging=False, **options)
-        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        except Exception as error:  # Ray has no class of its own for what happens while it starts
             raise BackendError(f"cannot reach a Ray cluster at {self.address}: {error}") from error
         try:
             self._run(ray, tasks, watcher, local)
