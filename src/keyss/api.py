@@ -18,14 +18,16 @@ if TYPE_CHECKING:
     from keyss._verbs.looking import evaluate, render
     from keyss._verbs.opening import reveal, reveal_counted, verify
     from keyss._verbs.planning import plan
+    from keyss._verbs.reproducing import download_scenes, plan_reproduction, reproduce
     from keyss.audit.run import audit
     from keyss.report.page import write_report
+    from keyss.reproduction.asking import PaperTable
     from keyss.sweeps.batch import BatchResult, hide_batch
     from keyss.sweeps.sweep import SweepResult, sweep
 
 __all__ = ["Conversion", "HideResult", "Secret", "audit", "convert", "evaluate", "fit", "hide", "plan"]
 __all__ += ["render", "render_video", "reveal", "reveal_counted", "verify", "write_report"]
-__all__ += ["compare"]
+__all__ += ["PaperTable", "compare", "download_scenes", "plan_reproduction", "reproduce"]
 __all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
 __all__ += ["BatchResult", "SweepResult", "hide_batch", "sweep"]
 
@@ -34,20 +36,24 @@ _HOMES = {
     "Conversion": "_verbs.converting",
     "HideFilesResult": "_verbs.filing",
     "HideResult": "_verbs.hiding",
+    "PaperTable": "reproduction.asking",
     "SweepResult": "sweeps.sweep",
     "Secret": "_verbs.asking",
     "SecretFile": "_verbs.filing",
     "audit": "audit.run",
     "compare": "_verbs.comparing",
     "convert": "_verbs.converting",
+    "download_scenes": "_verbs.reproducing",
     "evaluate": "_verbs.looking",
     "fit": "_verbs.fitting",
     "hide": "_verbs.hiding",
     "hide_batch": "sweeps.batch",
     "hide_files": "_verbs.filing",
     "plan": "_verbs.planning",
+    "plan_reproduction": "_verbs.reproducing",
     "render": "_verbs.looking",
     "render_video": "_verbs.filming",
+    "reproduce": "_verbs.reproducing",
     "reveal": "_verbs.opening",
     "reveal_counted": "_verbs.opening",
     "reveal_file": "_verbs.filing",

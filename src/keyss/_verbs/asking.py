@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -15,6 +16,8 @@ from keyss.methods.base import Method, MethodOptions, SceneInput
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import PathLike, path_of
 from keyss.runs.opening import as_3dgs_model
+
+_READERS = 2  # files that are read at once
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def inputs_of(
     sources: Sequence[PathLike | Scene | Gaussians], models: Sequence[PathLike | Gaussians | None]
 ) -> list[SceneInput]:
     """Scenes and the plain models that are given with them, or that they are. Raises UsageError."""
-    inputs = []
+    asked: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
     for index, (source, model) in enumerate(zip(sources, models, strict=True)):
         photos = isinstance(source, Scene) or not is_model(source)
         if not photos:
@@ -60,12 +63,20 @@ def inputs_of(
                 what = "a source in memory" if isinstance(source, Gaussians) else source
                 raise UsageError(f"{what} is a model itself and needs no other: leave out `{argument}`")
             model = source  # type: ignore[assignment]
-        found = None if model is None else as_3dgs_model(model, "the secret" if index else "the cover")
-        if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
-            what = "the secret" if index else "the cover"
-            raise UsageError(f"nothing of {what}'s model can be seen: all of its Gaussians are transparent")
-        inputs.append(SceneInput(found, photos))
-    return inputs
+        asked.append((model, photos))
+    names = ["the cover"] + ["the secret"] * (len(asked) - 1)
+    # Large files take seconds each, most of it outside of Python's lock.
+    with ThreadPoolExecutor(_READERS) as readers:
+        found = readers.map(_drawable, [model for model, _ in asked], names)
+        return [SceneInput(model, photos) for model, (_, photos) in zip(found, asked, strict=True)]
+
+
+def _drawable(model: PathLike | Gaussians | None, what: str) -> Gaussians | None:
+    """The model if there is one. Raises UsageError where nothing of it can be seen."""
+    found = None if model is None else as_3dgs_model(model, what)
+    if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
+        raise UsageError(f"nothing of {what}'s model can be seen: all of its Gaussians are transparent")
+    return found
 
 
 def check_keys(keys: Sequence[str]) -> None:

@@ -59,6 +59,7 @@ def hide_files(
     publish: Publish = "ply",
     channel: AnyChannel = "colours",
     strength: float = robust.STRENGTH,
+    repair: bool = False,
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> HideFilesResult:
@@ -66,14 +67,16 @@ def hide_files(
 
     `publish`: "ply" writes into low bits, and "spz", "sog" and "compressed-ply" into the codes of such a
     file, which have to be passed on as they are; "any" writes what survives other formats, by `channel`: into
-    colours, at a cost of `strength` (dB PSNR that views of the model keep at least), or into appended
-    Gaussians, which have room for far more and which everybody can see are there. `out` (a folder) gets
-    `publish/stego.ply`, or `.spz` and so on. Raises InputError for a cover whose low bits are not random, or
-    that has too few Gaussians, UsageError for files that do not fit, which names what would, and for equal
-    keys.
+    colours, at a cost of `strength` (dB PSNR that views of the model keep at least), less with `repair` (a
+    short fit of the harmonics afterwards), or into appended Gaussians, which have room for far more and which
+    everybody can see are there. `out` (a folder) gets `publish/stego.ply`, or `.spz` and so on. Raises
+    InputError for a cover whose low bits are not random, or that has too few Gaussians, UsageError for files
+    that do not fit, which names what would, for equal keys, and for a `repair` that cannot be.
     """
     if not files:
         raise UsageError("expected at least one file to hide")
+    if repair and (publish != "any" or channel != "colours"):
+        raise UsageError('`repair` is for what is written into colours (`publish="any", channel="colours"`)')
     check_keys([each.key for each in files])
     folder = None
     if out is not None:
@@ -86,7 +89,7 @@ def hide_files(
     if publish == "ply":
         stego = LOW_BITS.prepare(model).embed(payloads)
     else:
-        stego = room_in(model, publish, channel, strength).embed(payloads)
+        stego = room_in(model, publish, channel, strength=strength, repair=repair).embed(payloads)
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
         there = folder.write(writers({name: stego})) if folder else None

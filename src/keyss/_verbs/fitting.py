@@ -6,20 +6,23 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 
+from keyss._verbs.together import begun, together
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
 from keyss.fitting.plain import FitResult, fit_scene
+from keyss.fitting.ranks import here
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import Background, FitRunConfig, PathLike, colour_of, path_of
 from keyss.runs.files import CONFIG, METRICS, MODEL, writers
-from keyss.runs.folder import RunFolder, recorded_seed
+from keyss.runs.folder import RunFolder
 from keyss.runs.metrics import FitMetrics
 from keyss.runs.opening import as_scene
 from keyss.runs.planning import plan_fit, worth_planning
 
 
+@together
 def fit(
     scene: PathLike | Scene,
     *,
@@ -38,11 +41,13 @@ def fit(
     `width`: photos are shrunk to it. `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets
     `model.ply` and `private/` with `config.json` and `metrics.json`; while it runs, checkpoints from which
     `resume` goes on. Without a seed in `config` the run draws one from the system, and `config.json` records
-    it; to be resumed it needs none.
+    it; to be resumed it needs none. Of several processes of torchrun the first writes and reports; all
+    return the model.
     Raises KeyssError and its children; Interrupted on Ctrl-C.
     """
-    recorded = recorded_seed(Path(out), "config", "seed") if resume and out is not None else None
-    config = (config or FitConfig()).seeded(recorded)
+    answers = here().first
+    interrupted = Path(out) if resume and out is not None else None
+    config = begun(config or FitConfig(), interrupted, "config")
     target = resolve_device(device)
     settings = FitRunConfig(
         scene=path_of(scene),
@@ -52,13 +57,17 @@ def fit(
         config=config,
     )
     folder = None
-    if out is not None:
-        told = asdict(settings) | {"device": target.type}
+    if out is not None and answers:
         folder = RunFolder(
-            out, "fit", told, writes=(MODEL, CONFIG, METRICS), overwrite=overwrite, resume=resume
+            out,
+            "fit",
+            asdict(settings),
+            writes=(MODEL, CONFIG, METRICS),
+            overwrite=overwrite,
+            resume=resume,
         )
     loaded = as_scene(scene, width, background, skip_missing=skip_missing)
-    if reporter and not resume and worth_planning(config):
+    if reporter and answers and not resume and worth_planning(config):
         reporter.note(f"fit: {plan_fit(loaded, config, target)}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(

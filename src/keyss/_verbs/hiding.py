@@ -3,36 +3,53 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import msgspec
 import torch
 
 from keyss._verbs.asking import Secret, inputs_of, method_for
+from keyss._verbs.together import begun, together
 from keyss.channels.base import Payload
 from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene
 from keyss.files.models import is_model_path, read_model
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import quality
 from keyss.fitting.loop import Reporter
+from keyss.fitting.ranks import here
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
-from keyss.measure.hiding import RenderFidelity, measure_hiding, render_fidelity
+from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
 from keyss.methods.base import Context, KeyedSource, Method, MethodOptions, Opened, Source, Stego
 from keyss.methods.handed import pack
-from keyss.methods.plain_models import plain_models
+from keyss.methods.plain_models import Bound, fit_bound, plain_models
 from keyss.methods.registry import open_handed
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import Background, PathLike, RunConfig, colour_of, path_of, secret_ids
-from keyss.runs.files import CONFIG, METRICS, STEGOS, handed_names, plain_names, stego_name, writers
-from keyss.runs.folder import RunFolder, recorded_seed
-from keyss.runs.metrics import HideMetrics
+from keyss.runs.files import (
+    CONFIG,
+    METRICS,
+    MODEL,
+    STEGOS,
+    bound_names,
+    handed_names,
+    plain_names,
+    stego_name,
+    writers,
+)
+from keyss.runs.folder import RunFolder
+from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import as_scene, open_in
 from keyss.runs.planning import check_disk, plan_hiding, worth_planning
-from keyss.runs.records import record_bytes
+from keyss.runs.records import read_record, record_bytes
 
 MIN_PSNR = 20.0  # dB against the plain model; below it, pictures are of another thing
 _BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; of dark or small objects, empty pictures may pass for good ones
@@ -46,6 +63,7 @@ class HideResult:
     metrics: HideMetrics
 
 
+@together
 def hide(
     cover: PathLike | Scene | Gaussians,
     secrets: Sequence[Secret],
@@ -55,6 +73,7 @@ def hide(
     background: Background = None,
     skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
+    bound: bool = False,
     min_psnr: float = MIN_PSNR,
     device: Backend = "auto",
     out: PathLike | None = None,
@@ -75,9 +94,14 @@ def hide(
     hand over that need more than the published file (`keyss.methods.handed`); while it runs, checkpoints from
     which `resume` goes on.
 
+    With `bound`, scenes that were trained for longer than their plain models are compared with plain 3DGS of
+    as many Gaussians and as many training steps, fitted for that; without, `metrics.json` says which of its
+    `baseline` had fewer steps.
+
     At the end what was written is opened with the keys and rendered beside the plain models. Where one comes
     to less than `min_psnr` (dB), or is no better than empty pictures, nothing is published, and QualityError
-    is raised; checkpoints stay. Raises KeyssError and its other children; Interrupted on Ctrl-C.
+    is raised; checkpoints stay. Of several processes of torchrun the first writes, measures and reports.
+    Raises KeyssError and its other children; Interrupted on Ctrl-C.
     """
     if out is not None and is_model_path(out):
         raise UsageError(
@@ -85,9 +109,9 @@ def hide(
             'lie, or with `method="carry"` what its `publish` says'
         )
     chosen, options = method_for(method, secrets)
-    repeatable = options.fit.seed is not None
-    recorded = recorded_seed(Path(out), "options", "fit", "seed") if resume and out is not None else None
-    options = replace(options, fit=options.fit.seeded(recorded))
+    repeatable, ranks = options.fit.seed is not None, here()
+    interrupted = Path(out) if resume and out is not None else None
+    options = replace(options, fit=begun(options.fit, interrupted, "options", "fit"))
     keys = [secret.key for secret in secrets]
     target = resolve_device(device)
     sources = [cover, *(secret.scene for secret in secrets)]
@@ -107,8 +131,9 @@ def hide(
         options=options,
     )
     folder = None
-    if out is not None:
-        told = asdict(settings) | {"device": target.type, "models": [m and path_of(m) for m in models]}
+    if out is not None and ranks.first:
+        told = asdict(settings) | {"models": [m and path_of(m) for m in models]}
+        told |= {"bound": True} if bound else {}
         told["keys"] = _key_checks(keys, settings)
         folder = RunFolder(
             out,
@@ -126,34 +151,52 @@ def hide(
         check_disk(folder.path, chosen, options, inputs)
     trains = chosen.trains or any(each.model is None for each in inputs)
     scenes = [
-        as_scene(source, width, background, train_pictures=trains, skip_missing=skip_missing)
-        for source in sources
+        as_scene(
+            source,
+            width,
+            background,
+            train_pictures=trains,
+            skip_missing=skip_missing,
+            model=None if each.photos else each.model,
+        )
+        for source, each in zip(sources, inputs, strict=True)
     ]
-    if reporter and trains and not resume and worth_planning(options.fit):
+    if reporter and ranks.first and trains and not resume and worth_planning(options.fit):
         place = folder.path if folder else None
-        reporter.note(f"hide: {plan_hiding(chosen, options, inputs, scenes, target, place)}")
+        reporter.note(f"hide: {plan_hiding(chosen, options, inputs, scenes, target, place, bound=bound)}")
     with folder.work() if folder else nullcontext():
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         plain = plain_models(scenes, [each.model for each in inputs], options.fit, context)
         own, *others = map(Source, scenes, plain)
         if repeatable:
             context = replace(context, entropy=_entropy(keys, options, plain))
+        elif ranks.count > 1:  # what they go on with, as with `bound`, is then the same
+            context = replace(context, entropy=ranks.from_first(os.urandom(32)))
         stego = chosen.hide(own, list(map(KeyedSource, others, keys)), options, context)
-        handed = _handed_files(stego.handed, keys)
-        against_plain = tuple(
-            render_fidelity(model.to(target), original.to(target), scene)
-            for model, original, scene in zip(
-                _as_read(stego, keys, handed, folder), plain, scenes, strict=True
-            )
-        )
-        _check_quality(against_plain, min_psnr)
+        shown: list[Shown] = []
+        if ranks.first:
+            shown = [
+                show(model.to(target), original.to(target), scene)
+                for model, original, scene in zip(_as_read(stego, keys, folder), plain, scenes, strict=True)
+            ]
+            _check_quality(shown, min_psnr)
         photos = tuple(each.photos for each in inputs)
-        metrics = _measured(chosen, stego, scenes, plain, photos, options, against_plain, target)
+        fitted = [_steps_of(model, options.fit) for model in models]
+        bounds = list(map(Bound.of, options.training(len(scenes)), fitted))
+        longer = _longer(bounds, scenes, plain, photos, stego, options, context) if bound else {}
+        if ranks.first:
+            metrics = _measured(
+                chosen, stego, scenes, plain, photos, options, shown, target, bounds, fitted, longer
+            )
         if folder:
             payloads = secret_ids(options.fit.known_seed, stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
+            made |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
+    if ranks.count > 1:
+        found = json.dumps(asdict(metrics) if ranks.first else None)  # which keeps what is not a number
+        metrics = msgspec.convert(json.loads(ranks.from_first(found.encode())), HideMetrics)
     return HideResult(stego.gaussians, metrics)
 
 
@@ -166,10 +209,12 @@ def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list
 
 def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
     """32 bytes that nobody knows without the keys; other inputs or options have others."""
-    seed = options.fit.known_seed
+    seed, settings = options.fit.known_seed, msgspec.to_builtins(options)
+    if options.fit.views_per_step is None:  # came later than seeds, what these give stays as it was
+        del settings["fit"]["views_per_step"]
     salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
     parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys if key]
-    parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
+    parts += [record_bytes(settings), *(model.digest().encode() for model in plain)]
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 
@@ -179,11 +224,9 @@ def _handed_files(payloads: Sequence[Payload], keys: Sequence[str]) -> dict[str,
     return dict(zip(handed_names(len(packed)), packed, strict=True))
 
 
-def _as_read(
-    stego: Stego, keys: Sequence[str], handed: Mapping[str, bytes], folder: RunFolder | None
-) -> list[Gaussians]:
+def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
     """The stego model and the secrets as a reader gets them, from the files that are to be given away."""
-    model = stego.gaussians
+    model, handed = stego.gaussians, _handed_files(stego.handed, keys)
     if folder:
         name = stego_name(model)
         model = read_model(folder.write(writers({name: model, **handed})) / name)
@@ -197,10 +240,10 @@ def _as_read(
     return [model, *(each.reveal(model) for each in opened)]
 
 
-def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
+def _check_quality(shown: Sequence[Shown], least: float) -> None:
     """Raise QualityError where the cover or a secret does not come out as it should."""
-    for index, each in enumerate(found):
-        who = "the cover" if index == 0 else "the secret" if len(found) == 2 else f"secret {index}"
+    for index, each in enumerate(_fidelity(shown)):
+        who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
         if each.psnr < least:
             raise QualityError(
                 f"{who} comes out at {each.psnr:.1f} dB against its plain model, below {least:g} dB: nothing "
@@ -214,6 +257,42 @@ def _check_quality(found: Sequence[RenderFidelity], least: float) -> None:
             )
 
 
+def _fidelity(shown: Sequence[Shown]) -> tuple[RenderFidelity, ...]:
+    """Of cover and secrets to their plain models, which all have one here."""
+    return tuple(each.fidelity for each in shown if each.fidelity is not None)
+
+
+def _steps_of(model: PathLike | Gaussians | None, fit: FitConfig) -> int | None:
+    """Steps of the training of a plain model: one that is fitted here, or one that `fit` wrote."""
+    if model is None:
+        return fit.iterations
+    if isinstance(model, Gaussians) or Path(model).name != MODEL:
+        return None
+    metrics = Path(model).parent / METRICS
+    return read_record(metrics, FitMetrics).iterations if metrics.is_file() else None
+
+
+def _longer(
+    bounds: Sequence[Bound],
+    scenes: Sequence[Scene],
+    plain: Sequence[Gaussians],
+    photos: Sequence[bool],
+    stego: Stego,
+    options: MethodOptions,
+    context: Context,
+) -> dict[int, Gaussians]:
+    """Plain 3DGS of the scenes that were trained for longer than their plain models, by their index."""
+    sizes = [len(stego.gaussians), *(len(each.reveal(stego.gaussians)) for each in stego.opened)]
+    found = {}
+    for index, (each, scene, model, size) in enumerate(zip(bounds, scenes, plain, sizes, strict=True)):
+        if each.equal or each.steps is None or not photos[index]:
+            continue
+        # A secret that lost Gaussians for want of room is compared with one that has no more.
+        config = each.config(options.fit, size if size < len(model) else None)
+        found[index] = fit_bound(scene, config, index, context)
+    return found
+
+
 def _measured(
     method: Method,
     stego: Stego,
@@ -221,16 +300,29 @@ def _measured(
     models: Sequence[Gaussians],  # plain ones of the scenes
     photos: tuple[bool, ...],  # whether the scenes have some
     options: MethodOptions,
-    against_plain: tuple[RenderFidelity, ...],
+    shown: Sequence[Shown],  # beside the plain models
     device: torch.device,
+    bounds: Sequence[Bound],
+    fitted: Sequence[int | None],  # steps of the plain models
+    longer: Mapping[int, Gaussians],  # plain models with the steps of their bounds
 ) -> HideMetrics:
     """What `stego` comes to."""
+    baselines = [longer.get(index, model) for index, model in enumerate(models)]
+    beside_bounds = [
+        replace(each, plain=quality(longer[index].to(device), scene.test, scene.background.to(device)))
+        if index in longer
+        else each
+        for index, (each, scene) in enumerate(zip(shown, scenes, strict=True))
+    ]
     measured = measure_hiding(
         stego.gaussians.to(device),
         stego.opened,
         scenes,
-        [model.to(device) for model in models],
+        baselines,
+        steps=[each.steps if index in longer else fitted[index] for index, each in enumerate(bounds)],
+        equal=[each.equal or index in longer for index, each in enumerate(bounds)],
         seed=options.fit.known_seed,
+        shown=beside_bounds,
     )
     return HideMetrics(
         **vars(measured),
@@ -239,9 +331,10 @@ def _measured(
         photos=photos,
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
+        steps=tuple(each.steps for each in bounds),
         seconds=round(stego.seconds, 1),
         width=scenes[0].train[0].camera.width,
         seed=options.fit.known_seed,
-        against_plain=against_plain,
+        against_plain=_fidelity(shown),
         details=stego.details,
     )

@@ -83,7 +83,9 @@ def evaluate(
         opened.stego.to(target),
         opened.opened,
         opened.scenes(train_pictures=False),
-        [None if model is None else model.to(target) for model in opened.plain_models()],
+        [None if model is None else model.to(target) for model in opened.baselines()],
+        steps=opened.metrics.baseline.steps,
+        equal=opened.metrics.baseline.equal,
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
         seed=opened.metrics.seed if seed is None else seed,
     )

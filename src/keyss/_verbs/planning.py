@@ -24,6 +24,7 @@ def plan(
     background: Background = None,
     skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
+    bound: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
 ) -> Plan:
@@ -45,4 +46,5 @@ def plan(
         as_scene(source, width, background, train_pictures=False, skip_missing=skip_missing)
         for source in sources
     ]
-    return plan_hiding(chosen, options, inputs, scenes, target, None if out is None else Path(out))
+    place = None if out is None else Path(out)
+    return plan_hiding(chosen, options, inputs, scenes, target, place, bound=bound)

@@ -74,7 +74,8 @@ def subject_of(
     seeds that follow from the run's own and `seed`. Raises UsageError without a plain model of the cover.
     """
     scenes = run.scenes()
-    plain, *baselines = run.plain_models()
+    plain, *_ = run.plain_models()
+    _, *baselines = run.baselines()
     if original is not None:
         plain = as_model(original)
     if plain is None:

@@ -42,6 +42,9 @@ Background = Annotated[
 ]
 SkipMissing = Annotated[bool, arg(help="Leave out photos that a scene names but that are not there.")]
 Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
+ViewsPerStep = Annotated[
+    int | None, optional("N", "Photos of a step, in all processes together.", "one in each")
+]
 MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
 Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
 Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
@@ -68,9 +71,12 @@ def preset_sizes(presets: Mapping[str, FitConfig]) -> str:
     return f"Steps of each training, and Gaussians of each model at most: {'; '.join(sizes)}."
 
 
-def schedule(iterations: int | None, max_gaussians: int | None, seed: int | None) -> dict[str, int]:
+def schedule(
+    iterations: int | None, max_gaussians: int | None, seed: int | None, views_per_step: int | None
+) -> dict[str, int]:
     """What was asked for on the command line of the fields of `FitConfig`."""
-    asked = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": seed}
+    asked = {"iterations": iterations, "max_gaussians": max_gaussians}
+    asked |= {"seed": seed, "views_per_step": views_per_step}
     return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from keyss import __version__
+from keyss.cli import ranks
 from keyss.cli.flags import as_flags
 from keyss.cli.verbosity import spoken
 from keyss.core.errors import InputError, Interrupted, KeyssError, KeyssWarning, OutputError, signal_of
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     options: set[str] = set()  # of the command, as Python names them
     try:
-        with _warnings_as_lines(options), spoken(arguments) as asked:
+        with ranks.one_speaks(), _warnings_as_lines(options), spoken(arguments) as asked:
             try:
                 _run(asked or ["--help"], options)
             finally:
@@ -60,7 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             near = existing_path(message, arguments)
             message += f"; did you mean {near}?" if near else ""
-        print(f"keyss: {_one_line(as_flags(message, options))}", file=sys.stderr)
+        if ranks.has_to_say(error):
+            print(f"keyss: {ranks.name()}{_one_line(as_flags(message, options))}", file=sys.stderr)
         return status
 
 
@@ -73,6 +75,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
     from keyss.cli import suggestions
     from keyss.cli.commands import ALL
 
+    ranks.check_command(arguments[0])
     commands = application(arguments)
     flags = set()
     if (chosen := commands.found.get(arguments[0])) is not None:
@@ -107,14 +110,15 @@ def application(arguments: Sequence[str], *, whole: bool = False) -> Application
     import tyro
 
     from keyss.cli import commands
-    from keyss.cli.hiding import hide, hide_with_options
+    from keyss.cli.hiding import hide
+    from keyss.cli.hiding_options import hide_with_options
     from keyss.cli.models import fit, fit_with_presets
 
     found: dict[str, Callable[..., None]] = {}
     for command in commands.ALL:
         name, asked = name_of(command), command
         if command is hide and (whole or name == arguments[0]):
-            asked = hide_with_options(arguments)
+            asked = hide_with_options(hide, arguments)
         elif command is fit and (whole or name == arguments[0]):
             asked = fit_with_presets()
         found[name] = asked

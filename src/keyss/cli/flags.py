@@ -13,6 +13,7 @@ _NAME = re.compile(r"`([a-z_]\w*)`")
 
 # Named otherwise on the command line.
 _OTHERWISE = {"key": "key-file", "keys": "key-file", "secrets": "secret", "model": "secret-model"}
+_OTHERWISE |= {"download_scenes": "download"}
 
 
 def as_flags(message: str, options: Collection[str]) -> str:

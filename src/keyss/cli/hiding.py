@@ -5,12 +5,9 @@ Everything heavy is imported inside the commands, so that `keyss --help` answers
 
 from __future__ import annotations
 
-import inspect
-from argparse import ArgumentParser
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
@@ -30,18 +27,17 @@ from keyss.cli.arguments import (
     Seed,
     SkipMissing,
     TensorBoard,
+    ViewsPerStep,
     Width,
     optional,
-    preset_sizes,
     schedule,
 )
+from keyss.cli.hiding_options import DEFAULT_METHOD, own_options
 from keyss.cli.sweeping import hide_assets
 
 if TYPE_CHECKING:
     from keyss.channels.rooms import AnyChannel, Publish
-    from keyss.methods.base import CommandLineOption, Method
 
-DEFAULT_METHOD = "learned"
 _HOW = ("byte for byte as it is", "as it is, or converted")  # to publish
 
 
@@ -75,6 +71,9 @@ def hide(
             "scenes are appended, and files lie in colours",
         ),
     ] = None,
+    repair: Annotated[
+        bool, arg(help="With --channel colours: a short fit afterwards, so that views look more as before.")
+    ] = False,
     method: str = DEFAULT_METHOD,
     key_file: KeyFiles = (),
     batch: Annotated[
@@ -93,6 +92,7 @@ def hide(
     preset: str = "best",
     iterations: Iterations = None,
     max_gaussians: MaxGaussians = None,
+    views_per_step: ViewsPerStep = None,
     width: Width = None,
     background: Background = None,
     skip_missing: SkipMissing = False,
@@ -103,6 +103,13 @@ def hide(
         UseAppendAction[tuple[Path, ...]],
         optional("FILE", "Plain model of a secret, once for each secret.", "they are fitted"),
     ] = (),
+    bound: Annotated[
+        bool,
+        arg(
+            help="Fit plain 3DGS of as many Gaussians and as many training steps to compare each scene with, "
+            "where its plain model had fewer; takes as long again."
+        ),
+    ] = False,
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
     ] = 20.0,
@@ -132,6 +139,7 @@ def hide(
     from keyss import api
     from keyss.cli.keys import keys, warn_of_doubtful_keys
     from keyss.cli.live import watched
+    from keyss.cli.ranks import answers, check_command
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.cli.tensorboard import reporter
     from keyss.core.errors import UsageError
@@ -144,6 +152,7 @@ def hide(
     for flag, value in (("--master-key-file", master_key_file), ("--jobs", jobs), ("--ray", ray)):
         if batch is None and value is not None:
             raise UsageError(f"{flag} is for many hidings: give --batch CSV, or leave it out")
+    check_command("hide --batch" if batch else "hide --secret-file", trains=not (batch or secret_file))
     if secret_file and cover is not None and batch is None:
         unused: dict[str, object] = {
             "--secret": secret,
@@ -151,10 +160,10 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
-        unused |= {"--tensorboard": tensorboard, "--live": live}
+        unused |= {"--tensorboard": tensorboard, "--live": live, "--bound": bound}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
-        _hide_files(cover, secret_file, publish, channel or "colours", key_file, out, overwrite)
+        _hide_files(cover, secret_file, publish, channel or "colours", repair, key_file, out, overwrite)
         return
     if not secret and batch is None:
         raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
@@ -163,7 +172,7 @@ def hide(
             f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
         )
     chosen = registry.get(method)
-    known = _own_options(chosen)
+    known = own_options(chosen)
     changes = {
         name: parse(value) if (parse := known[name][1].parse) else value
         for name, value in own.items()
@@ -172,12 +181,15 @@ def hide(
     changes["publish"] = publish
     if channel:
         changes["channel"] = channel
+    if repair:
+        changes["repair"] = True
     options = chosen.presets[preset].adapted(**changes)
-    options = options.with_fit(**schedule(iterations, max_gaussians, seed))
+    options = options.with_fit(**schedule(iterations, max_gaussians, seed, views_per_step))
     if batch is not None:
         one: dict[str, object] = {"--cover": cover, "--secret": secret, "--secret-file": secret_file}
         one |= {"--key-file": key_file, "--cover-model": cover_model, "--secret-model": secret_model}
         one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--live": live, "--resume": resume}
+        one |= {"--bound": bound}
         if given_too := [flag for flag, value in one.items() if value]:
             raise UsageError(
                 f"--batch: {given_too[0]} is for a single hiding; a batch that was interrupted goes on "
@@ -205,6 +217,7 @@ def hide(
             "--preset": preset != next(iter(chosen.presets)),
             "--iterations": iterations is not None,
             "--max-gaussians": max_gaussians is not None,
+            "--views-per-step": views_per_step is not None,
             "--live": live,
         }
         if idle := [flag for flag, is_given in training.items() if is_given]:
@@ -230,6 +243,7 @@ def hide(
             background=background,
             skip_missing=skip_missing,
             cover_model=cover_model,
+            bound=bound,
             device=device,
             out=out,
         )
@@ -244,6 +258,7 @@ def hide(
             background=background,
             skip_missing=skip_missing,
             cover_model=cover_model,
+            bound=bound,
             min_psnr=min_psnr,
             device=device,
             out=out,
@@ -251,6 +266,8 @@ def hide(
             resume=resume,
             reporter=told,
         )
+    if not answers():
+        return
     print_hiding(result.metrics)
     how = _HOW[publish == "any"]
     what = "the cover, with the secret in it" if chosen.trains or chosen.capabilities.keys else "the cover"
@@ -277,6 +294,7 @@ def _hide_files(
     files: Sequence[Path],
     publish: Publish,
     channel: AnyChannel,
+    repair: bool,
     key_file: Sequence[Path],
     out: Path,
     overwrite: bool,
@@ -296,97 +314,10 @@ def _hide_files(
     opening = keys(key_file, len(files), confirm=True)
     warn_of_doubtful_keys(opening)
     secrets = [api.SecretFile(file, key) for file, key in zip(files, opening, strict=True)]
-    result = api.hide_files(cover, secrets, publish=publish, channel=channel, out=out, overwrite=overwrite)
+    result = api.hide_files(
+        cover, secrets, publish=publish, channel=channel, repair=repair, out=out, overwrite=overwrite
+    )
     for file, size in zip(files, result.sizes, strict=True):
         print(f"{file.name}: {size:,} bytes, opened again from what was written")
     print(f"The cover's views changed by {result.psnr:.0f} dB PSNR")
     print_files(out, dict.fromkeys(STEGOS, f"publish this, {_HOW[publish == 'any']}"))
-
-
-def hide_with_options(arguments: Sequence[str]) -> Callable[..., None]:
-    """`hide` as it is to be parsed: with the options of the method that `arguments` choose, and no others.
-
-    Raises UsageError for an option that only another method has.
-    """
-    from keyss.core.errors import UsageError
-    from keyss.methods.registry import METHODS
-
-    chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    chooser.add_argument("--method", nargs="?")
-    chooser.add_argument("--publish", nargs="?")
-    asked = chooser.parse_known_args(arguments)[0]
-    # Codes have room for small secrets, which are carried at once.
-    usual = DEFAULT_METHOD if asked.publish in (None, "ply", "any") else "carry"
-    method = METHODS[asked.method if asked.method in METHODS else usual]
-    flags = {name: _flags(each) for name, each in METHODS.items()}
-    for argument in arguments:
-        flag = argument.partition("=")[0].replace("_", "-")
-        having = [name for name in METHODS if flag in flags[name]]
-        if having and method.name not in having:
-            known = ", ".join(sorted(flags[method.name])) or "none"
-            raise UsageError(
-                f"{flag} is an option of --method {' and '.join(having)}; --method {method.name} has of its "
-                f"own: {known}"
-            )
-    return _with_options_of(method)
-
-
-def _with_options_of(method: Method) -> Callable[..., None]:
-    """`hide` with a signature for tyro: what all methods take, then the options of this one."""
-    from keyss.methods.registry import METHODS
-
-    summaries = "; ".join(f"{each.name}: {each.summary}" for each in METHODS.values())
-    # Types and defaults by name, for what `hide` leaves open.
-    hints: dict[str, Any] = {
-        "method": Annotated[Literal[tuple(METHODS)], arg(help=f"{summaries}.")],
-        "preset": Annotated[Literal[tuple(method.presets)], arg(help=_preset_help(method))],
-    }
-    defaults: dict[str, Any] = {"method": method.name, "preset": next(iter(method.presets))}
-    for name, (kind, option) in _own_options(method).items():
-        aliases = [f"--{option.alias}"] if option.alias else None
-        if kind is bool:
-            hints[name], defaults[name] = Annotated[bool, arg(help=option.help, aliases=aliases)], False
-            continue
-        choices = "{" + ",".join(get_args(kind)) + "}" if get_origin(kind) is Literal else None
-        described = optional(option.metavar or choices or "TEXT", option.help, "the preset's", aliases)
-        hints[name], defaults[name] = Annotated[(str if option.parse else kind) | None, described], None
-
-    def command(**arguments: Any) -> None:
-        hide(**arguments)
-
-    signature = inspect.signature(hide, eval_str=True)
-    parameters = {name: each for name, each in signature.parameters.items() if name != "own"}
-    for name, hint in hints.items():
-        parameters[name] = inspect.Parameter(
-            name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=hint
-        )
-    command.__signature__ = signature.replace(parameters=list(parameters.values()))  # type: ignore[attr-defined]
-    command.__name__, command.__doc__ = "hide", hide.__doc__
-    command.__annotations__ = {name: each.annotation for name, each in parameters.items()}
-    return command
-
-
-def _preset_help(method: Method) -> str:
-    """What the presets of a method come to."""
-    sizes = preset_sizes({name: options.fit for name, options in method.presets.items()})
-    return f"Size and kind of a run on photos; models bring their size along. {sizes}"
-
-
-def _own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
-    """Of the fields of a method's options that the command line has, types and descriptions."""
-    from keyss.methods.base import CommandLineOption
-
-    hints = get_type_hints(method.options, include_extras=True)
-    return {
-        each.name: (get_args(hints[each.name])[0], extra)
-        for each in fields(method.options)
-        for extra in getattr(hints[each.name], "__metadata__", ())
-        if isinstance(extra, CommandLineOption)
-    }
-
-
-def _flags(method: Method) -> set[str]:
-    """As they are typed: `--prune-to-fit`, `--thin`."""
-    own = _own_options(method)
-    aliases = [option.alias for _, option in own.values() if option.alias]
-    return {f"--{name.replace('_', '-')}" for name in (*own, *aliases)}

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from keyss._torchrun import processes
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.keys.key_file import read_key_file
 from keyss.keys.key_file import write_new_key as write_new_key
@@ -34,7 +35,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
                 f"{VARIABLE} holds one key, but there are {count} secrets: give --key-file for each"
             )
         return [_checked(os.environ[VARIABLE], VARIABLE)]
-    if not sys.stdin.isatty():
+    if not sys.stdin.isatty() or processes() > 1:
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal and be asked")
     return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 

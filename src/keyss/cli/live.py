@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from keyss.cli.ranks import answers
+
 if TYPE_CHECKING:
     from keyss.fitting.loop import Reporter
 
@@ -17,7 +19,7 @@ def watched(told: Reporter, scene: Path, *, live: bool) -> Iterator[Reporter]:
 
     The page is there while the context is. Raises OutputError where it cannot be served.
     """
-    if not live:
+    if not (live and answers()):
         yield told
         return
     from keyss.files.layout import usual_up

@@ -29,8 +29,9 @@ def evaluate(
     """Measure a hiding run on test views, with the keys and with wrong ones.
 
     Test views are photos that were not trained on or, of a model, renders of it. Beside each number
-    stands the baseline, which is that of the scene's plain model (3DGS with nothing hidden). Chance level is
-    what the stego model itself reaches against the secret: a wrong key should not get above it.
+    stands its bound, plain 3DGS of as many Gaussians and as many training steps, or where nobody fitted that
+    (`keyss hide --bound` does), the plain model that the scene started from. Chance level is what the stego
+    model itself reaches against the secret: a wrong key should not get above it.
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """

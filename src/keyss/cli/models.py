@@ -24,6 +24,7 @@ from keyss.cli.arguments import (
     Seed,
     SkipMissing,
     TensorBoard,
+    ViewsPerStep,
     Width,
     optional,
     preset_sizes,
@@ -38,6 +39,7 @@ def fit(
     preset: str = "default",
     iterations: Iterations = None,
     max_gaussians: MaxGaussians = None,
+    views_per_step: ViewsPerStep = None,
     width: Width = None,
     background: Background = None,
     skip_missing: SkipMissing = False,
@@ -58,6 +60,7 @@ def fit(
 
     from keyss import api
     from keyss.cli.live import watched
+    from keyss.cli.ranks import answers
     from keyss.cli.tables import print_files, print_fit
     from keyss.cli.tensorboard import reporter
     from keyss.fitting.config import PRESETS
@@ -68,7 +71,7 @@ def fit(
     with watched(reporter(out, tensorboard=tensorboard), scene, live=live) as told:
         api.fit(
             scene,
-            config=replace(PRESETS[preset], **schedule(iterations, max_gaussians, seed)),
+            config=replace(PRESETS[preset], **schedule(iterations, max_gaussians, seed, views_per_step)),
             width=width,
             background=background,
             skip_missing=skip_missing,
@@ -78,6 +81,8 @@ def fit(
             resume=resume,
             reporter=told,
         )
+    if not answers():
+        return
     print_fit(read_record(out / METRICS, FitMetrics))
     print_files(out, {"model.ply": "the model", "private": "its numbers, and what ran"})
 

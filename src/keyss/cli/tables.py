@@ -13,11 +13,14 @@ from keyss.progress import about
 
 if TYPE_CHECKING:
     from keyss._verbs.converting import Conversion
+    from keyss.comparison.record import Comparison
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
-    from keyss.runs.comparison import Comparison
     from keyss.runs.metrics import FitMetrics, HideMetrics
     from keyss.runs.planning import Plan
+
+
+_GAP = 2  # characters between columns
 
 
 class Console(RichConsole):
@@ -35,9 +38,15 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     plain = [metrics.baseline.cover, *metrics.baseline.secrets]
     sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
     differ = any(other not in (own, None) for own, other in sizes)
+    equal = metrics.baseline.equal or (False,) * len(names)  # of runs before it was known
+    shorter = [not same and other is not None for same, other in zip(equal, plain, strict=True)]
+    trained = metrics.steps or (None,) * len(names)
+    before = metrics.baseline.steps or (None,) * len(names)
     rows = [
-        _scene_row(name, own, other, size, others if differ else None)
-        for name, own, other, (size, others) in zip(names, found, plain, sizes, strict=True)
+        _scene_row(name, own, other, less, size, others if differ else None, steps, fewer)
+        for name, own, other, less, (size, others), steps, fewer in zip(
+            names, found, plain, shorter, sizes, trained, before, strict=True
+        )
     ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
@@ -51,15 +60,15 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
         (f"chance level of the secret{number}", level)
         for number, level in zip(numbers, metrics.chance_level, strict=True)
     ]
-    rows += [[name, f"{psnr:.2f}", "", "", "", "", ""] for name, psnr in psnrs]
-    heads = ("on test views", "PSNR", "SSIM", "baseline", "loss", "Gaussians", "baseline's")
+    rows += [[name, f"{psnr:.2f}", *[""] * 7] for name, psnr in psnrs]
+    heads = ("on test views", "PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")
     filled = [column for column in zip(heads, *rows, strict=True) if any(column[1:])]
-    table = _table(*(head for head, *_ in filled), texts=1)
+    table = new_table(*(head for head, *_ in filled), texts=1)
     for row in zip(*(cells for _, *cells in filled), strict=True):
         table.add_row(*row)
     console = console or Console()
     console.print(table)
-    for line in _explanations(metrics, names, differ):
+    for line in _explanations(metrics, names, differ, shorter):
         console.print(line, highlight=False, soft_wrap=True)
     for name, value in metrics.details.items():
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False)
@@ -67,7 +76,7 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
 
 def print_plan(plan: Plan) -> None:
     """Stages, room and estimates of a run that has not begun."""
-    table = _table("stage", "steps", "Gaussians", "time, about", texts=1)
+    table = new_table("stage", "steps", "Gaussians", "time, about", texts=1)
     for stage in plan.stages:
         steps = f"{stage.steps:,}" if stage.steps else ""
         table.add_row(stage.name, steps, f"{stage.gaussians:,}", about(stage.seconds))
@@ -92,7 +101,9 @@ def print_plan(plan: Plan) -> None:
     print("Nothing was written. Times are extrapolated from a few steps, and rough.")
 
 
-def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool) -> list[str]:
+def _explanations(
+    metrics: HideMetrics, names: Sequence[str], sizes_differ: bool, shorter: Sequence[bool]
+) -> list[str]:
     """A line for each term of the table."""
     rendered = [name for name, photos in zip(names, metrics.photos, strict=True) if not photos]
     views = "photos that were not trained on"
@@ -100,10 +111,19 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool
         views = "8-bit renders of the given models, as there are no photos"
     elif rendered:
         views += f"; for {', '.join(rendered)} 8-bit renders of the given model, as there are none"
-    lines = [f"Test views: {views}. PSNR, baseline and loss in dB."]
-    if metrics.baseline.cover or any(metrics.baseline.secrets):
-        size = "its own number of Gaussians" if sizes_differ else "as many Gaussians"
-        lines.append(f"Baseline: the scene's plain model (3DGS with nothing hidden), which has {size}.")
+    lines = [f"Test views: {views}. PSNR, bound, loss and start in dB."]
+    sizes = zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True)
+    near = all(other is None or abs(other - own) <= 0.02 * own for own, other in sizes)
+    size = "about as many Gaussians" if near else "its own number of Gaussians"
+    size = size if sizes_differ else "as many Gaussians"
+    plain = [metrics.baseline.cover, *metrics.baseline.secrets]
+    if any(each is not None and not less for each, less in zip(plain, shorter, strict=True)):
+        lines.append(f"Bound: plain 3DGS of {size} and as many training steps.")
+    if any(shorter):
+        lines.append(
+            f"Start: a plain model of {size} that was not trained as long, which is no bound; `keyss hide "
+            "--bound` fits plain 3DGS of as many Gaussians and as many training steps to compare with."
+        )
     if metrics.chance_level:
         lines.append(
             "Chance level: the stego model itself against the secret. No wrong key should get above."
@@ -115,7 +135,7 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], sizes_differ: bool
 
 def print_fit(metrics: FitMetrics) -> None:
     """The numbers of a plain fit."""
-    table = _table("PSNR", "SSIM", "Gaussians", "iterations", "seconds")
+    table = new_table("PSNR", "SSIM", "Gaussians", "iterations", "seconds")
     sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
     table.add_row(f"{metrics.psnr:.2f}", f"{metrics.ssim:.3f}", *sizes)
     Console().print(table)
@@ -123,7 +143,7 @@ def print_fit(metrics: FitMetrics) -> None:
 
 def print_steganalysis(found: Steganalysis) -> None:
     """How many images there are and how many of them are taken for stego images."""
-    table = _table("images", "flagged", "mean fusion")
+    table = new_table("images", "flagged", "mean fusion")
     mean = found.mean_fusion
     flagged = sum(row.flagged for row in found.rows)
     table.add_row(f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
@@ -131,27 +151,30 @@ def print_steganalysis(found: Steganalysis) -> None:
 
 
 def print_comparison(found: Comparison) -> None:
-    """The table of `comparison.md` in three parts."""
-    from keyss.runs.comparison import table
+    """The tables of `comparison.md`, in parts as wide as the terminal."""
+    from keyss.comparison.tables import LEGEND, impossible, not_measured, tables
 
-    heads, *rows = table(found)
-    for columns in (slice(1, 7), slice(8, 13), [7, *range(13, 16)]):  # as wide as terminals are
-        part = _table(heads[0], *_chosen(heads, columns), texts=1)
-        for row, each in zip(rows, found.methods, strict=True):
-            if each.error is None:
-                part.add_row(row[0], *_chosen(row, columns))
-        Console().print(part)
-    for each in found.methods:
-        if each.error is not None:
-            print(f"{each.name}: not possible: {each.error}")
-    print(
-        "Test views: photos that were not trained on. All methods had the same plain models, as many steps "
-        "in each training, and at most as many Gaussians."
-    )
+    console = Console()
+    for table in tables(found):
+        for columns in parts_within(console.width, [table.heads, *table.rows]):
+            part = new_table(*(table.heads[index] for index in columns), texts=1)
+            for row in table.rows:
+                part.add_row(*(row[index] for index in columns))
+            console.print(part)
+    for line in (*impossible(found), *not_measured(found), *LEGEND):
+        print(line)
 
 
-def _chosen(row: Sequence[str], columns: slice | Sequence[int]) -> list[str]:
-    return list(row[columns]) if isinstance(columns, slice) else [row[index] for index in columns]
+def parts_within(width: int, rows: Sequence[Sequence[str]]) -> list[list[int]]:
+    """Columns that go side by side in so many characters: the first one in each part, all in order."""
+    widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
+    parts: list[list[int]] = [[0]]
+    for index, own in enumerate(widths[1:], start=1):
+        taken = sum(widths[each] for each in parts[-1])
+        if len(parts[-1]) > 1 and taken + own - _GAP > width:
+            parts.append([0])
+        parts[-1].append(index)
+    return parts
 
 
 def print_verdicts(run: Path) -> None:
@@ -160,7 +183,7 @@ def print_verdicts(run: Path) -> None:
     from keyss.runs.audit_record import read_audit
 
     lines = verdicts(read_audit(run))
-    table = _table("measure", "measured", "baseline or control", "limit", "verdict", texts=5)
+    table = new_table("measure", "measured", "baseline or control", "limit", "verdict", texts=5)
     for column in (table.columns[0], table.columns[-1]):  # what is judged, and how; the rest may be long
         column.no_wrap = True
     for line in lines:
@@ -210,21 +233,35 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
 
 
 def _scene_row(
-    name: str, found: ImageQuality, plain: ImageQuality | None, gaussians: int, baselines: int | None
+    name: str,
+    found: ImageQuality,
+    plain: ImageQuality | None,
+    shorter: bool,  # was the plain model trained
+    gaussians: int,
+    others: int | None,  # Gaussians of the plain model
+    steps: int | None,
+    fewer: int | None,  # steps of the plain model
 ) -> list[str]:
-    """Cells of one scene: PSNR, SSIM, PSNR of its plain model, the loss, and the numbers of Gaussians."""
-    beside = ["", ""] if plain is None else [f"{plain.psnr:.2f}", f"{plain.psnr - found.psnr:.2f}"]
+    """Cells of one scene: PSNR, SSIM, bound and loss or start, numbers of Gaussians and of steps."""
+    beside = ["", "", ""]
+    if plain is not None:
+        loss = f"{plain.psnr - found.psnr:z.2f}"
+        beside = ["", "", f"{plain.psnr:.2f}"] if shorter else [f"{plain.psnr:.2f}", loss, ""]
+    trained = "" if steps is None else f"{steps:,}"
+    if shorter and steps is not None and fewer is not None:
+        trained += f" (start {fewer:,})"
     return [
         name,
         f"{found.psnr:.2f}",
         f"{found.ssim:.3f}",
         *beside,
         f"{gaussians:,}",
-        f"{baselines:,}" if baselines else "",
+        f"{others:,}" if others else "",
+        trained,
     ]
 
 
-def _table(*names: str, texts: int = 0) -> Table:
+def new_table(*names: str, texts: int = 0) -> Table:
     """An empty table with these columns, of which the first ones hold texts and the others numbers."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for index, name in enumerate(names):

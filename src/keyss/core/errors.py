@@ -53,6 +53,10 @@ class BackendError(KeyssError):
     exit_status = 6
 
 
+class OtherProcessError(BackendError):
+    """Of several processes that work on one run, another one has ended: that one knows why."""
+
+
 class KeyssWarning(UserWarning):
     """A result came out, but there is something to know about it; worded as messages of errors are."""
 

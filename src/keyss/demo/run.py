@@ -78,6 +78,7 @@ def run_demo(
             out / SCENES / COVER,
             [verbs.Secret(out / SCENES / SECRET, key)],
             method=options.with_fit(seed=seed),
+            bound=True,
             min_psnr=0,  # no result of a demo gets lost for being a quick one
             device=device,
             out=out,

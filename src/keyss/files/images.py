@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -76,6 +75,8 @@ def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]
 
 def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """[height, width, 3] by area averaging of a larger image."""
+    import cv2  # which takes a while, and reading models needs no pictures
+
     # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
@@ -87,6 +88,8 @@ def picture_name(camera: Camera) -> str:
 
 def png_bytes(image: Tensor) -> bytes:
     """A PNG file of an image [H, W, 3] uint8."""
+    import cv2
+
     return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
 
 

@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -105,6 +104,8 @@ class Undistortion:
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] undistorted, sampled bilinearly."""
+        import cv2  # models have no lenses, and importing it takes a while
+
         border = cv2.BORDER_REPLICATE
         straight = cv2.remap(image, self.map_x, self.map_y, cv2.INTER_LINEAR, borderMode=border)
         return np.asarray(straight, dtype=np.uint8)
@@ -142,6 +143,8 @@ def _source_coordinates(
     lens: Lens, new_K: NDArray[np.float64], size: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where each pixel of a pinhole image with `new_K` lies in the photo; all in OpenCV's coordinates."""
+    import cv2
+
     prepare = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
     maps = prepare(_opencv_K(lens), np.array(lens.distortion), np.eye(3), new_K, size, cv2.CV_32FC1)
     return np.asarray(maps[0], dtype=np.float32), np.asarray(maps[1], dtype=np.float32)

@@ -12,9 +12,15 @@ from torch import Tensor
 from keyss.core.alignment import align
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import Scene, View
 from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import ImageQuality, mean_psnr, quality, subsample_views
+from keyss.fitting.image_metrics import (
+    ImageQuality,
+    mean_psnr,
+    mean_quality,
+    subsample_views,
+    view_quality,
+)
 from keyss.keys import random_embeddings
 from keyss.methods.base import Opened
 from keyss.rendering import render
@@ -25,11 +31,17 @@ _FIDELITY_VIEWS = 8
 
 @dataclass(frozen=True)
 class BaselineQuality:
-    """Plain models of the same scenes; None where there is none of one."""
+    """Plain 3DGS of the same scenes; None where there is none of one.
+
+    A bound only where `equal`: of as many Gaussians and as many training steps. Else it is the plain model
+    from which the training of the scene went on.
+    """
 
     cover: ImageQuality | None
     secrets: tuple[ImageQuality | None, ...]
     gaussians: tuple[int | None, ...]  # of the plain models of the cover and of the secrets
+    steps: tuple[int | None, ...] = ()  # of their training; None: they were given, and it is not known
+    equal: tuple[bool, ...] = ()  # whether that is as long as the scene itself was trained, in all
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,15 @@ class RenderFidelity:
 
 
 @dataclass(frozen=True)
+class Shown:
+    """What a model shows on the test views of its scene, and the plain model beside it."""
+
+    quality: ImageQuality
+    plain: ImageQuality | None  # None, and what follows, where there is no plain model
+    fidelity: RenderFidelity | None
+
+
+@dataclass(frozen=True)
 class HidingQuality:
     """Cover and secrets on their test views, and what they are to be compared with."""
 
@@ -75,8 +96,11 @@ def measure_hiding(
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     baselines: Sequence[Gaussians | None],  # plain models of the scenes, each in its own frame
     *,
+    steps: Sequence[int | None] = (),  # of the baselines, and whether their scenes had as many
+    equal: Sequence[bool] = (),
     wrong_keys: int = WRONG_KEYS,
     seed: int = 0,
+    shown: Sequence[Shown] | None = None,  # of stego model and secrets, where it is known: they are not drawn
 ) -> HidingQuality:
     """Qualities of cover and secrets, of plain models, and what wrong keys show.
 
@@ -87,23 +111,23 @@ def measure_hiding(
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     cover, secrets = scenes[0], scenes[1:]
-    revealed = [each.reveal(stego).to(stego.device) for each in opened]
     wrong = random_embeddings(wrong_keys, torch.Generator().manual_seed(seed))
-    plain_cover, *plain_secrets = (
-        None if model is None else _quality(scene, model)
-        for scene, model in zip(scenes, baselines, strict=True)
-    )
+    if shown is None:
+        models = [stego, *(each.reveal(stego).to(stego.device) for each in opened)]
+        shown = list(map(show, models, baselines, scenes))
     return HidingQuality(
-        cover=_quality(cover, stego),
-        secrets=tuple(_quality(secret, model) for secret, model in zip(secrets, revealed, strict=True)),
+        cover=shown[0].quality,
+        secrets=tuple(each.quality for each in shown[1:]),
         baseline=BaselineQuality(
-            plain_cover,
-            tuple(plain_secrets),
+            shown[0].plain,
+            tuple(each.plain for each in shown[1:]),
             tuple(None if model is None else len(model) for model in baselines),
+            tuple(steps),
+            tuple(equal),
         ),
         wrong_key=what_wrong_keys_show(stego, opened, scenes, wrong),
         chance_level=tuple(
-            _psnr_in(secret, frame_of(each, secret, cover).inverse().apply_gaussians(stego))
+            _psnr_in(secret, stego, frame_of(each, secret, cover))
             for each, secret in zip(opened, secrets, strict=True)
         ),
     )
@@ -130,7 +154,7 @@ def what_wrong_keys_show(
         for embedding in embeddings:  # one model at a time: they are large
             shown = decode(stego, embedding)
             vs_cover[-1].append(_psnr_in(cover, shown))
-            vs_secrets[-1].append(_psnr_in(secret, frame.inverse().apply_gaussians(shown)))
+            vs_secrets[-1].append(_psnr_in(secret, shown, frame))
     means = [fmean(each) for each in zip(*vs_cover, strict=True)]
     return WrongKeys(len(embeddings), _range(means), tuple(map(_range, vs_secrets)))
 
@@ -143,25 +167,41 @@ def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
 
 
 @torch.no_grad()
-def render_fidelity(model: Gaussians, plain: Gaussians, scene: Scene) -> RenderFidelity:
-    """How near a model comes to the plain model of its scene, where no photo says anything about either."""
+def show(model: Gaussians, plain: Gaussians | None, scene: Scene) -> Shown:
+    """Both models on the test views of their scene; every picture is drawn once, and none is kept.
+
+    Fidelity is how near a model comes to the plain model, where no photo says anything about either.
+    """
     background = scene.background.to(model.device)
+    compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
+    qualities: list[ImageQuality] = []
+    plains: list[ImageQuality] = []
     errors, empty = [], []
-    for view in subsample_views(scene.test, _FIDELITY_VIEWS):
+    for view in scene.test:
+        photo = view.image.to(model.device).float() / 255
+        image = render(model, view.camera, background).clamp(0, 1)
+        qualities.append(view_quality(image, photo))
+        if plain is None:
+            continue
         expected = render(plain, view.camera, background).clamp(0, 1)
-        errors.append((render(model, view.camera, background).clamp(0, 1) - expected).square().mean())
-        empty.append((background - expected).square().mean())
+        plains.append(view_quality(expected, photo))
+        if id(view) in compared:
+            errors.append((image - expected).square().mean())
+            empty.append((background - expected).square().mean())
+    if plain is None:
+        return Shown(mean_quality(qualities), None, None)
     psnr, nothing = (-10 * torch.stack(each).mean().clamp_min(1e-12).log10() for each in (errors, empty))
-    return RenderFidelity(round(float(psnr), 2), round(float(nothing), 2))
+    fidelity = RenderFidelity(round(float(psnr), 2), round(float(nothing), 2))
+    return Shown(mean_quality(qualities), mean_quality(plains), fidelity)
 
 
 def _range(values: Sequence[float]) -> PsnrRange:
     return PsnrRange(fmean(values), min(values), max(values))
 
 
-def _quality(scene: Scene, model: Gaussians) -> ImageQuality:
-    return quality(model, scene.test, scene.background.to(model.device))
-
-
-def _psnr_in(scene: Scene, model: Gaussians) -> float:
-    return mean_psnr(model, scene.test, scene.background.to(model.device))
+def _psnr_in(scene: Scene, model: Gaussians, frame: Similarity | None = None) -> float:
+    """Of a model on the test views of a scene, from whose frame `frame` leads into the model's."""
+    views = scene.test
+    if frame is not None:
+        views = tuple(View(frame.apply_camera(view.camera), view.image) for view in views)
+    return mean_psnr(model, views, scene.background.to(model.device))

@@ -25,6 +25,7 @@ HIGHEST = 60.0  # degrees of elevation, and of depression
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY = 8
 _LARGE, _MOST = 0.95, 10.0  # a weight's quantile, and what the largest may be of it
+_SAMPLE = 200_000  # Gaussians that tell where a model lies
 
 
 def is_model(source: str | Path | Gaussians) -> bool:
@@ -98,8 +99,9 @@ def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
 
     Gaussians count by opacity and size, a huge one no more than ten typical large ones. The radius holds nine
     tenths of them, but is at most three times that of the nearer half: around an object, that is all of it;
-    in an unbounded scene, its middle.
+    in an unbounded scene, its middle. Of large models every n-th Gaussian is looked at.
     """
+    model = model[:: max(1, len(model) // _SAMPLE)]
     scales = model.scales.sort(dim=1).values
     weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu().nan_to_num(0.0)
     weight = weight.clamp_max(_MOST * _quantile(weight, torch.ones(len(model)), _LARGE))

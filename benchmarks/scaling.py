@@ -1,0 +1,221 @@
+"""What work takes as it grows: measured sizes, a model fitted to them, and a size four times as large.
+
+    python benchmarks/scaling.py                # a quarter of an hour on 2 cores
+    python benchmarks/scaling.py --only step    # of one kind of work
+
+The model is a sum of costs that are not negative: of a call, of each Gaussian, pixel, secret or photo, by
+non-negative least squares of relative errors. `predicted` is what it says of the largest size, which it was
+not fitted to, four times as large as any of those in everything that grows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.optimize import nnls
+
+from benchmark_record import processor_name
+from keyss import read_model, write_model
+from keyss.channels.low_bits import LOW_BITS
+from keyss.core import Gaussians
+from keyss.files.images import read_image
+from keyss.fitting.config import FitConfig
+from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
+from keyss.methods.records.embedding import embed_models
+from keyss.rendering import render
+from keyss.runs.revealing import reveal_model
+from rasterizer import camera_before, load_kernels, made_up
+
+Size = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Work:
+    """A kind of work, the sizes it is measured at, and what grows with them."""
+
+    name: str
+    terms: tuple[str, ...]  # of a size; a constant is always there
+    sizes: tuple[Size, ...]
+    larger: Size  # four times the largest
+    seconds: Callable[[Size], float]
+
+
+def best_of(repeats: int, call: Callable[[], object]) -> float:
+    """Seconds of the fastest, after one that is not counted."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return min(times[1:])
+
+
+def step_seconds(size: Size) -> float:
+    """A training step: render, loss, backward, Adam."""
+    torch.set_num_threads(int(size.get("threads", torch.get_num_threads())))
+    model = made_up(int(size["Gaussians"]))
+    width = round((size["pixels"] * 1.5) ** 0.5)
+    camera = camera_before(model.means, width, round(size["pixels"] / width))
+    with torch.no_grad():
+        target = Target.of(render(model, camera).clamp(0, 1))
+    parameters = to_parameters(model, "cpu")
+    optimizers = make_optimizers(parameters, FitConfig(), 1.0)
+
+    def step() -> None:
+        photometric_loss(render(to_gaussians(parameters), camera), target, 0.2).backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+    return best_of(5, step)
+
+
+def picture_seconds(size: Size) -> float:
+    """A picture without gradients."""
+    model = made_up(int(size["Gaussians"]))
+    width = round((size["pixels"] * 1.5) ** 0.5)
+    camera = camera_before(model.means, width, round(size["pixels"] / width))
+    with torch.no_grad():
+        return best_of(5, lambda: render(model, camera))
+
+
+def trained(count: int, seed: int) -> Gaussians:
+    """Made up, with low bits that look trained."""
+    generator = torch.Generator().manual_seed(seed)
+    model = made_up(count)
+    return model.map(lambda each: each * (1 + 1e-3 * torch.randn(each.shape, generator=generator)))
+
+
+def carry_seconds(size: Size) -> float:
+    """From files to a file: secrets of a tenth of the cover, all together, are carried, and opened again."""
+    count, secrets = int(size["Gaussians"]), int(size.get("secrets", 1))
+    with tempfile.TemporaryDirectory() as name:
+        cover, secret = Path(name) / "cover.ply", Path(name) / "secret.ply"
+        write_model(cover, trained(count, 0))
+        write_model(secret, trained(int(size.get("each", count)), 1))
+        keys = [f"key {number} of the benchmark, 9fK2" for number in range(secrets)]
+
+        def carry() -> None:
+            prepared, hidden = LOW_BITS.prepare(read_model(cover)), read_model(secret)
+            stego = embed_models(prepared, keys, [hidden] * secrets, [len(hidden)] * secrets, "carry").stego
+            write_model(Path(name) / "stego.ply", stego)
+
+        return best_of(1, carry)
+
+
+def reveal_seconds(size: Size) -> float:
+    """From file to file."""
+    count = int(size["Gaussians"])
+    with tempfile.TemporaryDirectory() as name:
+        key, stego = "the key of the benchmark, 9fK2", Path(name) / "stego.ply"
+        hidden = trained(count, 1)
+        prepared = LOW_BITS.prepare(trained(count, 0))
+        write_model(stego, embed_models(prepared, [key], [hidden], [count], "carry").stego)
+
+        def reveal() -> None:
+            found = reveal_model(read_model(stego), key, device=torch.device("cpu"))
+            write_model(Path(name) / "secret.ply", found.gaussians)
+
+        return best_of(1, reveal)
+
+
+def photo_seconds(size: Size) -> float:
+    """Reading JPEG photos, as scenes do."""
+    count, pixels = int(size["photos"]), int(size["pixels"])
+    width = round((pixels * 1.5) ** 0.5)
+    with tempfile.TemporaryDirectory() as name:
+        noise = np.random.default_rng(0).integers(0, 255, (pixels // width // 8, width // 8, 3), np.uint8)
+        picture = Image.fromarray(noise).resize((width, pixels // width))
+        paths = [Path(name) / f"{index}.jpg" for index in range(count)]
+        for path in paths:
+            picture.save(path, quality=95)
+        return best_of(1, lambda: [read_image(path, np.zeros(3, np.float32)) for path in paths])
+
+
+COUNTS = (10_000.0, 40_000.0, 160_000.0)
+DRAWN = tuple({"Gaussians": gaussians, "pixels": pixels} for gaussians in COUNTS for pixels in COUNTS)
+LARGER = {"Gaussians": 640_000.0, "pixels": 640_000.0}
+MODELS = tuple({"Gaussians": float(count)} for count in (50_000, 100_000, 200_000, 400_000))
+WORKS = (
+    Work("step", ("Gaussians", "pixels"), DRAWN, LARGER, step_seconds),
+    Work("picture", ("Gaussians", "pixels"), DRAWN, LARGER, picture_seconds),
+    Work("carry", ("Gaussians",), MODELS, {"Gaussians": 1_600_000}, carry_seconds),
+    Work("reveal", ("Gaussians",), MODELS, {"Gaussians": 1_600_000}, reveal_seconds),
+    Work(
+        "secrets",
+        ("secrets",),
+        tuple({"secrets": float(k), "Gaussians": 200_000.0, "each": 2_000.0} for k in (1, 2, 3, 4)),
+        {"secrets": 16, "Gaussians": 200_000, "each": 2_000},
+        carry_seconds,
+    ),
+    Work(
+        "photos",
+        ("photos", "photos x pixels"),
+        tuple(
+            {"photos": float(n), "pixels": p, "photos x pixels": n * p}
+            for n in (4, 8, 16)
+            for p in (130_000.0, 520_000.0)
+        ),
+        {"photos": 64, "pixels": 2_080_000, "photos x pixels": 64 * 2_080_000},
+        photo_seconds,
+    ),
+)
+
+
+def fitted(sizes: list[Size], terms: tuple[str, ...], seconds: list[float]) -> dict[str, float]:
+    """Seconds of a call, and for each unit of the terms; none is negative."""
+    rows = np.array([[1.0, *(size[term] for term in terms)] for size in sizes]) / np.array(seconds)[:, None]
+    scale = rows.max(0)
+    found, _ = nnls(rows / scale, np.ones(len(sizes)))
+    return dict(zip(("a call", *terms), found / scale, strict=True))
+
+
+def predicted(costs: dict[str, float], size: Size) -> float:
+    return sum(cost * size.get(term, 1.0) for term, cost in costs.items())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", nargs="+", choices=[work.name for work in WORKS], help="these kinds of work"
+    )
+    options = parser.parse_args()
+    load_kernels()
+    print(f"{processor_name()}, {torch.get_num_threads()} threads\n")
+    print("| work | seconds of a call, and of each million | misfit | predicted | measured | ratio |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for work in WORKS:
+        if options.only and work.name not in options.only:
+            continue
+        seconds = [work.seconds(size) for size in work.sizes]
+        costs = fitted(list(work.sizes), work.terms, seconds)
+        pairs = zip(work.sizes, seconds, strict=True)
+        misfit = max(abs(predicted(costs, size) / took - 1) for size, took in pairs)
+        expected, took = predicted(costs, work.larger), work.seconds(work.larger)
+        parts = [f"{costs['a call']:.3g}", *(f"{1e6 * costs[term]:.3g} ({term})" for term in work.terms)]
+        print(
+            f"| {work.name} | {', '.join(parts)} | {misfit:.0%} | {expected:.3g} | {took:.3g} | "
+            f"{took / expected:.2f} |",
+            flush=True,
+        )
+    if not options.only or "step" in options.only:
+        for size in (DRAWN[4], DRAWN[-1]):
+            one, two = (step_seconds(size | {"threads": threads}) for threads in (1, 2))
+            print(
+                f"\nstep of {size}: {one:.4f} s on 1 thread, {two:.4f} s on 2, {one / two:.2f} times as fast"
+            )
+
+
+if __name__ == "__main__":
+    main()
