@@ -39,8 +39,15 @@ OLDEST_PIP := $(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-
 OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
 
 FAST := -m "not slow and not cuda and not real"
-# Files go to processes whole, since their tests share what is expensive; what measures time runs alone.
-PARALLEL := -n $(JOBS) --dist loadfile
+# A process that is done takes the second half of what another has still to do: neighbours, which share what is
+# expensive, stay together but for a few. What measures time runs alone.
+PARALLEL := -n $(JOBS) --dist worksteal
+# Each has one thread: those of BLAS and OpenMP wait for each other busily where others need the cores. Tests of
+# threads ask for several.
+test coverage: export OMP_NUM_THREADS = 1
+
+# Where it is set, each of the hundreds of processes that tests start compiles all of keyss.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test web test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
   lint format docs pictures venv clean \

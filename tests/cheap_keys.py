@@ -37,9 +37,8 @@ def pytest_sessionstart() -> None:
     derivation.hash_secret_raw = hash_secret_raw
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Before fixtures of any scope: those that are shared must not be mixed."""
+def choose_costs(item: pytest.Item) -> None:
+    """For the test and its fixtures from now on."""
     global _cheap
     _cheap = item.get_closest_marker("argon2") is None
 

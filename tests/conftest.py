@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
+import uncompiled  # noqa: F401  before any test module imports gsply
 from alone import pytest_runtest_protocol  # noqa: F401  hook
-from cheap_keys import pytest_runtest_setup, pytest_sessionstart  # noqa: F401  hooks
+from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
+from child_coverage import count_or_not
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 # What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
-# it; on other machines it goes on searching.
-settings.register_profile("ci", derandomize=True)
-if "CI" in os.environ:
-    settings.load_profile("ci")
+# it; on other machines it goes on searching. How long an example takes depends on what else a machine does.
+settings.register_profile("tests", derandomize="CI" in os.environ, deadline=None)
+settings.load_profile("tests")
+
+# A script that runs the tests in its background has them ignore Ctrl-C, which many of them send.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Before fixtures of any scope: those that are shared must not be mixed."""
+    choose_costs(item)
+    count_or_not(item)
 
 
 @pytest.fixture(scope="session")

@@ -80,11 +80,21 @@ def test_metrics_have_their_shape(run: Path) -> None:
     assert set(metrics) == {
         *("method", "cover", "secrets", "baseline", "wrong_key", "chance_level", "gaussians"),
         *("photos", "against_plain"),
-        *("secret_gaussians", "iterations", "seconds", "width", "seed", "details", "version", "keyss"),
+        *(
+            "secret_gaussians",
+            "iterations",
+            "steps",
+            "seconds",
+            "width",
+            "seed",
+            "details",
+            "version",
+            "keyss",
+        ),
     }
     assert metrics["method"] == "learned"
     assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim"}
-    assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians"}
+    assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians", "steps", "equal"}
     assert metrics["photos"] == [True, True]
     assert metrics["wrong_key"] is None  # there is no decoder that a wrong one could be tried on
     assert len(metrics["chance_level"]) == 1

@@ -17,7 +17,8 @@ from channels.low_bits.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels.low_bits import LOW_BITS
 from keyss.cli import commands, main
-from keyss.cli.hiding import hide_with_options
+from keyss.cli.hiding import hide
+from keyss.cli.hiding_options import hide_with_options
 from keyss.core.errors import KeyssError
 from keyss.fitting.loop import SilentReporter
 from keyss.keys import DerivedKey, KeyDerivation
@@ -98,7 +99,7 @@ def test_nothing_that_is_written_or_said_holds_the_key(
 
 
 def test_no_command_takes_a_key_as_an_argument() -> None:
-    hiding = [hide_with_options(["hide", "--method", name]) for name in METHODS]
+    hiding = [hide_with_options(hide, ["hide", "--method", name]) for name in METHODS]
     for command in (*commands.ALL, *hiding):
         for name, hint in get_type_hints(command, include_extras=False).items():
             if "key" in name and name not in ("wrong_keys", "key_encoder"):

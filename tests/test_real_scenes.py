@@ -23,25 +23,26 @@ def run(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Bonsai hides fox at width 200 with 20,000 Gaussians."""
     out = tmp_path_factory.mktemp("runs") / "hidden"
     secret = Secret(real_data / "fox", "a key for a fox")
-    keyss.hide(real_data / "bonsai", [secret], method=CONFIG, width=200, out=out)
+    keyss.hide(real_data / "bonsai", [secret], method=CONFIG, width=200, bound=True, out=out)
     return out
 
 
 def test_bonsai_hides_fox_without_loss(run: Path) -> None:
-    """Measured: the cover is its baseline, the secret 0.8 dB better."""
+    """Against plain 3DGS of as many steps, 6,000 for the fox; measured: 31.7 dB beside 31.5."""
     metrics = keyss.evaluate(run, ["a key for a fox"])
     (secret,), (plain,) = metrics.secrets, metrics.baseline.secrets
     assert metrics.seconds < 10 * 60
     assert metrics.cover.psnr > metrics.baseline.cover.psnr - 0.01
-    assert secret.psnr > plain.psnr - 0.2
+    assert metrics.baseline.steps == metrics.steps == (3000, 6000)
+    assert secret.psnr > plain.psnr - 0.5
     assert metrics.wrong_key is None  # they open nothing
 
 
 def test_plain_models_are_as_good_as_measured(run: Path) -> None:
-    """Fox: 30.5, 30.9 and 30.7 dB with seeds 0 to 2."""
+    """Fox: 30.5, 30.9 and 30.7 dB with seeds 0 to 2 and 3,000 steps, 31.5 with 6,000."""
     baseline = keyss.evaluate(run, ["a key for a fox"]).baseline
     assert baseline.cover.psnr > 26.1
-    assert baseline.secrets[0].psnr > 30.2
+    assert baseline.secrets[0].psnr > 31.0
 
 
 def test_an_audit_finds_nothing_of_the_fox(run: Path) -> None:
@@ -74,7 +75,7 @@ def test_other_pairs_do_not_collapse(real_data: Path, cover: str, secret: str) -
     """White and empty backgrounds, scenes without points, half rings and full domes."""
     config = CONFIG.with_fit(iterations=1000, max_gaussians=10_000)
     secrets = [Secret(real_data / secret, "key")]
-    metrics = keyss.hide(real_data / cover, secrets, method=config, width=160).metrics
+    metrics = keyss.hide(real_data / cover, secrets, method=config, width=160, bound=True).metrics
     assert metrics.cover.psnr > metrics.baseline.cover.psnr - 0.01
     assert metrics.secrets[0].psnr > metrics.baseline.secrets[0].psnr - 1
 

@@ -11,6 +11,7 @@ import pytest
 from cli.said import SMALL, Said
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.cli import main
+from shared import made_once
 
 
 @pytest.fixture
@@ -35,7 +36,10 @@ def keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -
 @pytest.fixture(scope="session")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scenes `a` and `b`, a key file, and `hidden`: b hidden in a; tests must not change it."""
-    folder = tmp_path_factory.mktemp("world")
+    return made_once(tmp_path_factory, "world", _make_world)
+
+
+def _make_world(folder: Path) -> None:
     write_blender(folder / "a", count=3, channels=3)
     write_nerfstudio(folder / "b", count=4)
     (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
@@ -53,4 +57,3 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     status = main(["hide", *map(str, arguments), "-o", str(folder / "hidden"), *SMALL])
     assert status == 0
-    return folder

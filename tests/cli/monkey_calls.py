@@ -95,10 +95,8 @@ class Caller:
         return [f"{flag}={self.pick(values)}"]
 
     def models(self) -> list[str]:
-        made = [str(path) for path in Path().glob("out-*/publish/stego.ply")]
-        made += [str(path) for path in Path().glob("out-*/**/*.ply")] + list(
-            map(str, Path().glob("made-*.ply"))
-        )
+        patterns = ("out-*/publish/stego.ply", "out-*/**/*.ply", "made-*.ply")
+        made = [str(path) for pattern in patterns for path in sorted(Path().glob(pattern))]
         return ["in/cover.ply", "in/secret.ply", *made]
 
     def anything(self) -> list[str]:
@@ -168,7 +166,7 @@ class Caller:
         return [each for _ in range(count) for each in ("--key-file", self.mostly(good, KEY_FILES, share))]
 
     def stego(self) -> str:
-        made = [str(path) for path in Path().glob("out-*/publish/*.ply")]
+        made = [str(path) for path in sorted(Path().glob("out-*/publish/*.ply"))]
         return self.mostly(made, [*self.models(), *self.anything()], 0.75)
 
     def reveal(self) -> Call:
@@ -237,7 +235,7 @@ class Caller:
         return Call(arguments, run=run)
 
     def report(self) -> Call:
-        audited = [str(path.parents[2]) for path in Path().glob("out-*/private/audit/audit.json")]
+        audited = [str(path.parents[2]) for path in sorted(Path().glob("out-*/private/audit/audit.json"))]
         run = self.mostly(audited or self.runs(), self.anything(), 0.85)
         return Call(["report", run], run=run)
 

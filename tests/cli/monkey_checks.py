@@ -15,7 +15,7 @@ from pathlib import Path
 from cli.monkey_calls import FOLDERS_OUT, Call
 from keyss import api
 from keyss.files.models import read_model
-from keyss.measure.hiding import render_fidelity
+from keyss.measure.hiding import show
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import open_run
 
@@ -162,7 +162,7 @@ class Checker:
             run.opened, run.scenes(train_pictures=False)[1:], run.plain_models()[1:], strict=True
         ):
             must(plain is not None, "no plain model")
-            fidelity = render_fidelity(opened.reveal(run.stego), plain, scene)
+            fidelity = show(opened.reveal(run.stego), plain, scene).fidelity
             must(fidelity.psnr >= least, f"exit status 0 and {fidelity.psnr} dB, at least {least} expected")
             dark = min(fidelity.nothing + 3, 40)
             must(

@@ -78,6 +78,7 @@ class TestArguments:
             "background": (1.0, 0.5, 0.0),
             "skip_missing": False,
             "cover_model": Path("m.ply"),
+            "bound": False,
             "min_psnr": 20.0,
             "device": "cpu",
             "out": Path("out"),

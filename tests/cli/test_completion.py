@@ -25,7 +25,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("words", "completed"),
     [
         (["keyss", ""], {*COMMANDS, "-h", "--help"}),
-        (["keyss", "re"], {"reveal", "render", "report"}),
+        (["keyss", "re"], {"reveal", "render", "report", "reproduce"}),
         (["keyss", "hide", "--secret"], {"--secret", "--secret-file", "--secret-model"}),
         (["keyss", "hide", "--start"], {"--start"}),
         (["keyss", "fit", "x", "--preset", ""], set(PRESETS)),

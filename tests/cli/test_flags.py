@@ -15,7 +15,7 @@ from keyss.cli.flags import as_flags
 from keyss.core.errors import KeyssWarning, UsageError
 
 SOURCE = Path(__file__).parents[2] / "src" / "keyss"
-OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model"}
+OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model", "download"}
 # Options of other programs, and whole commands, which a page may quote.
 QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
 
@@ -31,6 +31,7 @@ QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
         ("`decoy=False`", "no --decoy"),
         ("give `sh_degree`, `publish`", "give --sh-degree, --publish"),
         ("`key`, `secrets` and `model`", "--key-file, --secret and --secret-model"),
+        ("`download_scenes` fetches it", "--download fetches it"),
         # What is no option of the command stays, whatever it is.
         ("`chmod 600` and `f_dc_0` and `reporter`", "`chmod 600` and `f_dc_0` and `reporter`"),
         ("`keyss keygen -o FILE`", "`keyss keygen -o FILE`"),

@@ -52,8 +52,8 @@ class TestHelp:
             "view",
             "export-html",
         ]
-        judging = ["sweep", "evaluate", "audit", "report", "compare", "steganalyze", "info", "demo", "doctor"]
-        assert [*making, *judging, "completion", "version"] == COMMANDS
+        judging = ["sweep", "evaluate", "audit", "report", "compare", "reproduce", "steganalyze", "info"]
+        assert [*making, *judging, "demo", "doctor", "completion", "version"] == COMMANDS
 
     @pytest.mark.parametrize("command", COMMANDS)
     def test_shows_an_example(self, keyss: Callable[..., Said], command: str) -> None:
@@ -65,9 +65,10 @@ class TestHelp:
     @pytest.mark.parametrize("command", COMMANDS)
     def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
         out = keyss(command, "--help").out
-        assert ("--seed" in out) == (command in {"fit", "hide", "evaluate", "audit", "compare", "demo"})
+        random = {"fit", "hide", "evaluate", "audit", "compare", "reproduce", "demo"}
+        assert ("--seed" in out) == (command in random)
         computing = {"fit", "hide", "reveal", "verify", "render", "convert", "evaluate", "audit", "demo"}
-        computing |= {"doctor", "compare"}
+        computing |= {"doctor", "compare", "reproduce"}
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 

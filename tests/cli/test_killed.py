@@ -39,7 +39,7 @@ class Command:
 
     arguments: tuple[str, ...]
     again: str  # option with which it is repeated
-    in_run: bool = False  # works in a copy of a finished run
+    in_run: bool = False  # works in a copy of what `hide` comes to
     results: tuple[str, ...] = field(default=())  # files that must be the same to the byte
     numbers: tuple[str, ...] = field(default=())  # JSON that must be the same but for seconds
 
@@ -121,7 +121,7 @@ def result_of(command: Command, out: Path, run: Path) -> list[object]:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes, a key and a finished run."""
+    """Two scenes and a key."""
     from files.scene_files import write_blender, write_nerfstudio
 
     folder = tmp_path_factory.mktemp("killed")
@@ -129,8 +129,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_nerfstudio(folder / "b", count=4)
     (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
     (folder / "key.txt").chmod(0o600)
-    hide = [part.replace("OUT", "finished") for part in COMMANDS["hide"].arguments]
-    assert subprocess.run([*PROGRAM, *hide], cwd=folder, capture_output=True, check=False).returncode == 0
     return folder
 
 
@@ -139,6 +137,7 @@ class Undisturbed:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.found = folder, dict[str, tuple[list[object], float]]()
+        self("hide")
 
     def __call__(self, name: str) -> tuple[list[object], float]:
         if name not in self.found:
@@ -162,7 +161,7 @@ def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]
     place.mkdir()
     out, run = place / ("out.ply" if name == "reveal" else "out"), place / "run"
     if COMMANDS[name].in_run:
-        shutil.copytree(folder / "finished", run)
+        shutil.copytree(folder / "hide-undisturbed" / "out", run)
     parts = [part.replace("OUT", str(out)).replace("RUN", str(run)) for part in COMMANDS[name].arguments]
     return out, run, parts
 

@@ -11,7 +11,7 @@ from cli.monkey import Monkey
 
 def test_some_random_calls(tmp_path: Path) -> None:
     monkey = Monkey(tmp_path, seed=11)
-    monkey.play(40)
+    monkey.play(20)
     assert {0, 2, 4, 5} <= monkey.statuses.keys()
 
 

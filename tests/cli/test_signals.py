@@ -14,6 +14,8 @@ import pytest
 
 from cli.said import PROGRAM, Said, assert_refused, listing
 
+pytestmark = pytest.mark.counted
+
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
 
 
@@ -124,6 +126,7 @@ main()
 """
 
 
+@pytest.mark.counted
 @pytest.mark.parametrize(
     ("body", "said"),
     [
@@ -144,6 +147,7 @@ def test_ctrl_c_inside_a_command(body: str, said: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, said, "keyss: interrupted\n")
 
 
+@pytest.mark.counted
 def test_what_is_ignored_stays_ignored() -> None:
     """As `nohup` and scripts have it that run a command in the background."""
     program = IN_A_COMMAND.format(body="[os.kill(os.getpid(), s) for s in (2, 1)]; sys.exit(0)")

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from cli.said import METRICS
 from keyss.cli.tables import print_hiding
+from keyss.fitting.image_metrics import ImageQuality
 from keyss.measure.hiding import BaselineQuality, PsnrRange, WrongKeys
 from keyss.runs.metrics import HideMetrics
 
@@ -26,17 +27,17 @@ class TestNumbers:
     def test_a_row_for_each_and_what_the_method_adds(self) -> None:
         rows = self.table(METRICS)
         assert rows[:4] == [
-            ["on test views", "PSNR", "SSIM", "baseline", "loss", "Gaussians"],
-            ["cover", "30.00", "0.500", "30.50", "0.50", "1,234"],
-            ["secret", "20.00", "0.250", "567"],
+            ["on test views", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
+            ["cover", "30.00", "0.500", "30.50", "0.50", "1,234", "10"],
+            ["secret", "20.00", "0.250", "567", "20"],
             ["chance level of the secret", "9.00"],
         ]
         assert rows[-2:] == [["carriers: 1,000"], ["bits per gaussian: 568, 600"]]
 
     def test_columns_that_nothing_fills_are_left_out(self) -> None:
         rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)), details={}))
-        assert rows[0] == ["on test views", "PSNR", "SSIM", "Gaussians"]
-        assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
+        assert rows[0] == ["on test views", "PSNR", "SSIM", "Gaussians", "steps"]
+        assert rows[1] == ["cover", "30.00", "0.500", "1,234", "10"]
 
     def test_wrong_keys_where_there_is_a_decoder(self) -> None:
         two = replace(
@@ -46,6 +47,7 @@ class TestNumbers:
             photos=(True, True, True),
             against_plain=METRICS.against_plain + METRICS.against_plain[1:],
             secret_gaussians=(5, 6),
+            steps=(10, 20, 20),
             chance_level=(9.0, 8.0),
             wrong_key=WrongKeys(
                 7, PsnrRange(28.0, 27.0, 29.0), (PsnrRange(8.0, 7.0, 9.5), PsnrRange(6.0, 5.0, 7.5))
@@ -68,13 +70,11 @@ class TestNumbers:
 
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)
-        assert ["Test views: photos that were not trained on. PSNR, baseline and loss in dB."] in rows
-        assert any(
-            "plain model (3DGS with nothing hidden), which has as many Gaussians" in row[0] for row in rows
-        )
+        assert ["Test views: photos that were not trained on. PSNR, bound, loss and start in dB."] in rows
+        assert ["Bound: plain 3DGS of as many Gaussians and as many training steps."] in rows
         assert any(row[0].startswith("Chance level: the stego model itself") for row in rows)
         alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
-        assert not any(row[0].startswith("Baseline:") for row in self.table(alone))
+        assert not any(row[0].startswith(("Bound:", "Start:")) for row in self.table(alone))
 
     def test_renders_of_models_are_not_called_photos(self) -> None:
         rows = self.table(replace(METRICS, photos=(False, False)))
@@ -84,8 +84,21 @@ class TestNumbers:
         assert "photos that were not trained on; for secret 8-bit renders of the given model" in line
 
     def test_a_baseline_of_another_size_has_its_number_of_gaussians_beside_it(self) -> None:
-        baseline = BaselineQuality(METRICS.baseline.cover, METRICS.baseline.secrets, (152_746, None))
+        baseline = replace(METRICS.baseline, gaussians=(152_746, None))
         rows = self.table(replace(METRICS, baseline=baseline))
-        assert rows[0][-2:] == ["Gaussians", "baseline's"]
-        assert rows[1][-2:] == ["1,234", "152,746"]
-        assert not any("as many" in cell for row in rows for cell in row)
+        assert rows[0][-3:] == ["Gaussians", "plain's", "steps"]
+        assert rows[1][-3:] == ["1,234", "152,746", "10"]
+        assert not any("as many Gaussians" in cell for row in rows for cell in row)
+
+    def test_a_plain_model_of_fewer_steps_is_no_bound(self) -> None:
+        shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
+        rows = self.table(replace(METRICS, baseline=shorter))
+        assert rows[0] == [
+            *("on test views", "PSNR", "SSIM", "bound", "loss", "start"),
+            *("Gaussians", "steps"),
+        ]
+        assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20 (start 10)"]
+        assert any(row[0].startswith("Start:") and "is no bound" in row[0] for row in rows)
+        old = replace(shorter, steps=(), equal=())  # a record that knows nothing of steps
+        rows = self.table(replace(METRICS, baseline=old, steps=()))
+        assert rows[0] == ["on test views", "PSNR", "SSIM", "start", "Gaussians"]

@@ -18,6 +18,7 @@ from keyss.files.ply import write_ply
 from keyss.measure import speed as module
 from keyss.measure.robustness.survival import Reopened, Reopener
 from keyss.measure.speed import FileSize, ReaderResult, readers, render_time, reveal_seconds, speed
+from keyss.methods.base import Opened
 from keyss.methods.registry import open_model
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians, tiny_scene
@@ -65,8 +66,9 @@ def test_the_ratio_is_that_of_the_times_whatever_else_the_machine_does(
     assert {tuple(drawn[i : i + 2]) for i in range(0, len(drawn), 2)} == {(30, 20), (20, 30)}
 
 
-def test_a_model_takes_longer_than_a_hundredth_of_it() -> None:
-    """Really drawn; three thousand Gaussians against thirty, so that no other work makes up for it."""
+def test_a_model_takes_longer_than_a_hundredth_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Really drawn, in time of this process, which others do not take."""
+    monkeypatch.setattr(time, "perf_counter", time.process_time)
     scene, model = tiny_scene(), random_gaussians(3000)
     found = render_time("m", model, model[:30], scene)
     assert found.ratio > 1
@@ -147,9 +149,14 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     cover, secret = trained_like(1000), trained_like(300, seed=1)
     write_ply(tmp_path / "stego.ply", embed(cover, [(KEY, secret)]))
     steps: list[tuple[int, int, str]] = []
+
+    def slowly(model: Gaussians, key: str) -> Opened:
+        time.sleep(0.05)
+        return open_model(model, key)
+
     found = speed(
         tmp_path / "stego.ply",
-        [Reopener(KEY, open_model)],
+        [Reopener(KEY, slowly)],
         scenes,
         [cover, secret],
         rounds=2,
@@ -162,7 +169,7 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     assert [(each.model, each.gaussians) for each in found.render] == [("stego", 1000), ("secret 1", 300)]
     assert len(found.reveal_seconds) == 1
-    assert 0.01 < found.reveal_seconds[0] < 60
+    assert 0.05 <= found.reveal_seconds[0] < 60
     assert {(each.file, each.reader) for each in found.readers if each.loads} == {
         (model, reader) for model in ("stego", "secret 1") for reader in ("plyfile", "gsply")
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 
 import torch
 
@@ -22,3 +23,16 @@ def digest_on_threads(threads: int) -> str:
     """That of one random scene."""
     torch.set_num_threads(threads)
     return digest(random_scene(count=300, width=60, height=70))
+
+
+def check_on_generic_processor(names: Sequence[str]) -> str:
+    """Holds scenes to the dense reference; returns for which processor, without extras, the kernels are."""
+    from numba.core.registry import cpu_target
+
+    from rendering.scenes import SCENES
+    from rendering.test_against_dense_reference import check
+
+    for name in names:
+        check(SCENES[name]())
+    _, processor, features = cpu_target.target_context.codegen().magic_tuple()
+    return f"{processor} {features}".strip()

@@ -29,8 +29,8 @@ KEYS = ("the key of a treasure", "the key of a map")
 POINTS = replace(CONFIG, start="points", hidden=(8, 8), branch=8)
 
 
-def audited_run(root: Path) -> Path:
-    """Two secrets in a garden, 40 x 30 pixels, audited by all parts; one tool for conversions is missing."""
+def audited_run(root: Path) -> None:
+    """`run`: two secrets in a garden, 40 x 30 pixels, audited by all parts; one converter is missing."""
     scenes = [
         write_nerfstudio(root / name, tiny_scene(seed))
         for seed, name in enumerate(("garden", "treasure", "map"))
@@ -54,7 +54,6 @@ def audited_run(root: Path) -> Path:
         patch.setattr(survival, "default_changes", lambda *_, **__: _few_changes())
         patch.setenv("KEYSS_SPLAT_TRANSFORM", str(root / "nowhere"))
         audit(root / "run", KEYS, controls=2)
-    return root / "run"
 
 
 def _few_changes() -> list[Change]:
@@ -74,10 +73,11 @@ def found_in(run: Path) -> dict[str, Any]:
 
 
 def run_with(run: Path, folder: Path, data: object, *, published: bool = False) -> Path:
-    """A copy of a run's audit in a new folder, with other JSON; `published`: of what is published, too."""
+    """A copy of a run's audit in a folder, with other JSON; `published`: of what is published, too."""
     if published:
         shutil.copytree(run / "publish", folder / "publish")
-    shutil.copytree(run / "private" / "audit", folder / "private" / "audit", dirs_exist_ok=True)
+    if not (folder / "private" / "audit").exists():
+        shutil.copytree(run / "private" / "audit", folder / "private" / "audit")
     (folder / "private" / "audit" / "audit.json").write_text(json.dumps(data))
     return folder
 

@@ -33,10 +33,10 @@ MEGABYTE = 1 << 20
 def refused(name: str, data: bytes, words: str, *, most: int = 8 * MEGABYTE) -> None:
     """That `data` end in an InputError with `words`, soon and without `most` bytes of memory."""
     tracemalloc.start()
-    start = time.perf_counter()
+    start = time.process_time()  # others may keep the machine busy
     with pytest.raises(InputError, match=words):
         read_source(MemoryInput(name, data))
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < most, f"{peak:,} bytes"
@@ -150,7 +150,6 @@ def webp(width: int, height: int) -> bytes:
     return data.getvalue()
 
 
-@pytest.mark.alone
 def test_a_webp_of_huge_size() -> None:
     """Its header says so; 1 GB would be what its few bytes unpack to."""
     small = bytearray(webp(16, 16))
@@ -158,9 +157,9 @@ def test_a_webp_of_huge_size() -> None:
     for image in (bytes(small), webp(4000, 4000)):
         for name in ("means_l", "quats", "shN_labels", "shN_centroids"):
             # numpy's and Python's memory is counted here, and a canvas of Pillow's is neither
-            start = time.perf_counter()
+            start = time.process_time()
             refused("a.sog", with_meta(lambda meta: None, **{name: image}), "damaged SOG")
-            assert time.perf_counter() - start < 0.5
+            assert time.process_time() - start < 0.5
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,35 @@
+"""The kernels as they are compiled for processors without AVX2, whose vectors hold four numbers or two."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from keyss.rendering.cpu import jit
+from rendering import child_process
+
+# Colours and features, depths, antialiasing, several cameras; drawn forward and backward.
+SCENES = ("random", "three cameras, features and expected depth, antialiased")
+
+
+def test_images_and_gradients_without_avx2() -> None:
+    """In a process of its own, for a processor is chosen once; what it compiles is kept for the next time."""
+    cache = jit.cache_folder()
+    assert cache is not None
+    program = (
+        f"from rendering.child_process import check_on_generic_processor as check; print(check({SCENES!r}))"
+    )
+    environment = {
+        **os.environ,
+        "NUMBA_CPU_NAME": "generic",
+        "NUMBA_CPU_FEATURES": "",
+        "NUMBA_CACHE_DIR": str(cache.parent / "generic"),
+        "PYTHONPATH": os.pathsep.join([str(Path(child_process.__file__).parents[1]), *sys.path]),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.split() == ["generic"]
