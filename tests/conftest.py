@@ -14,12 +14,15 @@ import uncompiled  # noqa: F401  before any test module imports gsply
 from alone import pytest_runtest_protocol  # noqa: F401  hook
 from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
 from child_coverage import count_or_not
+from same_draws import begin_draws, draw_the_same, pytest_fixture_setup  # noqa: F401  hook
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 # What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
 # it; on other machines it goes on searching. How long an example takes depends on what else a machine does.
 settings.register_profile("tests", derandomize="CI" in os.environ, deadline=None)
 settings.load_profile("tests")
+if "CI" in os.environ:
+    draw_the_same()
 
 # A script that runs the tests in its background has them ignore Ctrl-C, which many of them send.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -29,6 +32,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before fixtures of any scope: those that are shared must not be mixed."""
+    begin_draws(item)
     choose_costs(item)
     count_or_not(item)
 
