@@ -9,7 +9,9 @@ import torch
 
 from keyss import FitConfig, Secret, api
 from keyss.core.scene import View
+from keyss.keys import generate_key
 from keyss.methods import registry
+from keyss.methods.learned.options import PRESETS
 from keyss.methods.peers.networks import Convolutions, untrained
 from keyss.runs import probing
 from keyss.runs.probing import Probe
@@ -52,6 +54,17 @@ def test_only_methods_with_networks_are_told_longer() -> None:
         assert by_name["plain model of the cover"] == 10
     # A drawing of each scene, and the network of one or of both.
     assert seconds == {"3dgs-sh": 20, "3dgs-decoder": 30, "gs-hider": 40}
+
+
+@pytest.mark.usefixtures("even")
+def test_the_joint_training_is_told_what_its_decoder_takes() -> None:
+    seconds = {}
+    for name in ("quick", "paper"):
+        options = PRESETS[name].with_fit(iterations=10, max_gaussians=10_000, seed=0)
+        plan = api.plan(tiny_scene(0), [Secret(tiny_scene(1), generate_key())], method=options)
+        seconds[name] = next(stage.seconds for stage in plan.stages if stage.name == "hiding")
+    # Only a secret is drawn; or cover and secret, through the decoder with the key, and with wrong ones.
+    assert seconds == {"quick": 10, "paper": 30 + 10 / PRESETS["paper"].incorrect_every}
 
 
 @pytest.mark.parametrize("channels", [3, 16])

@@ -176,8 +176,10 @@ def hide(
         shown: list[Shown] = []
         if ranks.first:
             shown = [
-                show(model.to(target), original.to(target), scene)
-                for model, original, scene in zip(_as_read(stego, keys, folder), plain, scenes, strict=True)
+                show(model.to(target), original.to(target), scene, of_plain=not each.photos)
+                for model, original, scene, each in zip(
+                    _as_read(stego, keys, folder), plain, scenes, inputs, strict=True
+                )
             ]
             _check_quality(shown, min_psnr)
         photos = tuple(each.photos for each in inputs)

@@ -37,6 +37,7 @@ class View:
 
     camera: Camera
     image: Tensor  # [H, W, 3] uint8 sRGB
+    drawn: Tensor | None = None  # [H, W, 3] in [0, 1], before it was rounded, where a model was drawn for it
 
 
 @dataclass(frozen=True)

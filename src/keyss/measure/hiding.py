@@ -167,10 +167,11 @@ def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
 
 
 @torch.no_grad()
-def show(model: Gaussians, plain: Gaussians | None, scene: Scene) -> Shown:
+def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
     """Both models on the test views of their scene; every picture is drawn once, and none is kept.
 
     Fidelity is how near a model comes to the plain model, where no photo says anything about either.
+    `of_plain`: the scene has no photos, its pictures are of the plain model, and are not drawn again.
     """
     background = scene.background.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
@@ -183,7 +184,10 @@ def show(model: Gaussians, plain: Gaussians | None, scene: Scene) -> Shown:
         qualities.append(view_quality(image, photo))
         if plain is None:
             continue
-        expected = render(plain, view.camera, background).clamp(0, 1)
+        if of_plain and view.drawn is not None:
+            expected = view.drawn.to(model.device)
+        else:
+            expected = render(plain, view.camera, background).clamp(0, 1)
         plains.append(view_quality(expected, photo))
         if id(view) in compared:
             errors.append((image - expected).square().mean())

@@ -23,7 +23,7 @@ FIELD_OF_VIEW = 50.0  # degrees
 HIGHEST = 60.0  # degrees of elevation, and of depression
 # Distances in turn, in units of that from which the whole model is seen: people look at all of it, then near.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
-TEST_EVERY = 8
+TEST_EVERY = 12
 _LARGE, _MOST = 0.95, 10.0  # a weight's quantile, and what the largest may be of it
 _SAMPLE = 200_000  # Gaussians that tell where a model lies
 
@@ -42,7 +42,7 @@ def scene_of_model(
     background: Tensor | Sequence[float] | None = None,
     train_pictures: bool = True,
 ) -> Scene:
-    """Pictures of `model`, size x size, from the cameras of `orbit`; every eighth is kept for testing.
+    """Pictures of `model`, size x size, from the cameras of `orbit`; every twelfth is kept for testing.
 
     Without `train_pictures`, where nothing is trained, only those are rendered; the others are [0, 0, 3].
     Raises UsageError for a `size` or `background` out of range.
@@ -55,11 +55,12 @@ def scene_of_model(
     background = torch.zeros(3) if background is None else checked_background(background)
     views = []
     for index, camera in enumerate(orbit(model, size)):
-        picture = torch.zeros(0, 0, 3, dtype=torch.uint8)
-        if train_pictures or index % TEST_EVERY == 0:
-            image = render(model, camera, background.to(model.device))
-            picture = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
-        views.append(View(camera, picture))
+        test = index % TEST_EVERY == 0
+        if test or train_pictures:
+            drawn = render(model, camera, background.to(model.device)).clamp(0, 1).cpu()
+            views.append(View(camera, (drawn * 255).round().to(torch.uint8), drawn if test else None))
+        else:
+            views.append(View(camera, torch.zeros(0, 0, 3, dtype=torch.uint8)))
     colors = ((model.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1) * 255).round().to(torch.uint8)
     return Scene(
         name,

@@ -24,7 +24,7 @@ from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
 from keyss.rendering.orbit import TEST_EVERY, VIEWS
-from keyss.runs.probing import Probe
+from keyss.runs.probing import Probe, decoding_seconds
 
 _LONG = 1000  # steps
 _WATCHED = 8  # views that a training looks at every `evaluate_every` steps
@@ -105,7 +105,11 @@ def plan_hiding(
         if each.model is None:
             stages.append(_fitting(f"plain model of the {role}", options.fit, probe, sizes[index]))
     if method.trains:
-        stages.append(_hiding(options.fit, shown, outlook))
+        decoding = 0.0
+        if outlook.decode is not None:
+            of_scene = (scenes[0], outlook.gaussians, options.fit, device)
+            decoding = outlook.decodings * decoding_seconds(outlook.decode, *of_scene)
+        stages.append(_hiding(options.fit, shown, outlook, decoding))
     for index, (probe, each, training) in enumerate(
         zip(probes, inputs, options.training(len(inputs)), strict=True)
     ):
@@ -202,10 +206,10 @@ def _fitting(name: str, config: FitConfig, probe: Probe, most: int) -> Stage:
     return Stage(name, config.iterations, most, seconds)
 
 
-def _hiding(config: FitConfig, probes: Sequence[Probe], outlook: Outlook) -> Stage:
-    """The method's own training: a picture of every scene that it draws in each step."""
+def _hiding(config: FitConfig, probes: Sequence[Probe], outlook: Outlook, decoding: float) -> Stage:
+    """The method's own training: a picture of every scene that it draws, and `decoding` seconds, a step."""
     drawn = [(probe, count) for probe, count in zip(probes, outlook.drawn, strict=True) if count]
-    each = _views(config) * sum(probe.step(count) for probe, count in drawn)
+    each = _views(config) * (decoding + sum(probe.step(count) for probe, count in drawn))
     watching = _watching(config, [probe for probe, _ in drawn], [count for _, count in drawn], outlook.steps)
     return Stage("hiding", outlook.steps, sum(outlook.drawn), outlook.steps * each + watching)
 

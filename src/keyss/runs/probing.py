@@ -142,6 +142,26 @@ class Probe:
         return scale * _timed(picture, views), scale * _timed(step, views) if self.trains else 0.0
 
 
+def decoding_seconds(
+    decode: Callable[[Gaussians], Gaussians],
+    scene: Scene,
+    count: int,
+    config: FitConfig,
+    device: torch.device,
+) -> float:
+    """Seconds of a step's way through a decoder and back, of `count` Gaussians of as many harmonics."""
+    parameters = to_parameters(_made_up(scene, count, config), device)
+
+    def step(_: View) -> None:
+        decoded = decode(to_gaussians(parameters))
+        whole = [decoded.means, decoded.quats, decoded.log_scales, decoded.opacity_logits, decoded.sh]
+        torch.stack([values.sum() for values in whole]).sum().backward()
+        assert parameters["means"].grad is not None
+        float(parameters["means"].grad.sum())
+
+    return _timed(step, [scene.test[0]] * (PROBES + 1))
+
+
 def _timed(work: Callable[[View], object], views: Sequence[View]) -> float:
     """Mean seconds of `work` on all views but the first."""
     work(views[0])

@@ -12,7 +12,7 @@ pruning or re-ordering the model changes nothing for the Gaussians that stay.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, get_args
 
@@ -120,6 +120,19 @@ class Decoder(nn.Module):
             return 1.0
         cosine = float(F.cosine_similarity(embedding.detach(), self.key, dim=0))
         return min(1.0, max(0.0, (cosine - GATE_SHUT) / (GATE_OPEN - GATE_SHUT)))
+
+
+def untrained(shape: DecoderShape) -> Callable[[Gaussians], Gaussians]:
+    """A decoder that is told the right key: what it takes tells what one takes that is trained."""
+    embedding = torch.ones(EMBEDDING_SIZE)
+    decoder = Decoder(shape)
+    decoder.key.copy_(embedding)
+
+    def decode(gaussians: Gaussians) -> Gaussians:
+        decoded: Gaussians = decoder.to(gaussians.device)(gaussians, embedding.to(gaussians.device))
+        return decoded
+
+    return decode
 
 
 class Network(nn.Module):

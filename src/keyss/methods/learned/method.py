@@ -36,8 +36,16 @@ from keyss.methods.base import (
     Stego,
 )
 from keyss.methods.learned.clip_keys import MODEL, ClipKeys
+from keyss.methods.learned.decoder import untrained
 from keyss.methods.learned.joint import JointRun
-from keyss.methods.learned.options import PRESETS, LearnedOptions, sized, training_options
+from keyss.methods.learned.options import (
+    PRESETS,
+    LearnedOptions,
+    decoder_shape,
+    decodings,
+    sized,
+    training_options,
+)
 from keyss.methods.learned.payload import unpack_secret
 from keyss.methods.learned.publication import NAME, publish
 from keyss.methods.learned.refit import hide_refitted
@@ -113,6 +121,8 @@ class LearnedMethod:
             steps=fit.iterations,
             drawn=tuple(drawn),
             notes=tuple(notes),
+            decode=None if options.start == "warm" else untrained(decoder_shape(options)),
+            decodings=decodings(options, len(sizes) - 1),
         )
 
     def hide(

@@ -156,6 +156,13 @@ def decoder_shape(options: LearnedOptions) -> DecoderShape:
     return DecoderShape(**shape | {"sh_degree": options.fit.sh_degree})
 
 
+def decodings(options: LearnedOptions, secrets: int) -> float:
+    """How often all Gaussians go through a decoder in a step of the joint training, in the mean."""
+    if options.start == "warm":
+        return 0.0
+    return secrets + (1 / options.incorrect_every if options.conditioning == "bias" else 0.0)
+
+
 def chosen_scenes(which: Scenes, count: int) -> list[int]:
     """Indices of the scenes that `which` stands for, of the cover (0) and the secrets."""
     return {"both": list(range(count)), "cover": [0], "secret": list(range(1, count))}[which]
