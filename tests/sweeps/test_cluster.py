@@ -38,15 +38,15 @@ def test_a_local_cluster_does_the_same_cells_with_the_same_bytes(tmp_path: Path)
 @pytest.mark.filterwarnings("default")
 def test_with_killed_workers_and_drivers_it_ends_as_if_nothing_had_happened(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="ray is not installed")
-    spec, master = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=6), tmp_path / "master.txt"
+    spec, master = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=12), tmp_path / "master.txt"
     calm = api.sweep(spec, tmp_path / "calm", master_key_file=master, how=How(2, command=fake()))
 
     def worker_or_job(command: str) -> bool:
         return command.startswith("ray::") or "worker.attempt(" in command
 
-    killed = kill_until_done(spec, tmp_path / "out", "ray", 8, seed=4, longest=0.6, chosen=worker_or_job)
+    killed = kill_until_done(spec, tmp_path / "out", "ray", 20, seed=4, longest=0.6, chosen=worker_or_job)
     assert sum(each.startswith("ray::") for each in killed) >= 2
-    assert len(results(tmp_path / "out")) == 12
+    assert len(results(tmp_path / "out")) == 24
     for name in calm.tables:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
 
