@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -13,6 +13,8 @@ from torch import Tensor
 from keyss.fitting.config import FitConfig
 from keyss.fitting.parameters import Optimizers, Parameters
 from keyss.fitting.ranks import here
+
+T = TypeVar("T")
 
 # A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
 Drawn = tuple[dict[str, Any], Tensor | None, float]
@@ -102,6 +104,26 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         if 0 < count < len(pruned):
             remove(params=params, optimizers=optimizers, state=state, mask=pruned)
         return count
+
+
+def draw_views(
+    views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Drawn]]]
+) -> tuple[Tensor, list[Drawn]]:
+    """The mean loss of a step's `views`, and the renders that density control goes by.
+
+    Of both this rank's share; its backward pass is done. `loss_at` draws a view.
+    """
+    share = 1 / len(views)
+    losses: list[Tensor] = []
+    found: list[Drawn] = []
+    for view in here().mine(views):
+        loss, drawn = loss_at(view)
+        for meta, _, _ in drawn:
+            meta["means2d"].retain_grad()
+        (share * loss).backward()
+        losses.append(share * loss.detach())
+        found += [(meta, indices, share * weight) for meta, indices, weight in drawn]
+    return torch.stack(losses).sum(), found
 
 
 def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:

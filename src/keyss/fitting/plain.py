@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import Scene, View
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
+from keyss.fitting.density import CappedStrategy, Drawn, combine_densification, draw_views
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import Reporter, train
 from keyss.fitting.losses import Target, photometric_loss
@@ -78,17 +79,14 @@ class PlainRun:
         views = [self.views[self.shuffle.draw()] for _ in range(self.views_per_step)]
         self.iteration += 1
         degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
-        share = 1 / len(views)
-        total = torch.zeros((), device=self.device)
-        drawn: list[Drawn] = []
-        for view in here().mine(views):
+
+        def loss_at(view: View) -> tuple[Tensor, list[Drawn]]:
             model = to_gaussians(self.parameters)
             image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
             loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
-            meta["means2d"].retain_grad()
-            (share * loss).backward()
-            total += share * loss.detach()
-            drawn.append((meta, None, share))
+            return loss, [(meta, None, 1.0)]
+
+        total, drawn = draw_views(views, loss_at)
         seen = combine_densification(drawn, len(self)) if self.grows else None
         self.loss, seen = self.strategy.over_ranks(total, self.parameters.values(), self.parameters, seen)
         self._set_rates()

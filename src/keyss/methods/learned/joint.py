@@ -18,7 +18,7 @@ from keyss.fitting.checkpoint import (
     unpack_network,
     unpack_optimizers,
 )
-from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
+from keyss.fitting.density import CappedStrategy, Drawn, combine_densification, draw_views
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
@@ -92,17 +92,7 @@ class JointRun:
         wrong: list[Tensor | None] = [None] * len(views)
         if config.conditioning == "bias" and self.iteration % config.incorrect_every == 0:
             wrong = [random_embeddings(1, self.generator)[0].to(self.device) for _ in views]
-        share = 1 / len(views)
-        total = torch.zeros((), device=self.device)
-        drawn: list[Drawn] = []
-        for poses, other in here().mine(list(zip(views, wrong, strict=True))):
-            loss, pictures = self._loss_at(poses, other)
-            for meta, _, _ in pictures:
-                meta["means2d"].retain_grad()
-            (share * loss).backward()
-            total += share * loss.detach()
-            asking = [pictures[scene] for scene in chosen_scenes(config.densification, len(pictures))]
-            drawn += [(meta, indices, share * weight) for meta, indices, weight in asking]
+        total, drawn = draw_views(list(zip(views, wrong, strict=True)), self._loss_at)
         trained = (*self.parameters.values(), *self._all_decoders.parameters())
         seen = combine_densification(drawn, len(self))
         self.loss, seen = self.strategy.over_ranks(total, trained, self.parameters, seen)
@@ -112,9 +102,9 @@ class JointRun:
             optimizer.zero_grad(set_to_none=True)
         self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, seen)
 
-    def _loss_at(self, poses: Sequence[tuple[int, int]], wrong: Tensor | None) -> tuple[Tensor, list[Drawn]]:
-        """The losses of all scenes, each at its pose, and what was drawn; `wrong`: a wrong key."""
-        config = self.config
+    def _loss_at(self, view: tuple[Sequence[tuple[int, int]], Tensor | None]) -> tuple[Tensor, list[Drawn]]:
+        """The losses of all scenes, each at its pose, with a wrong key or none; what asks for density."""
+        (poses, wrong), config = view, self.config
         degree = config.fit.sh_degree_at(self.iteration)
 
         def loss_of(drawn: Gaussians, scene: int) -> tuple[Tensor, dict[str, Any]]:
@@ -134,7 +124,7 @@ class JointRun:
             drawn.append((meta, seen, config.secret_weight))
         if wrong is not None:
             total = total + self._incorrect_loss(cover.detach(), poses[0], wrong, loss_of)
-        return total, drawn
+        return total, [drawn[scene] for scene in chosen_scenes(config.densification, len(drawn))]
 
     def _incorrect_loss(self, cover: Gaussians, pose: tuple[int, int], wrong: Tensor, loss_of: Any) -> Tensor:
         """The cover is right already: only the decoders are to learn from wrong keys, in turns."""

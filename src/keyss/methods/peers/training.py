@@ -20,7 +20,7 @@ from keyss.fitting.checkpoint import (
     unpack_network,
     unpack_optimizers,
 )
-from keyss.fitting.density import CappedStrategy, Drawn, combine_densification
+from keyss.fitting.density import CappedStrategy, Drawn, combine_densification, draw_views
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_parameters
@@ -102,16 +102,7 @@ class PeerRun:
     def step(self) -> None:
         self.iteration += 1
         views = [self._draw_poses() for _ in range(self.views_per_step)]
-        share = 1 / len(views)
-        total = torch.zeros((), device=self.device)
-        drawn: list[Drawn] = []
-        for view in here().mine(views):
-            loss, pictures = self._loss_at(view)
-            for meta, _, _ in pictures:
-                meta["means2d"].retain_grad()
-            (share * loss).backward()
-            total += share * loss.detach()
-            drawn += [(meta, None, share * weight) for meta, _, weight in pictures]
+        total, drawn = draw_views(views, self._loss_at)
         trained = (*self.parameters.values(), *self.networks.parameters())
         seen = combine_densification(drawn, len(self))
         self.loss, seen = self.strategy.over_ranks(total, trained, self.parameters, seen)
