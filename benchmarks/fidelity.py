@@ -215,9 +215,9 @@ def row(result: dict[str, Any]) -> list[str]:
     return [
         f"{result['names'][0]} hides {', '.join(result['names'][1:])}",
         result["preset"],
-        f"{metrics['cover']['psnr']:.2f} ({cover:+.2f})",
+        f"{metrics['cover']['psnr']:.2f} ({round(cover, 2) + 0.0:+.2f})",  # no -0.00
         ", ".join(
-            f"{each['psnr']:.2f} ({loss:+.2f})"
+            f"{each['psnr']:.2f} ({round(loss, 2) + 0.0:+.2f})"
             for each, loss in zip(metrics["secrets"], secrets, strict=True)
         ),
         against("wrong"),
