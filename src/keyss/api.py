@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from keyss._verbs.asking import Secret
-    from keyss._verbs.comparing import compare
+    from keyss._verbs.comparing import compare, plan_comparison
     from keyss._verbs.converting import Conversion, convert
     from keyss._verbs.filing import HideFilesResult, SecretFile, hide_files, reveal_file
     from keyss._verbs.filming import render_video
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Conversion", "HideResult", "Secret", "audit", "convert", "evaluate", "fit", "hide", "plan"]
 __all__ += ["render", "render_video", "reveal", "reveal_counted", "verify", "write_report"]
-__all__ += ["PaperTable", "compare", "download_scenes", "plan_reproduction", "reproduce"]
+__all__ += ["PaperTable", "compare", "download_scenes", "plan_comparison", "plan_reproduction", "reproduce"]
 __all__ += ["HideFilesResult", "SecretFile", "hide_files", "reveal_file"]
 __all__ += ["BatchResult", "SweepResult", "hide_batch", "sweep"]
 
@@ -50,6 +50,7 @@ _HOMES = {
     "hide_batch": "sweeps.batch",
     "hide_files": "_verbs.filing",
     "plan": "_verbs.planning",
+    "plan_comparison": "_verbs.comparing",
     "plan_reproduction": "_verbs.reproducing",
     "render": "_verbs.looking",
     "render_video": "_verbs.filming",

@@ -35,6 +35,9 @@ def test_a_table_a_picture_and_a_second_start(
     out = tmp_path / "compared"
     names = "3dgs,3dgs-sh,watergs,learned"
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
+    assert main([*command, "--methods", names, "--dry-run"]) == 0
+    assert not out.exists()
+    assert "7 to do" in capsys.readouterr().out  # four plain models and three methods
     assert main([*command, "--methods", "3dgs,3dgs-sh"]) == 0
     first = (out / "3dgs-sh" / "publish" / "stego.ply").stat().st_mtime_ns
     before = json.loads((out / "3dgs-sh.json").read_text())
@@ -78,6 +81,11 @@ def test_a_table_a_picture_and_a_second_start(
         assert secrecy[figure] == secrecy[f"{figure}_plain"]
     assert {each["reader"] for each in rows["watergs"]["readers"]} == {"plyfile", "gsply", "splat-transform"}
     assert all(each["loads"] for each in rows["watergs"]["readers"] if each["loads"] is not None)
+    capsys.readouterr()
+    assert main([*command, "--methods", names, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "0 to do" in said
+    assert "learned: " in said
     text = (out / "comparison.md").read_text()
     assert text.count("\n## ") + text.startswith("## ") == 2
     assert "- learned: not possible" in text

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from keyss._verbs.asking import Secret
 from keyss._verbs.fitting import fit
 from keyss._verbs.hiding import hide
+from keyss._verbs.planning import plan
 from keyss.comparison.measuring import PlainCovers, measured
 from keyss.comparison.record import ComparedMethod, Comparison
 from keyss.comparison.sheet import sheet
@@ -32,12 +33,15 @@ from keyss.runs.config import PathLike
 from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import HidingRun, as_scene, open_run
+from keyss.runs.planning import PlannedRun
 from keyss.runs.records import read_record, write_record
 
 RECORD, TABLE, PICTURE, KEY = "comparison.json", "comparison.md", "comparison.png", "key.txt"
 CONTROLS = 2  # plain models of the cover from other seeds, beside which published ones are judged
 _BEGUN = "arguments.json"
 _ROLES = ("cover", "secret")
+_PLAIN = "plain-"
+_CONTROL_NAMES = tuple(f"control-{number}" for number in range(1, CONTROLS + 1))
 # Every method with its first preset; `learned` as KeySS was published too, which is another training.
 EVERY = tuple(
     name for each in registry.METHODS for name in ((each, f"{each}:paper") if each == "learned" else (each,))
@@ -68,15 +72,14 @@ class _PlainModels:
 
     def of(self, role: str, iterations: int) -> Path:
         """That of the cover or the secret after so many steps, from the seed of all methods."""
-        steps = "" if iterations == self.config.iterations else f"-{iterations}"
-        return self._fitted(f"{role}{steps}", self.scenes[role], replace(self.config, iterations=iterations))
+        name = _plain_name(role, iterations, self.config)
+        return self._fitted(name, self.scenes[role], replace(self.config, iterations=iterations))
 
     @cached_property
     def judging(self) -> PlainCovers:
         """What published models are held against."""
-        names = [f"control-{number}" for number in range(1, CONTROLS + 1)]
         paths = [self.of("cover", self.config.iterations)]
-        for name in names:
+        for name in _CONTROL_NAMES:
             config = replace(self.config, seed=self.config.seed_of(name))
             paths.append(self._fitted(name, self.scenes["cover"], config))
         scene = as_scene(self.scenes["cover"], self.width, None)
@@ -84,7 +87,7 @@ class _PlainModels:
 
     def _fitted(self, name: str, scene: PathLike, config: FitConfig) -> Path:
         return fitted_once(
-            self.folder / f"plain-{name}",
+            self.folder / f"{_PLAIN}{name}",
             scene,
             config,
             width=self.width,
@@ -119,23 +122,18 @@ def compare(
     was finished is not done again with `resume`. What a method cannot do is its row.
     Raises KeyssError for scenes that cannot be read and for folders that hold something else; Interrupted.
     """
-    if is_model(cover) or is_model(secret):
-        raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
-    chosen = [_named(name) for name in methods or EVERY]
-    folder, budget = Path(out), {"iterations": iterations, "max_gaussians": max_gaussians}
+    chosen, fit = _asked(cover, secret, methods, iterations, max_gaussians)
+    folder = Path(out)
     told: dict[str, Any] = {"cover": os.path.realpath(cover), "secret": os.path.realpath(secret)}
-    told |= {**budget, "width": width}
+    told |= {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     seed = _begin(folder, told, seed, resume)
     key = read_text(folder / KEY).strip()
-    fit = replace(
-        chosen[0][2].fit, seed=seed, **{name: each for name, each in budget.items() if each is not None}
-    )
+    fit = replace(fit, seed=seed)
     changes = {"max_gaussians": fit.max_gaussians, "seed": seed}
     plain_models = _PlainModels(folder, {"cover": cover, "secret": secret}, fit, width, device, reporter)
     rows = []
     for name, method, options in chosen:
-        place = folder / name.replace(":", "-")
-        done = folder / f"{place.name}.json"
+        place, done = _place(folder, name), _row_file(folder, name)
         if (row := _row(done)) is not None:
             rows.append(row)
             continue
@@ -168,6 +166,77 @@ def compare(
     sheet(_runs(folder, found), device).save(picture, "PNG", optimize=True)
     write_bytes(folder / PICTURE, picture.getvalue())
     return found
+
+
+def plan_comparison(
+    cover: PathLike,
+    secret: PathLike,
+    *,
+    methods: Sequence[str] = (),
+    iterations: int | None = None,
+    max_gaussians: int | None = None,
+    width: int | None = None,
+    device: Backend = "auto",
+    out: PathLike,
+) -> list[PlannedRun]:
+    """What `compare` would run, with times from a few steps of each kind. Writes nothing; raises as it.
+
+    Measuring is in it as `hide` does it: what else `compare` measures takes up to a minute for each method.
+    """
+    chosen, fit = _asked(cover, secret, methods, iterations, max_gaussians)
+    folder, models, runs = Path(out), dict[str, PlannedRun](), list[PlannedRun]()
+    for name, method, options in chosen:
+        if _row(_row_file(folder, name)) is not None:
+            runs.append(PlannedRun(name, True))
+            continue
+        options, steps = within(fit.iterations, options)
+        options = options.with_fit(max_gaussians=fit.max_gaussians)
+        key = "any" if method.capabilities.keys else ""
+        try:
+            planned = plan(cover, [Secret(secret, key)], method=options, width=width, device=device)
+        except UsageError as error:
+            runs.append(PlannedRun(name, False, error=str(error)))
+            continue
+        seconds = {stage.name: stage.seconds for stage in planned.stages}
+        for role, count in zip(_ROLES, steps, strict=True):
+            whole = seconds.pop(f"plain model of the {role}")
+            needed = [(_plain_name(role, count, fit), count)]
+            needed += [(each, fit.iterations) for each in _CONTROL_NAMES if role == "cover"]
+            for each, own in needed:
+                done = (folder / f"{_PLAIN}{each}" / MODEL).exists()
+                time = 0.0 if done else whole * own / options.fit.iterations
+                models.setdefault(each, PlannedRun(f"{_PLAIN}{each}", done, time))
+        runs.append(PlannedRun(name, False, sum(seconds.values())))
+    return [*models.values(), *runs]
+
+
+def _asked(
+    cover: PathLike,
+    secret: PathLike,
+    methods: Sequence[str],
+    iterations: int | None,
+    max_gaussians: int | None,
+) -> tuple[list[tuple[str, Method, MethodOptions]], FitConfig]:
+    """The methods by name, and the training that all have. Raises UsageError."""
+    if is_model(cover) or is_model(secret):
+        raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
+    chosen = [_named(name) for name in methods or EVERY]
+    budget = {"iterations": iterations, "max_gaussians": max_gaussians}
+    fit = replace(chosen[0][2].fit, **{name: each for name, each in budget.items() if each is not None})
+    return chosen, fit
+
+
+def _plain_name(role: str, iterations: int, config: FitConfig) -> str:
+    return role if iterations == config.iterations else f"{role}-{iterations}"
+
+
+def _place(folder: Path, name: str) -> Path:
+    """A method's run."""
+    return folder / name.replace(":", "-")
+
+
+def _row_file(folder: Path, name: str) -> Path:
+    return folder / f"{_place(folder, name).name}.json"
 
 
 def _row(path: Path) -> ComparedMethod | None:
@@ -235,7 +304,7 @@ def _runs(folder: Path, found: Comparison) -> list[tuple[str, HidingRun]]:
     """Those that came to something, by name."""
     key = read_text(folder / KEY).strip()
     return [
-        (each.name, open_run(folder / each.name.replace(":", "-"), [key] if each.capabilities.keys else []))
+        (each.name, open_run(_place(folder, each.name), [key] if each.capabilities.keys else []))
         for each in found.methods
         if each.error is None
     ]

@@ -31,6 +31,7 @@ from keyss.runs.config import PathLike
 from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import open_run
+from keyss.runs.planning import PlannedRun
 from keyss.runs.records import read_record, write_record
 
 _BEGUN, _PLAIN, _SCENES = "arguments.json", "plain", "scenes"
@@ -43,15 +44,6 @@ class _Begun:
     version: int = 1
     told: dict[str, Any]
     seed: int
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """A run that a table needs."""
-
-    name: str
-    done: bool
-    seconds: float = 0.0  # that it takes, roughly; 0 for one that is done
 
 
 def reproduce(

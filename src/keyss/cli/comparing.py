@@ -35,6 +35,9 @@ def compare(
     iterations: Iterations = None,
     max_gaussians: MaxGaussians = None,
     width: Width = None,
+    dry_run: Annotated[
+        bool, arg(help="Print what would run and estimates of the time; write nothing.")
+    ] = False,
     resume: Resume = False,
     device: Device = "auto",
     seed: Seed = None,
@@ -49,15 +52,22 @@ def compare(
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
     from keyss import api
-    from keyss.cli.tables import print_comparison, print_files
+    from keyss.cli.tables import print_comparison, print_files, print_planned_runs
     from keyss.progress import reporter
 
     asked = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     budget = {name: QUICK[name] if value is None and quick else value for name, value in asked.items()}
+    chosen = () if methods.strip() == "all" else [name.strip() for name in methods.split(",")]
+    if dry_run:
+        print_planned_runs(
+            api.plan_comparison(cover, secret, methods=chosen, device=device, out=out, **budget)
+        )
+        print("What is measured beside these times takes up to a minute for each method.")
+        return
     found = api.compare(
         cover,
         secret,
-        methods=() if methods.strip() == "all" else [name.strip() for name in methods.split(",")],
+        methods=chosen,
         seed=seed,
         device=device,
         out=out,

@@ -13,7 +13,6 @@ from tyro.conf import Positional, UseAppendAction, arg
 from keyss.cli.arguments import Device, OutFolder, Seed, optional
 
 if TYPE_CHECKING:
-    from keyss._verbs.reproducing import PlannedRun
     from keyss.reproduction.record import Reproduction
 
 Name = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
@@ -76,7 +75,7 @@ def reproduce(
     example: keyss reproduce multi --scale full --data 360_v2 --download -o runs/paper-full
     """
     from keyss import api
-    from keyss.cli.tables import print_files
+    from keyss.cli.tables import print_files, print_planned_runs
     from keyss.core.errors import UsageError
     from keyss.progress import reporter
 
@@ -97,7 +96,7 @@ def reproduce(
     if download:
         api.download_scenes(asked, reporter=reporter())
     if dry_run:
-        _print_plan(api.plan_reproduction(asked, out=out))
+        print_planned_runs(api.plan_reproduction(asked, out=out))
         return
     found = api.reproduce(asked, seed=seed, out=out, reporter=reporter())
     _print_table(found)
@@ -130,16 +129,3 @@ def _print_table(found: Reproduction) -> None:
         "Published figures, and those measured here on photos that were not trained on: means over "
         f"{len(found.pairs)} pair(s)."
     )
-
-
-def _print_plan(planned: list[PlannedRun]) -> None:
-    from keyss.cli.tables import Console, new_table
-    from keyss.progress import about
-
-    table = new_table("run", "time, about", texts=1)
-    for each in planned:
-        table.add_row(each.name, "done" if each.done else about(each.seconds))
-    due = [each for each in planned if not each.done]
-    Console().print(table)
-    print(f"{len(due)} to do: about {about(sum(each.seconds for each in due))}")
-    print("Nothing was written. Times are extrapolated from a few steps, and rough.")

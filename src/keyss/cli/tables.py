@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.measure.stegexpose import Steganalysis
     from keyss.runs.metrics import FitMetrics, HideMetrics
-    from keyss.runs.planning import Plan
+    from keyss.runs.planning import Plan, PlannedRun
 
 
 _GAP = 2  # characters between columns
@@ -218,6 +218,21 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
 
 def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:,.1f} kB"
+
+
+def print_planned_runs(planned: Sequence[PlannedRun]) -> None:
+    """What of several runs is done, and about how long the others take."""
+    table = new_table("run", "time, about", texts=1)
+    for each in planned:
+        time = "not possible" if each.error else "done" if each.done else about(each.seconds)
+        table.add_row(each.name, time)
+    due = [each for each in planned if not each.done and not each.error]
+    Console().print(table)
+    for each in planned:
+        if each.error:
+            print(f"{each.name}: {each.error}")
+    print(f"{len(due)} to do: about {about(sum(each.seconds for each in due))}")
+    print("Nothing was written. Times are extrapolated from a few steps, and rough.")
 
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:

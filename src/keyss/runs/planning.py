@@ -66,6 +66,16 @@ class Plan:
         return _line(self.seconds, self.memory_bytes, self.disk_bytes)
 
 
+@dataclass(frozen=True)
+class PlannedRun:
+    """One of several runs that are asked for."""
+
+    name: str
+    done: bool
+    seconds: float = 0.0  # that it takes, roughly; 0 for one that is done
+    error: str | None = None  # why it is not possible
+
+
 def plan_hiding(
     method: Method,
     options: MethodOptions,  # prepared
