@@ -62,9 +62,9 @@ def best_of(repeats: int, call: Callable[[], object]) -> float:
 def step_seconds(size: Size) -> float:
     """A training step: render, loss, backward, Adam."""
     torch.set_num_threads(int(size.get("threads", torch.get_num_threads())))
-    model = made_up(int(size["Gaussians"]))
-    width = round((size["pixels"] * 1.5) ** 0.5)
-    camera = camera_before(model.means, width, round(size["pixels"] / width))
+    model = made_up(int(size["Gaussian"]))
+    width = round((size["pixel"] * 1.5) ** 0.5)
+    camera = camera_before(model.means, width, round(size["pixel"] / width))
     with torch.no_grad():
         target = Target.of(render(model, camera).clamp(0, 1))
     parameters = to_parameters(model, "cpu")
@@ -81,9 +81,9 @@ def step_seconds(size: Size) -> float:
 
 def picture_seconds(size: Size) -> float:
     """A picture without gradients."""
-    model = made_up(int(size["Gaussians"]))
-    width = round((size["pixels"] * 1.5) ** 0.5)
-    camera = camera_before(model.means, width, round(size["pixels"] / width))
+    model = made_up(int(size["Gaussian"]))
+    width = round((size["pixel"] * 1.5) ** 0.5)
+    camera = camera_before(model.means, width, round(size["pixel"] / width))
     with torch.no_grad():
         return best_of(5, lambda: render(model, camera))
 
@@ -97,7 +97,7 @@ def trained(count: int, seed: int) -> Gaussians:
 
 def carry_seconds(size: Size) -> float:
     """From files to a file: secrets of a tenth of the cover, all together, are carried, and opened again."""
-    count, secrets = int(size["Gaussians"]), int(size.get("secrets", 1))
+    count, secrets = int(size["Gaussian"]), int(size.get("secret", 1))
     with tempfile.TemporaryDirectory() as name:
         cover, secret = Path(name) / "cover.ply", Path(name) / "secret.ply"
         write_model(cover, trained(count, 0))
@@ -114,7 +114,7 @@ def carry_seconds(size: Size) -> float:
 
 def reveal_seconds(size: Size) -> float:
     """From file to file."""
-    count = int(size["Gaussians"])
+    count = int(size["Gaussian"])
     with tempfile.TemporaryDirectory() as name:
         key, stego = "the key of the benchmark, 9fK2", Path(name) / "stego.ply"
         hidden = trained(count, 1)
@@ -130,7 +130,7 @@ def reveal_seconds(size: Size) -> float:
 
 def photo_seconds(size: Size) -> float:
     """Reading JPEG photos, as scenes do."""
-    count, pixels = int(size["photos"]), int(size["pixels"])
+    count, pixels = int(size["photo"]), int(size["pixel"])
     width = round((pixels * 1.5) ** 0.5)
     with tempfile.TemporaryDirectory() as name:
         noise = np.random.default_rng(0).integers(0, 255, (pixels // width // 8, width // 8, 3), np.uint8)
@@ -142,30 +142,31 @@ def photo_seconds(size: Size) -> float:
 
 
 COUNTS = (10_000.0, 40_000.0, 160_000.0)
-DRAWN = tuple({"Gaussians": gaussians, "pixels": pixels} for gaussians in COUNTS for pixels in COUNTS)
-LARGER = {"Gaussians": 640_000.0, "pixels": 640_000.0}
-MODELS = tuple({"Gaussians": float(count)} for count in (50_000, 100_000, 200_000, 400_000))
+DRAWN = tuple({"Gaussian": gaussians, "pixel": pixels} for gaussians in COUNTS for pixels in COUNTS)
+LARGER = {"Gaussian": 640_000.0, "pixel": 640_000.0}
+MODELS = tuple({"Gaussian": float(count)} for count in (50_000, 100_000, 200_000, 400_000))
+COUNTED = {"secret", "photo"}  # one by one, all else in millions
 WORKS = (
-    Work("step", ("Gaussians", "pixels"), DRAWN, LARGER, step_seconds),
-    Work("picture", ("Gaussians", "pixels"), DRAWN, LARGER, picture_seconds),
-    Work("carry", ("Gaussians",), MODELS, {"Gaussians": 1_600_000}, carry_seconds),
-    Work("reveal", ("Gaussians",), MODELS, {"Gaussians": 1_600_000}, reveal_seconds),
+    Work("step", ("Gaussian", "pixel"), DRAWN, LARGER, step_seconds),
+    Work("picture", ("Gaussian", "pixel"), DRAWN, LARGER, picture_seconds),
+    Work("carry", ("Gaussian",), MODELS, {"Gaussian": 1_600_000}, carry_seconds),
+    Work("reveal", ("Gaussian",), MODELS, {"Gaussian": 1_600_000}, reveal_seconds),
     Work(
         "secrets",
-        ("secrets",),
-        tuple({"secrets": float(k), "Gaussians": 200_000.0, "each": 2_000.0} for k in (1, 2, 3, 4)),
-        {"secrets": 16, "Gaussians": 200_000, "each": 2_000},
+        ("secret",),
+        tuple({"secret": float(k), "Gaussian": 200_000.0, "each": 2_000.0} for k in (1, 2, 3, 4)),
+        {"secret": 16, "Gaussian": 200_000, "each": 2_000},
         carry_seconds,
     ),
     Work(
         "photos",
-        ("photos", "photos x pixels"),
+        ("photo", "photo x pixel"),
         tuple(
-            {"photos": float(n), "pixels": p, "photos x pixels": n * p}
+            {"photo": float(n), "pixel": p, "photo x pixel": n * p}
             for n in (4, 8, 16)
             for p in (130_000.0, 520_000.0)
         ),
-        {"photos": 64, "pixels": 2_080_000, "photos x pixels": 64 * 2_080_000},
+        {"photo": 64, "pixel": 2_080_000, "photo x pixel": 64 * 2_080_000},
         photo_seconds,
     ),
 )
@@ -193,7 +194,7 @@ def main() -> None:
     options = parser.parse_args()
     load_kernels()
     print(f"{processor_name()}, {torch.get_num_threads()} threads\n")
-    print("| work | seconds of a call, and of each million | misfit | predicted | measured | ratio |")
+    print("| work | seconds | misfit | predicted | measured | ratio |")
     print("| --- | --- | --- | --- | --- | --- |")
     for work in WORKS:
         if options.only and work.name not in options.only:
@@ -203,7 +204,10 @@ def main() -> None:
         pairs = zip(work.sizes, seconds, strict=True)
         misfit = max(abs(predicted(costs, size) / took - 1) for size, took in pairs)
         expected, took = predicted(costs, work.larger), work.seconds(work.larger)
-        parts = [f"{costs['a call']:.3g}", *(f"{1e6 * costs[term]:.3g} ({term})" for term in work.terms)]
+        parts = [f"{costs['a call']:.3g} a call"]
+        for term in work.terms:
+            unit, cost = (term, costs[term]) if term in COUNTED else (f"million {term}", 1e6 * costs[term])
+            parts.append(f"{cost:.3g} a {unit}")
         print(
             f"| {work.name} | {', '.join(parts)} | {misfit:.0%} | {expected:.3g} | {took:.3g} | "
             f"{took / expected:.2f} |",
