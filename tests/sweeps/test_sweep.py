@@ -171,9 +171,9 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks at /proc")
-@pytest.mark.parametrize("kills", [4, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_killed_at_any_moments_it_ends_as_if_nothing_had_happened(tmp_path: Path, kills: int) -> None:
-    seeds = 4 if kills < 20 else 8
+    seeds = 2 if kills < 20 else 8
     spec = write_spec(tmp_path, ["a.ply", "b.ply", "c.ply"], seeds)
     calm = api.sweep(
         spec, tmp_path / "calm", how=How(4, command=fake()), master_key_file=tmp_path / "master.txt"
