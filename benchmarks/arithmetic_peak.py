@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import numpy as np
-
 from keyss.rendering.cpu.jit import finite_kernel
 from keyss.rendering.cpu.simd8 import load8, multiply_add, store8
+
+import numpy as np
 
 # Arithmetic on each (Gaussian, pixel) pair, one instruction each: two steps of the recurrence, clamping
 # alpha, dimming the transmittance (3), the test whether the pixel has stopped (3), alpha >= 1/255 (2), and

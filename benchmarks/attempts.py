@@ -20,8 +20,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-import torch
-
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss.channels import appended
@@ -35,6 +33,8 @@ from keyss.keys import generate_key, random_embeddings
 from keyss.methods.learned.decoder import Decoder, DecoderShape
 from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
 from keyss.methods.registry import open_model
+
+import torch
 
 
 def main() -> None:

@@ -19,12 +19,14 @@ import time
 from itertools import permutations
 from pathlib import Path
 
+import keyss  # noqa: F401  before torch, see `ruff.toml`
+
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.trained_like import trained_like
 from keyss import read_model, write_model
+from channels.low_bits.trained_like import trained_like
 from keyss.channels.low_bits.layout import record_capacity
 from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene

@@ -23,9 +23,6 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
-import torch
-
 from keyss.channels.base import Payload
 from keyss.channels.codes import CodesCover, CodesReader
 from keyss.channels.codes.fields import format_of
@@ -43,6 +40,9 @@ from keyss.methods.records.precision import fitted
 from keyss.rendering import render
 from keyss.rendering.difference import cost
 from keyss.rendering.orbit import scene_of_model
+
+import numpy as np
+import torch
 
 FORMATS: dict[str, ModuleType] = {"spz": spz, "sog": sog, "compressed-ply": compressed_ply}
 START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"

@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
-
 from keyss.files import read_model
 from keyss.rendering import render
 from keyss.rendering.contributions import contributions
 from keyss.rendering.orbit import orbit
 from rasterizer import table
+
+import torch
 
 SIZE, VIEWS, REPEATS = 400, 24, 5  # pixels, cameras, of which the fastest counts
 

@@ -19,9 +19,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import torch
-
 import keyss
 from benchmark_record import make_record, write_record
 from keyss.core import Scene, WrongKeyError
@@ -41,6 +38,9 @@ from keyss.methods.learned.method import training_salt
 from keyss.methods.learned.options import PRESETS, LearnedOptions
 from keyss.methods.poses import PlacedScene
 from keyss.progress import reporter
+
+import msgspec
+import torch
 
 START, END = "<!-- measured by `make benchmark-fidelity` -->", "<!-- end of what was measured -->"
 KEY = "Xq7Rf2LmZ9aT{:03d}"  # 16 characters

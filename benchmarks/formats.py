@@ -17,16 +17,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import torch
-from scipy.spatial import cKDTree
-from torch import Tensor
-
 from keyss.core import BackendError, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
 from keyss.measure.robustness.conversions import find_package, transform
 from keyss.rendering.difference import cost
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
 
 VISIBLE = 0.05
 Writer = Callable[[Path, Path], object]  # from a .ply to a file

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
+import keyss  # noqa: F401  before torch, see `ruff.toml`
+
 import numpy as np
 import torch
 

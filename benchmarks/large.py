@@ -23,12 +23,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import keyss  # noqa: F401  before torch, see `ruff.toml`
+
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.trained_like import trained_like
 from keyss import read_model, write_model
+from channels.low_bits.trained_like import trained_like
 from keyss.channels.low_bits import LOW_BITS
 from keyss.channels.rooms import room_in
 from keyss.methods.records.embedding import embed_models, embed_whole

@@ -16,12 +16,12 @@ import sys
 import time
 import zipfile
 
-import numpy as np
-import torch
-
 from keyss.core import Gaussians, InputError
 from keyss.files.formats import spz
 from keyss.files.models import MemoryInput, model_bytes, read_source
+
+import numpy as np
+import torch
 
 SECONDS = 2.0  # that one file of a few kilobytes may take
 ROOM = 2 << 30  # bytes that all of them may take beside what the program has

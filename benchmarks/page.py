@@ -19,13 +19,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from playwright.sync_api import sync_playwright
-
 import keyss
 from keyss.core.gaussians import Gaussians
 from keyss.methods.carry.options import CarryOptions
 from keyss.viewer.page import export_html
+
+import torch
+from playwright.sync_api import sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
-import numpy as np
-
 from keyss.rendering.cpu.layout import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -22,6 +19,9 @@ from keyss.rendering.cpu.layout import (
     Y,
 )
 from keyss.rendering.cpu.rasterization import Drawing
+
+import numba
+import numpy as np
 
 
 def blended_pairs(drawing: Drawing, width: int, height: int) -> int:

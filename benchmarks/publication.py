@@ -14,8 +14,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from codes import against_photos
 from keyss import reveal
+from codes import against_photos
 from keyss.core.errors import BackendError, KeyssError
 from keyss.measure.robustness.conversions import Converter, converters
 from keyss.runs.opening import HidingRun, open_run

@@ -22,13 +22,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-import numpy as np
-import torch
-from cryptography.hazmat.primitives.ciphers import Cipher
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.ciphers.modes import CTR
-from threadpoolctl import threadpool_limits
-
 from benchmark_record import RESULTS, make_record, read_record, regressions, write_record
 from channels.low_bits.trained_like import trained_like
 from keyss.fitting.config import FitConfig
@@ -37,6 +30,13 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.rendering import render
 from methods.carry.carried import embed, extract
 from rasterizer import camera_before, made_up
+
+import numpy as np
+import torch
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.modes import CTR
+from threadpoolctl import threadpool_limits
 
 BASELINE = RESULTS / "quick" / "baseline.json"
 TOLERANCE = 0.5  # share by which a ratio may grow; it grew by up to 0.4 when five others used the machine

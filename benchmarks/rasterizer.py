@@ -19,9 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
 from benchmark_record import make_record, numbers_of_table, processor_name, write_record
 from keyss.core import Camera, Gaussians
@@ -32,6 +29,9 @@ from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.rendering import rasterization, render
 from pair_count import blended_pairs
+
+import torch
+from torch import Tensor
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))

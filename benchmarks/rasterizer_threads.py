@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
-import torch
-
 from keyss.rendering import rasterization
 from keyss.rendering.cpu import rasterization as cpu
 from keyss.rendering.cpu.layout import CHUNK, TILE_RUN
 from rasterizer import CASES, Case, load_kernels, table
+
+import numpy as np
+import torch
 
 THREADS = (1, 2, 4, 8, 16, 32)
 _WHOLE = ("sort_by_depth", "share_bounds", "offsets_from_counts")  # not divided into pieces

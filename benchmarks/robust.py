@@ -39,10 +39,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-import torch
-from scipy.spatial.transform import Rotation
-
 from keyss.channels.robust import RobustCover, embed, extract, repaired
 from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -54,6 +50,10 @@ from keyss.measure.robustness.conversions import converters
 from keyss.rendering.difference import Viewpoints, cost
 from keyss.rendering.orbit import orbit
 from robust_payloads import run_payloads
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 Change = Callable[[Gaussians], Gaussians]
 FIFTH = 0.2

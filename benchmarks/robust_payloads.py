@@ -15,14 +15,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from keyss.channels.robust import RobustCover
 from keyss.core.errors import BackendError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
 from keyss.measure.robustness import changes
 from keyss.rendering.difference import cost
+
+import numpy as np
 
 Change = Callable[[Gaussians], Gaussians]
 Embed = Callable[[RobustCover, float, int, bytes], Gaussians]  # cover, strength, number of the key, payload

@@ -17,13 +17,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import torch
-from PIL import Image
-from scipy.optimize import nnls
-
-from benchmark_record import processor_name
 from keyss import read_model, write_model
+from benchmark_record import processor_name
 from keyss.channels.low_bits import LOW_BITS
 from keyss.core import Gaussians
 from keyss.files.images import read_image
@@ -34,6 +29,11 @@ from keyss.methods.records.embedding import embed_models
 from keyss.rendering import render
 from keyss.runs.revealing import reveal_model
 from rasterizer import camera_before, load_kernels, made_up
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.optimize import nnls
 
 Size = dict[str, float]
 

@@ -27,6 +27,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import keyss  # noqa: F401  before torch, see `ruff.toml`
+
 import numpy as np
 import numpy.typing as npt
 import torch

@@ -17,9 +17,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from keyss.api import SecretFile, convert, hide_files, reveal_file
 from keyss.core import Gaussians, InputError, WrongKeyError
 from keyss.core.errors import BackendError
@@ -28,6 +25,9 @@ from keyss.files.scenes import load_scene
 from keyss.keys import derivation
 from keyss.measure.robustness.changes import fine_tuning
 from robust import FORMATS, OTHERS, Change
+
+import numpy as np
+import torch
 
 KEY = "a key of the benchmark 4711"
 CHANNELS: dict[str, dict[str, Any]] = {

@@ -20,8 +20,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.trained_like import trained_like
 from keyss import api, write_model
+from channels.low_bits.trained_like import trained_like
 from keyss.sweeps.engine import usable_cores
 from keyss.sweeps.running import How
 
