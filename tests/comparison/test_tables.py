@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
 from keyss.cli.tables import parts_within
+from keyss.comparison import sheet
 from keyss.comparison.record import (
     ComparedMethod,
     Comparison,
@@ -135,3 +137,11 @@ def test_parts_hold_all_columns_in_order_and_no_more_than_fit(
     for part in parts:
         line = "  ".join(max((row[index] for row in rows), key=len) for index in part)
         assert len(line) <= width or len(part) <= 2
+
+
+def test_no_heading_of_the_picture_is_cut() -> None:
+    """However narrow the pictures are."""
+    narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
+    picture = sheet._drawn([("photos", narrow)])
+    right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
+    assert (right == 255).all()

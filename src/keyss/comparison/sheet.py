@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,8 @@ from PIL import Image, ImageDraw, ImageFont
 from keyss.measure.images import renders_of
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.opening import HidingRun
+
+_TITLES = ("cover", "secret", "error of the secret, x4")
 
 
 def sheet(runs: Sequence[tuple[str, HidingRun]], device: Backend) -> Image.Image:
@@ -40,12 +43,16 @@ def _drawn(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], cell: int = 
         [each.resize((max(1, round(each.width * cell / each.height)), cell)) for each in own]
         for own in pictures
     ]
-    widths = [max(each.width for each in column) for column in zip(*scaled, strict=True)]
+    font = ImageFont.load_default(cell // 14)
+    widths = [
+        max(math.ceil(font.getlength(title)), *(each.width for each in column))
+        for title, column in zip(_TITLES, zip(*scaled, strict=True), strict=True)
+    ]
     size = label + sum(widths) + gap * (len(widths) + 1), head + (cell + gap) * len(rows) + gap
     sheet = Image.new("RGB", size, "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(cell // 14)
+    draw = ImageDraw.Draw(sheet)
     starts = [label + sum(widths[:index]) + gap * index for index in range(len(widths))]
-    for x, text in zip(starts, ("cover", "secret", "error of the secret, x4"), strict=False):
+    for x, text in zip(starts, _TITLES, strict=True):
         draw.text((x, gap), text, fill=(20, 20, 20), font=font)
     for number, ((name, _), own) in enumerate(zip(rows, scaled, strict=True)):
         y = head + (cell + gap) * number
