@@ -321,7 +321,11 @@ def main() -> None:
     )
     text = "\n\n".join([heading, *(table(titles, rows) for titles, rows in tables)])
     print(text)
-    numbers = {name: value for each in tables for name, value in numbers_of_table(*each).items()}
+    numbers = {
+        f"{titles[0]}: {name}": value  # two tables have a column `backward`
+        for titles, rows in tables
+        for name, value in numbers_of_table(titles, rows).items()
+    }
     ratios = {name: value for name, value in numbers.items() if name.endswith("step / rasterizer")}
     print(write_record(make_record("rasterizer", numbers, ratios)))
     if options.write is not None:

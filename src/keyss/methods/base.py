@@ -57,7 +57,7 @@ class Outlook:
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each
     # By way of which pictures of the cover and of each secret are made, untrained; () where there are none.
     networks: tuple[PictureNetwork | None, ...] = ()
-    # What all Gaussians go through in a step of it, and how often; None where they are drawn as they are.
+    # What all Gaussians go through in a step of it, None where they are drawn as they are; and how often.
     decode: Callable[[Gaussians], Gaussians] | None = None
     decodings: float = 0.0
 

@@ -158,8 +158,6 @@ def decoder_shape(options: LearnedOptions) -> DecoderShape:
 
 def decodings(options: LearnedOptions, secrets: int) -> float:
     """How often all Gaussians go through a decoder in a step of the joint training, in the mean."""
-    if options.start == "warm":
-        return 0.0
     return secrets + (1 / options.incorrect_every if options.conditioning == "bias" else 0.0)
 
 
