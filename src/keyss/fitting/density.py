@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -74,12 +74,15 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        """By the meta of renders, or by the statistics of all ranks' renders."""
-        if not set(_STATISTICS) <= set(info):
-            super()._update_state(params, state, info, packed)
-            return
-        for name in _STATISTICS:
-            state[name] = info[name] if state[name] is None else state[name] + info[name]
+        """By the meta of renders, or by the statistics of all ranks' renders.
+
+        Of renders it adds up what gsplat does, without picking out the Gaussians that are seen: on a CPU that
+        takes a twelfth of a small step.
+        """
+        known = set(_STATISTICS) <= set(info)
+        for values in [[info[name] for name in _STATISTICS]] if known else _seen_by_cameras(info):
+            for name, each in zip(_STATISTICS, values, strict=True):
+                state[name] = each if state[name] is None else state[name] + each
 
     @torch.no_grad()
     def _grow_gs(
@@ -104,6 +107,16 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         if 0 < count < len(pruned):
             remove(params=params, optimizers=optimizers, state=state, mask=pruned)
         return count
+
+
+def _seen_by_cameras(info: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
+    """`_STATISTICS` of each camera of a render's meta; gradients are those on a screen from -1 to 1."""
+    gradients = info["means2d"].grad  # [C, N, 2]
+    halves = gradients.new_tensor([info["width"] / 2, info["height"] / 2]) * info["n_cameras"]
+    for gradient, radii in zip(gradients, info["radii"], strict=True):
+        seen = (radii[:, 0] > 0) & (radii[:, 1] > 0)
+        norms = torch.linalg.vector_norm(gradient * halves, dim=-1)
+        yield torch.where(seen, norms, 0), seen.float()
 
 
 def draw_views(
