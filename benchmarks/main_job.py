@@ -1,0 +1,126 @@
+"""What one hiding takes from photos to a measured result, against an older commit, and its fits side by side.
+
+    python benchmarks/main_job.py --cover bonsai --secret fox --against 2f752b1
+    python benchmarks/main_job.py --cover bonsai --secret fox --fits
+
+`keyss hide` as it is typed, in a process of its own, with the working tree and with the older commit in
+turns. With `--fits` also `keyss fit` of both scenes: one after the other with all threads, and side by side
+with half of them each. Each tree first hides for a few steps, so that its kernels are compiled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+KEY = "Xq7Rf2LmZ9aT+001"
+FEW = 60  # steps
+LIBRARIES = ("OMP", "MKL", "NUMBA")  # that have threads, as the names of their settings begin
+
+Command = list[object]
+Times = tuple[float, float]  # seconds and processor seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--cover", type=Path, required=True)
+    parser.add_argument("--secret", type=Path, required=True)
+    parser.add_argument("--against", metavar="COMMIT")
+    parser.add_argument("--fits", action="store_true")
+    parser.add_argument("--width", type=int, default=200)
+    parser.add_argument("--max-gaussians", type=int, default=20_000)
+    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--repeats", type=int, default=2)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        found = hidings(options, Path(name))
+        if options.fits:
+            found |= fits(options, Path(name))
+    print(f"{options.iterations} steps, {options.threads} thread(s); the least of {options.repeats}\n")
+    print("| | seconds | processor seconds |\n| --- | --- | --- |")
+    for what, times in found.items():
+        print(f"| {what} | {min(each[0] for each in times):.1f} | {min(each[1] for each in times):.1f} |")
+
+
+def hidings(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]:
+    """Whole hidings, by the tree that ran them."""
+    (folder / "key.txt").write_text(KEY)
+    scenes = ["--cover", options.cover.resolve(), "--secret", options.secret.resolve()]
+    job = ["hide", *scenes, "--key-file", folder / "key.txt", *sizes(options)]
+    found: dict[str, list[Times]] = {}
+    with older_tree(options.against, folder / "older") as older:
+        trees = {"hide, this tree": ROOT, **older}
+        for what, tree in trees.items():
+            few = ["--iterations", FEW, "--min-psnr", 0, "-o", folder / f"first, {what}"]
+            timed(tree, [[*job, *few]], options.threads)
+        for number in range(options.repeats):
+            for what, tree in trees.items():
+                command = [*job, "--iterations", options.iterations, "-o", folder / f"{number}, {what}"]
+                found.setdefault(what, []).append(timed(tree, [command], options.threads))
+    return found
+
+
+def fits(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]:
+    """The plain models of both scenes, with as many threads in all."""
+    steps = ["--iterations", options.iterations]
+    found: dict[str, list[Times]] = {"fits, one after the other": [], "fits, side by side": []}
+    for number in range(options.repeats):
+        for what, times in found.items():
+            commands: list[Command] = [
+                ["fit", scene.resolve(), *sizes(options), *steps, "-o", folder / f"{number}, {what}, {role}"]
+                for role, scene in (("cover", options.cover), ("secret", options.secret))
+            ]
+            if what == "fits, side by side":
+                times.append(timed(ROOT, commands, max(1, options.threads // 2)))
+            else:
+                alone = [timed(ROOT, [command], options.threads) for command in commands]
+                times.append((sum(each[0] for each in alone), sum(each[1] for each in alone)))
+    return found
+
+
+def sizes(options: argparse.Namespace) -> Command:
+    return ["--width", options.width, "--max-gaussians", options.max_gaussians, "--seed", 0]
+
+
+@contextmanager
+def older_tree(commit: str | None, place: Path) -> Iterator[dict[str, Path]]:
+    """The tree of a commit in a folder, by what its hidings are called; none without one."""
+    if commit is None:
+        yield {}
+        return
+    git = ["git", "-C", ROOT, "worktree"]
+    subprocess.run([*git, "add", "--detach", place, commit], check=True)
+    try:
+        yield {f"hide, {commit}": place}
+    finally:
+        subprocess.run([*git, "remove", "--force", place], check=True)
+
+
+def timed(tree: Path, commands: list[Command], threads: int) -> Times:
+    """What the `keyss` of a tree takes for commands at the same time. Raises SystemExit where one fails."""
+    environment = os.environ | {f"{library}_NUM_THREADS": str(threads) for library in LIBRARIES}
+    environment["PYTHONPATH"] = str(tree / "src")
+    before, start = os.times(), time.perf_counter()
+    running = [
+        subprocess.Popen([sys.executable, "-m", "keyss", *map(str, command)], env=environment, cwd=tree)
+        for command in commands
+    ]
+    statuses = [process.wait() for process in running]
+    if any(statuses):
+        raise SystemExit("a command failed")
+    seconds, after = time.perf_counter() - start, os.times()
+    spent = [each.children_user + each.children_system for each in (before, after)]
+    return seconds, spent[1] - spent[0]
+
+
+if __name__ == "__main__":
+    main()
