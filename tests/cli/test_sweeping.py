@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cli.said import Said
 from keyss.keys.master import MasterKey
-from sweeps.test_sweep import real_spec
+from sweeps.fakes import real_spec
 
 MASTER = "q7Rv2LxT9bWm4KzDq7Rv2L"
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import keyss
+from tiny_scenes import random_gaussians, tiny_scene
+
 TESTS = str(Path(__file__).parents[1])
 
 # Takes a moment, and publishes what follows from the job alone. A job whose cover has "broken" in its name is
@@ -87,4 +90,26 @@ def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> P
         f"seeds: {list(range(seeds))}\n{more}"
     )
     (folder / "master.txt").write_text("q7Rv2LxT9bWm4KzDq7Rv2L\n")
+    return folder / "sweep.yaml"
+
+
+def real_spec(folder: Path, seeds: int) -> Path:
+    """A sweep of real models, of almost no size."""
+    keyss.write_model(folder / "a.ply", random_gaussians(300, seed=0))
+    keyss.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
+    return write_spec(folder, ["a.ply"], seeds, "width: 32\n")
+
+
+def training_spec(folder: Path) -> Path:
+    """A sweep of one cell that trains for long."""
+    from test_api import write_nerfstudio  # not for drivers, which import this file
+
+    write_nerfstudio(folder / "scene", tiny_scene())
+    keyss.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
+    (folder / "master.txt").write_text("q7Rv2LxT9bWm4KzDq7Rv2L\n")
+    (folder / "sweep.yaml").write_text(
+        "pairs:\n  - {cover: scene, secrets: [secret.ply]}\n"
+        "methods:\n  - method: carry\n"
+        "    options: {publish: any, fit.iterations: 40000, fit.max_gaussians: 500}\n"
+    )
     return folder / "sweep.yaml"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -132,6 +133,35 @@ def test_another_master_key_is_refused(folder: Path) -> None:
     (folder / "master.txt").write_text("another-key-for-7Qx2")
     with pytest.raises(OutputError, match="another master key"):
         hide(folder)
+
+
+def test_another_key_in_a_key_file_is_not_taken_for_the_one_before(folder: Path) -> None:
+    key_file, how = folder / "key.txt", How(1, command=fake())
+    manifest(folder, "cover,secret,out,key_file\na.ply,secret.ply,x,key.txt\n")
+
+    def run(**options: Any) -> api.BatchResult:
+        return api.hide_batch(folder / "assets.csv", folder / "out", how=how, **options)
+
+    key_file.write_text(KEY)
+    assert run().failed == ()
+    assert run().assets[0].skipped
+    key_file.rename(folder / "moved.txt")
+    manifest(folder, "cover,secret,out,key_file\na.ply,secret.ply,x,moved.txt\n")
+    assert run().assets[0].skipped
+    (folder / "moved.txt").write_text(KEY[::-1])
+    assert "made with another key" in str(run().failed[0].error)
+    again = run(overwrite=True)
+    assert again.failed == ()
+    assert not again.assets[0].skipped
+    assert run().assets[0].skipped
+    assert not any(KEY[::-1].encode() in path.read_bytes() for path in (folder / "out").rglob("*.*"))
+
+
+def test_a_name_that_no_file_can_have_does_not_stop_the_others(folder: Path) -> None:
+    manifest(folder, HEAD + f"a.ply,secret.ply,{'x' * 300}\na.ply,secret.ply,y\n")
+    long, other = hide(folder).assets
+    assert "cannot write" in str(long.error)
+    assert other.error is None
 
 
 @pytest.mark.counted

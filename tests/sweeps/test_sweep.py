@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,17 +15,16 @@ import numpy as np
 import pytest
 import scipy.stats
 
-import keyss
 from keyss import api
 from keyss.core import InputError, OutputError
+from keyss.runs.folder import MANIFEST
 from keyss.sweeps.job import checksum
 from keyss.sweeps.running import How
 from keyss.sweeps.spec import read_spec, variants
 from keyss.sweeps.sweep import estimates
 from keyss.sweeps.tables import CellNumbers, half_interval, summaries, write_tables
-from sweeps.fakes import DRIVER, REAL, fake, write_spec
+from sweeps.fakes import DRIVER, REAL, fake, real_spec, training_spec, write_spec
 from sweeps.killing import kill_until_done, results, until
-from tiny_scenes import random_gaussians
 
 GOOD = """
 pairs:
@@ -74,6 +75,8 @@ def test_a_grid_is_every_choice_with_every_other(files: Path) -> None:
         ("methods:", "width: &x 3\nseeds: [*x]\nmethods:", "aliases"),
         ("methods:", "width: !!python/object/apply:os.system [ls]\nmethods:", "expected YAML"),
         ("{cover", "{{{cover", "expected YAML"),
+        ("methods:", "  - {cover: b.ply, secrets: [a.ply], name: a-b}\nmethods:", "called 'a-b' as [0] is"),
+        ("methods:", "methods:\n  - {method: learned, preset: best}", "[1]: called 'learned' as [0] is"),
     ],
 )
 def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
@@ -129,6 +132,48 @@ def test_a_cell_runs_again_when_its_data_options_or_result_changed(tmp_path: Pat
 
 
 @pytest.mark.counted
+def test_a_folder_is_what_its_links_lead_to(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / "photos" / name).mkdir(parents=True)
+        (tmp_path / "photos" / name / "0.png").write_text(name)
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "images").symlink_to(tmp_path / "photos" / name)
+    assert checksum(str(tmp_path / "one")) != checksum(str(tmp_path / "two"))
+    (tmp_path / "one" / "again").symlink_to(tmp_path / "one")
+    checksum.cache_clear()
+    with pytest.raises(InputError, match="again leads into itself"):
+        checksum(str(tmp_path / "one"))
+
+
+def test_results_are_not_written_into_what_is_given_away(tmp_path: Path) -> None:
+    publish = tmp_path / "run" / "publish"
+    publish.mkdir(parents=True)
+    (tmp_path / "run" / "private").mkdir()
+    (tmp_path / "run" / MANIFEST).touch()
+    with pytest.raises(OutputError, match="given away"):
+        api.sweep(write_spec(tmp_path, ["a.ply"], seeds=1), publish / "sweep")
+
+
+def test_a_folder_that_is_there_stays_open_to_whom_it_was(tmp_path: Path) -> None:
+    out = tmp_path / "shared"
+    out.mkdir(mode=0o755)
+    api.sweep(write_spec(tmp_path, ["a.ply"], seeds=1), out, how=How(1, command=fake()))
+    assert out.stat().st_mode & 0o777 == 0o755
+    assert (out / "private").stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.counted
+def test_ctrl_c_leaves_what_a_cell_has_trained(tmp_path: Path) -> None:
+    """As a terminal does it: the signal goes to the whole group of processes."""
+    spec = training_spec(tmp_path)
+    command = [sys.executable, "-c", DRIVER, spec, tmp_path / "out", tmp_path / "master.txt", "real"]
+    with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE) as driver:
+        until(lambda: any(" 40000 steps" in log.read_text() for log in tmp_path.glob("out/cells/*/log.txt")))
+        os.killpg(driver.pid, signal.SIGINT)
+        driver.communicate(timeout=60)
+    assert list(tmp_path.glob("out/cells/*/run/private/checkpoint/*.safetensors"))
+
+
 def test_what_dies_is_tried_again_and_what_is_refused_is_not(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["mortal.ply", "broken.ply", "a.ply"], seeds=1)
     result = api.sweep(spec, tmp_path / "out", how=How(1, retries=2, command=fake()))
@@ -185,12 +230,6 @@ def test_killed_at_any_moments_it_ends_as_if_nothing_had_happened(tmp_path: Path
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
     assert len(results(tmp_path / "out")) == 3 * seeds
     assert list((tmp_path / "out").rglob("*.unfinished")) == []
-
-
-def real_spec(folder: Path, seeds: int) -> Path:
-    keyss.write_model(folder / "a.ply", random_gaussians(300, seed=0))
-    keyss.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
-    return write_spec(folder, ["a.ply"], seeds, "width: 32\n")
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from keyss._verbs.asking import Secret
 from keyss._verbs.fitting import fit
 from keyss._verbs.hiding import hide
 from keyss._verbs.planning import plan
+from keyss._verbs.shared_folder import Begun, alone_in, begin, begun_before
 from keyss.comparison.measuring import PlainCovers, measured
 from keyss.comparison.record import ComparedMethod, Comparison
 from keyss.comparison.sheet import sheet
@@ -33,12 +34,11 @@ from keyss.runs.config import PathLike
 from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import HidingRun, as_scene, open_run
-from keyss.runs.planning import PlannedRun
+from keyss.runs.planning import PlannedRun, plain_stage
 from keyss.runs.records import read_record, write_record
 
 RECORD, TABLE, PICTURE, KEY = "comparison.json", "comparison.md", "comparison.png", "key.txt"
 CONTROLS = 2  # plain models of the cover from other seeds, beside which published ones are judged
-_BEGUN = "arguments.json"
 _ROLES = ("cover", "secret")
 _PLAIN = "plain-"
 _CONTROL_NAMES = tuple(f"control-{number}" for number in range(1, CONTROLS + 1))
@@ -48,15 +48,6 @@ EVERY = tuple(
 )
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Begun:
-    """What a comparison was told."""
-
-    version: int = 1
-    told: dict[str, Any]
-    seed: int
 
 
 @dataclass(frozen=True)
@@ -125,47 +116,51 @@ def compare(
     chosen, fit = _asked(cover, secret, methods, iterations, max_gaussians)
     folder = Path(out)
     told: dict[str, Any] = {"cover": os.path.realpath(cover), "secret": os.path.realpath(secret)}
-    told |= {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
-    seed = _begin(folder, told, seed, resume)
-    key = read_text(folder / KEY).strip()
-    fit = replace(fit, seed=seed)
-    changes = {"max_gaussians": fit.max_gaussians, "seed": seed}
-    plain_models = _PlainModels(folder, {"cover": cover, "secret": secret}, fit, width, device, reporter)
-    rows = []
-    for name, method, options in chosen:
-        place, done = _place(folder, name), _row_file(folder, name)
-        if (row := _row(done)) is not None:
-            rows.append(row)
-            continue
-        own = key if method.capabilities.keys else ""
-        options, steps = within(fit.iterations, options)
-        plain = [] if is_run(place) else [plain_models.of(*each) for each in zip(_ROLES, steps, strict=True)]
-        try:
-            if plain:
-                hide(
-                    cover,
-                    [Secret(secret, own, plain[1])],
-                    method=options.with_fit(**changes),
-                    width=width,
-                    cover_model=plain[0],
-                    min_psnr=0,  # however bad it is
-                    device=device,
-                    out=place,
-                    resume=read_manifest(place).running is not None,
-                    reporter=reporter,
-                )
-            run = open_run(place, [own] if own else [])
-            rows.append(measured(name, run, plain_models.judging, device))
-            write_record(done, rows[-1])
-        except KeyssError as error:
-            rows.append(ComparedMethod(name=name, error=str(error), capabilities=method.capabilities))
-    found = Comparison(arguments=told | {"seed": seed}, methods=tuple(rows))
-    write_record(folder / RECORD, found)
-    write_bytes(folder / TABLE, markdown(found).encode())
-    picture = io.BytesIO()
-    sheet(_runs(folder, found), device).save(picture, "PNG", optimize=True)
-    write_bytes(folder / PICTURE, picture.getvalue())
-    return found
+    told |= {"iterations": fit.iterations, "max_gaussians": fit.max_gaussians, "width": width}
+    with alone_in(folder):
+        seed = _begin(folder, told, seed, resume)
+        fit = replace(fit, seed=seed)
+        key = read_text(folder / KEY).strip()
+        changes = {"max_gaussians": fit.max_gaussians, "seed": seed}
+        plain_models = _PlainModels(folder, {"cover": cover, "secret": secret}, fit, width, device, reporter)
+        rows = []
+        for name, method, options in chosen:
+            place, done = _place(folder, name), _row_file(folder, name)
+            if (row := _row(done)) is not None:
+                rows.append(row)
+                continue
+            own = key if method.capabilities.keys else ""
+            options, steps = within(fit.iterations, options)
+            plain = []
+            if not is_run(place):
+                plain = [plain_models.of(*each) for each in zip(_ROLES, steps, strict=True)]
+            try:
+                if plain:
+                    hide(
+                        cover,
+                        [Secret(secret, own, plain[1])],
+                        method=options.with_fit(**changes),
+                        width=width,
+                        cover_model=plain[0],
+                        min_psnr=0,  # however bad it is
+                        device=device,
+                        out=place,
+                        resume=read_manifest(place).running is not None,
+                        reporter=reporter,
+                    )
+                run = open_run(place, [own] if own else [])
+                rows.append(measured(name, run, plain_models.judging, device))
+                write_record(done, rows[-1])
+            except KeyssError as error:
+                rows.append(ComparedMethod(name=name, error=str(error), capabilities=method.capabilities))
+        found = Comparison(arguments=told | {"seed": seed}, methods=tuple(rows))
+        write_record(folder / RECORD, found)
+        write_bytes(folder / TABLE, markdown(found).encode())
+        if runs := _runs(folder, found):
+            picture = io.BytesIO()
+            sheet(runs, device).save(picture, "PNG", optimize=True)
+            write_bytes(folder / PICTURE, picture.getvalue())
+        return found
 
 
 def plan_comparison(
@@ -199,7 +194,7 @@ def plan_comparison(
             continue
         seconds = {stage.name: stage.seconds for stage in planned.stages}
         for role, count in zip(_ROLES, steps, strict=True):
-            whole = seconds.pop(f"plain model of the {role}")
+            whole = seconds.pop(plain_stage(role))
             needed = [(_plain_name(role, count, fit), count)]
             needed += [(each, fit.iterations) for each in _CONTROL_NAMES if role == "cover"]
             for each, own in needed:
@@ -251,7 +246,8 @@ def within(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
     """Options, and steps of plain models of cover and secret, so that each scene has `iterations` in all."""
     goes_on = [each.goes_on and each.steps > 0 for each in options.training(2)]
     plain = iterations - iterations // 2
-    options = options.with_fit(iterations=iterations // 2 if any(goes_on) else iterations)
+    own = max(1, iterations // 2) if any(goes_on) else iterations
+    options = options.with_fit(iterations=own)
     return options, [plain if each else iterations for each in goes_on]
 
 
@@ -266,21 +262,15 @@ def _named(text: str) -> tuple[str, Method, MethodOptions]:
 
 def _begin(folder: Path, told: dict[str, Any], seed: int | None, resume: bool) -> int:
     """The seed of the comparison that is in `folder` from now on. Raises OutputError."""
-    begun = folder / _BEGUN
-    if folder.exists() and any(folder.iterdir()):
-        if not begun.exists():
-            raise OutputError(f"{folder} holds something else: choose another folder")
-        before = read_record(begun, _Begun)
+    if (before := begun_before(folder)) is not None:
         if not resume:
             raise OutputError(f"{folder} holds a comparison: `resume=True` goes on with it")
         if before.told != told or seed not in (None, before.seed):
             raise OutputError(f"{folder} holds a comparison with other arguments: give the same ones")
         return before.seed
     seed = FitConfig(seed=seed).seeded().known_seed
-    folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / KEY, f"{generate_key()}\n".encode())
-    (folder / KEY).chmod(0o600)
-    write_record(begun, _Begun(told=told, seed=seed))
+    begin(folder, Begun(told=told, seed=seed))
     return seed
 
 

@@ -147,6 +147,7 @@ def hide(
         )
     inputs = inputs_of(sources, models)
     options = chosen.prepare(inputs, options)
+    fitted = [_steps_of(model, options.fit) for model in models]
     if folder:
         check_disk(folder.path, chosen, options, inputs)
     trains = chosen.trains or any(each.model is None for each in inputs)
@@ -183,7 +184,6 @@ def hide(
             ]
             _check_quality(shown, min_psnr)
         photos = tuple(each.photos for each in inputs)
-        fitted = [_steps_of(model, options.fit) for model in models]
         bounds = list(map(Bound.of, options.training(len(scenes)), fitted))
         longer = _longer(bounds, scenes, plain, photos, stego, options, context) if bound else {}
         if ranks.first:

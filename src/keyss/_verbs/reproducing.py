@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from keyss._verbs.asking import Secret
 from keyss._verbs.comparing import fitted_once
 from keyss._verbs.hiding import hide
 from keyss._verbs.planning import plan
+from keyss._verbs.shared_folder import Begun, alone_in, begin, begun_before
 from keyss.core.errors import KeyssError, OutputError
 from keyss.files.atomic import write_bytes
 from keyss.files.reading import read_text
@@ -21,6 +22,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.keys import generate_key
 from keyss.methods import registry
+from keyss.methods.base import role_of
 from keyss.reproduction import downloading
 from keyss.reproduction.asking import PaperTable, Setting, benchmark_scenes, setting_of
 from keyss.reproduction.measuring import MEASURES
@@ -31,19 +33,10 @@ from keyss.runs.config import PathLike
 from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import open_run
-from keyss.runs.planning import PlannedRun
+from keyss.runs.planning import PlannedRun, plain_stage
 from keyss.runs.records import read_record, write_record
 
-_BEGUN, _PLAIN, _SCENES = "arguments.json", "plain", "scenes"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Begun:
-    """What the first table in a folder was told; all others there are made so, and share its runs."""
-
-    version: int = 1
-    told: dict[str, Any]
-    seed: int
+_PLAIN, _SCENES = "plain", "scenes"
 
 
 def reproduce(
@@ -57,7 +50,11 @@ def reproduce(
     for scenes and arguments that cannot be, Interrupted.
     """
     asked = setting_of(table, Path(out))
-    seed = _begin(asked, seed)
+    with alone_in(asked.out):
+        return _reproduced(asked, _begin(asked, seed), reporter)
+
+
+def _reproduced(asked: Setting, seed: int, reporter: Reporter | None) -> Reproduction:
     folders = asked.folders
     if asked.data is not None:
         names = sorted({name for group in asked.groups for name in group})
@@ -80,8 +77,8 @@ def reproduce(
         arguments={"scale": asked.scale, **asked.sizes, "seed": seed},
         failures=failures,
     )
-    write_record(asked.out / f"{table.table}.json", result)
-    write_bytes(asked.out / f"{table.table}.md", markdown(result).encode())
+    write_record(asked.out / f"{asked.table.name}.json", result)
+    write_bytes(asked.out / f"{asked.table.name}.md", markdown(result).encode())
     return result
 
 
@@ -114,8 +111,7 @@ def plan_reproduction(table: PaperTable, *, out: PathLike) -> list[PlannedRun]:
                 times[kind] = _stages(asked, cell, [folders[each] for each in group])
             stages = dict(times[kind])
             for index, each in enumerate(group):
-                role = "cover" if not index else "secret" if len(group) == 2 else f"secret {index}"
-                seconds = stages.pop(f"plain model of the {role}", 0.0)
+                seconds = stages.pop(plain_stage(role_of(index, len(group))))
                 if each not in fitted:
                     fitted.add(each)
                     done = (asked.out / _PLAIN / each / MODEL).exists()
@@ -134,14 +130,10 @@ def _stages(asked: Setting, cell: Cell, paths: Sequence[Path]) -> dict[str, floa
 
 
 def _begin(asked: Setting, seed: int | None) -> int:
-    """The seed of all tables in the folder. Raises OutputError for a folder that holds something else."""
+    """The seed of all tables in the folder, which share their runs. Raises OutputError for another folder."""
     told: dict[str, Any] = {"scale": asked.scale, **asked.sizes}
     scenes = {name: str(path) for name, path in asked.folders.items()}
-    begun = asked.out / _BEGUN
-    if asked.out.exists() and (not asked.out.is_dir() or any(asked.out.iterdir())):
-        if not begun.exists():
-            raise OutputError(f"{asked.out} holds something else: choose another folder")
-        before = read_record(begun, _Begun)
+    if (before := begun_before(asked.out)) is not None:
         known = before.told.pop("scenes", {})
         same = all(known.get(name, path) == path for name, path in scenes.items())
         if before.told != told or seed not in (None, before.seed) or not same:
@@ -152,8 +144,7 @@ def _begin(asked: Setting, seed: int | None) -> int:
         seed, scenes = before.seed, known | scenes
     else:
         seed = FitConfig(seed=seed).seeded().known_seed
-        asked.out.mkdir(parents=True, exist_ok=True)
-    write_record(begun, _Begun(told=told | {"scenes": scenes}, seed=seed))
+    begin(asked.out, Begun(told=told | {"scenes": scenes}, seed=seed))
     return seed
 
 
@@ -211,7 +202,6 @@ def _key(out: Path, index: int) -> str:
     path = out / f"key-{index}.txt"
     if not path.exists():
         write_bytes(path, f"{generate_key()}\n".encode())
-        path.chmod(0o600)
     return read_text(path).strip()
 
 

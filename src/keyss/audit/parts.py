@@ -12,11 +12,11 @@ from torch import Tensor
 from keyss.audit.progress import PartProgress, PartResult
 from keyss.audit.subject import AuditSubject
 from keyss.core.errors import BackendError
-from keyss.files.images import picture_name
+from keyss.files.images import picture_names
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_controls
 from keyss.measure.histograms import histograms
-from keyss.measure.images import compare_images, renders_of
+from keyss.measure.images import compare_images, photos_of, renders_of
 from keyss.measure.leaks.attacks import decoder_attack, file_attacks, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
 from keyss.measure.robustness.survival import breakdown_points
@@ -59,7 +59,7 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
         progress(index, len(names))
         role = "secret" if index and len(names) == 2 else name.replace("-", " ")
         reference = "photo" if subject.run.metrics.photos[index] else "given model"
-        photos = [(picture_name(view.camera), view.image) for view in scene.test]
+        photos = photos_of(scene.test)
         renders = {"stego model" if index == 0 else "revealed": renders_of(model, scene, scene.test)}
         if plain is not None:
             renders["plain model"] = renders_of(plain, scene, scene.test)
@@ -139,7 +139,7 @@ def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
         except BackendError as error:
             missing = str(error)  # which says how to get it
         found.append(RenderDetection(stegexpose_roc(plain, others), sealwatch))
-    names = tuple(picture_name(view.camera) for view in views)
+    names = tuple(picture_names(view.camera for view in views))
     return PartResult(RendersResult(names, found[0], found[1], missing))
 
 

@@ -80,10 +80,10 @@ def schedule(
     return {name: value for name, value in asked.items() if value is not None}
 
 
-def checked_seed(seed: int) -> int:
+def checked_seed(seed: int, most: int = 2**32 - 1) -> int:
     """The seed, if every generator takes it. Raises UsageError."""
     from keyss.core.errors import UsageError
 
-    if not 0 <= seed < 2**32:
-        raise UsageError(f"--seed: expected 0 to {2**32 - 1}, got {seed}")
+    if not 0 <= seed <= most:
+        raise UsageError(f"--seed: expected 0 to {most}, got {seed}")
     return seed

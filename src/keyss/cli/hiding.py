@@ -38,6 +38,7 @@ from keyss.cli.sweeping import hide_assets
 if TYPE_CHECKING:
     from keyss.channels.rooms import AnyChannel, Publish
 
+_MIN_PSNR = 20.0  # as `keyss.api.hide` has it; its module would take a second to load
 _HOW = ("byte for byte as it is", "as it is, or converted")  # to publish
 
 
@@ -112,7 +113,7 @@ def hide(
     ] = False,
     min_psnr: Annotated[
         float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
-    ] = 20.0,
+    ] = _MIN_PSNR,
     dry_run: Annotated[
         bool, arg(help="Print plan, room, and estimates of time, memory and disk; write nothing.")
     ] = False,
@@ -160,7 +161,10 @@ def hide(
             "--cover-model": cover_model,
         }
         unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
-        unused |= {"--tensorboard": tensorboard, "--live": live, "--bound": bound}
+        unused |= {"--tensorboard": tensorboard, "--live": live, "--bound": bound, "--width": width}
+        unused |= {"--max-gaussians": max_gaussians, "--views-per-step": views_per_step}
+        unused |= {"--seed": seed is not None, "--min-psnr": min_psnr != _MIN_PSNR}
+        unused |= {f"--{name.replace('_', '-')}": value for name, value in own.items()}
         if given_too := [flag for flag, value in unused.items() if value]:
             raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
         _hide_files(cover, secret_file, publish, channel or "colours", repair, key_file, out, overwrite)

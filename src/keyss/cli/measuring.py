@@ -38,6 +38,7 @@ def evaluate(
     from keyss import api
     from keyss.cli.keys import hinting_at_white_space, keys_of_run
     from keyss.cli.tables import print_files, print_hiding
+    from keyss.fitting.config import MOST_SEED
 
     chosen = keys_of_run(run, key_file)
     with hinting_at_white_space(chosen):
@@ -45,7 +46,7 @@ def evaluate(
             run,
             chosen,
             wrong_keys=wrong_keys,
-            seed=None if seed is None else checked_seed(seed),
+            seed=None if seed is None else checked_seed(seed, MOST_SEED),
             device=device,
         )
     print_hiding(metrics)

@@ -76,7 +76,7 @@ def reproduce(
     """
     from keyss import api
     from keyss.cli.tables import print_files, print_planned_runs
-    from keyss.core.errors import UsageError
+    from keyss.core.errors import InputError, UsageError
     from keyss.progress import reporter
 
     asked = api.PaperTable(
@@ -108,6 +108,8 @@ def reproduce(
             "runs": "what was run: further tables use it",
         },
     )
+    if found.failures:
+        raise InputError(f"{len(found.failures)} run(s) failed")
 
 
 def _print_table(found: Reproduction) -> None:

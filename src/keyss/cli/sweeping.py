@@ -115,6 +115,7 @@ def _end(failed: list[tuple[str, str | None]], count: int, what: str) -> None:
 
 def _print_estimates(found: list[Estimate], jobs: int | None) -> None:
     from rich.table import Table
+    from rich.text import Text
 
     from keyss.cli.tables import Console
     from keyss.progress import about
@@ -124,9 +125,9 @@ def _print_estimates(found: list[Estimate], jobs: int | None) -> None:
     for head in ("cell", "what", "time, about", "memory"):
         table.add_column(head, overflow="fold")
     for each in found:
-        cell, what = each.cell.id[:12], each.cell.planned.job.name
+        cell, what = each.cell.id[:12], Text(each.cell.planned.job.name)
         if each.refused is not None:
-            table.add_row(cell, what, "cannot work", each.refused)
+            table.add_row(cell, what, "cannot work", Text(each.refused))
         elif each.done:
             table.add_row(cell, what, "done", "")
         else:

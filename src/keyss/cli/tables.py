@@ -69,9 +69,9 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     console = console or Console()
     console.print(table)
     for line in _explanations(metrics, names, differ, shorter):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     for name, value in metrics.details.items():
-        console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False)
+        console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False, markup=False)
 
 
 def print_plan(plan: Plan) -> None:

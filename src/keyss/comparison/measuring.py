@@ -25,9 +25,8 @@ from keyss.comparison.record import (
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.images import picture_name
 from keyss.fitting.image_metrics import subsample_views
-from keyss.measure.images import compare_images, renders_of
+from keyss.measure.images import compare_images, photos_of, renders_of
 from keyss.measure.robustness.changes import Change, purification, random_pruning
 from keyss.measure.robustness.conversions import converters
 from keyss.measure.robustness.survival import robustness
@@ -125,7 +124,7 @@ def measured(name: str, run: HidingRun, covers: PlainCovers, device: Backend) ->
     for scene, model, plain, own in zip(
         scenes, (stego, revealed), run.plain_models(), (metrics.cover, metrics.secrets[0]), strict=True
     ):
-        photos = [(picture_name(view.camera), view.image) for view in scene.test]
+        photos = photos_of(scene.test)
         pictures = renders_of(model, scene, scene.test)
         beside = plain.to(target) if plain is not None else model
         times = render_time(name, model, beside, scene, rounds=_ROUNDS)

@@ -58,9 +58,19 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """1.1 x the largest distance of a training camera from their mean (3DGS's `cameras_extent`)."""
-        positions = camera_positions([view.camera for view in self.train])
-        return 1.1 * float((positions - positions.mean(0)).norm(dim=1).max())
+        """1.1 x the largest distance of a training camera from their mean (3DGS's `cameras_extent`).
+
+        Of cameras in one place, where that is 0 and nothing would move: from what they look at.
+        """
+        cameras = [view.camera for view in self.train]
+        positions = camera_positions(cameras)
+        reach = float((positions - positions.mean(0)).norm(dim=1).max())
+        if reach == 0:
+            from keyss.core.alignment import focus_point  # which needs this module
+
+            seen = self.points.double().mean(0) if len(self.points) else focus_point(cameras)
+            reach = float((positions[0].double() - seen).norm())
+        return 1.1 * reach
 
     def digest(self) -> str:
         """SHA-256 over all cameras, photos, points and the background: equal for equal content only."""

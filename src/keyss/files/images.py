@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +83,17 @@ def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def picture_name(camera: Camera) -> str:
-    """A flat file name for a picture from `camera`: folders in the camera's name become part of it."""
-    return Path(camera.name.replace("/", "_").replace("\\", "_")).stem + ".png"
+def picture_names(cameras: Iterable[Camera]) -> list[str]:
+    """A flat file name for a picture from each: folders in the camera's name become part of it.
+
+    Where two would have one name, the second gets a number: `a.png`, `a-2.png`.
+    """
+    names: list[str] = []
+    for camera in cameras:
+        stem = Path(camera.name.replace("/", "_").replace("\\", "_")).stem
+        numbered = (f"{stem}-{number}.png" for number in itertools.count(2))
+        names.append(next(each for each in itertools.chain([f"{stem}.png"], numbered) if each not in names))
+    return names
 
 
 def png_bytes(image: Tensor) -> bytes:

@@ -12,9 +12,10 @@ from keyss.core.errors import OutputError
 
 
 @contextmanager
-def lock(path: Path) -> Iterator[None]:
+def lock(path: Path, folder: Path | None = None) -> Iterator[None]:
     """Hold `path` while the block runs; the file is gone afterwards. The system frees it if the process dies.
 
+    `folder`: what it stands for, by default that in which the file's own folder lies.
     Raises OutputError when another process holds it, or the system refuses.
     """
     while True:
@@ -27,7 +28,7 @@ def lock(path: Path) -> Iterator[None]:
         except OSError as error:
             os.close(descriptor)
             raise OutputError(
-                f"{path.parent.parent}: process {_pid(path)} is at work in this folder"
+                f"{folder or path.parent.parent}: process {_pid(path)} is at work in this folder"
             ) from error
         try:
             if os.path.samestat(os.fstat(descriptor), os.stat(path, follow_symlinks=False)):

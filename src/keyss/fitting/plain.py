@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -164,8 +163,7 @@ def refit_model(
     rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
     config = replace(config.seeded(), sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
     run = PlainRun(scene, config, torch.device(device), model)
-    digest = hashlib.sha256(b"".join(values.numpy().tobytes() for values in vars(model).values()))
-    inputs = {"scene": scene.digest(), "model": digest.hexdigest()}
+    inputs = {"scene": scene.digest(), "model": model.digest()}
     seconds = _train(run, title, inputs, checkpoint, resume, reporter)
     return FitResult(run.gaussians().to("cpu"), config, seconds)
 

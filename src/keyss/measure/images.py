@@ -18,7 +18,7 @@ from torch import Tensor
 from keyss.core.errors import BackendError, InputError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.files.images import picture_name, read_image
+from keyss.files.images import picture_names, read_image
 from keyss.fitting.image_metrics import psnr
 from keyss.measure.lpips import lpips_alex
 from keyss.rendering import render
@@ -157,10 +157,17 @@ def _flip(a: Tensor, b: Tensor) -> float:
 
 
 @torch.no_grad()
+def photos_of(views: Sequence[View]) -> list[tuple[str, Tensor]]:
+    """Names and uint8 photos [H, W, 3] of views, as `renders_of` has its pictures."""
+    names = picture_names(view.camera for view in views)
+    return [(name, view.image) for name, view in zip(names, views, strict=True)]
+
+
 def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> list[tuple[str, Tensor]]:
     """Names and uint8 pictures [H, W, 3], on the CPU, of a model from the cameras of views of a scene."""
     background, found = scene.background.to(model.device), []
-    for view in views:
+    names = picture_names(view.camera for view in views)
+    for name, view in zip(names, views, strict=True):
         image = render(model, view.camera, background).clamp(0, 1)
-        found.append((picture_name(view.camera), (image * 255).round().to(torch.uint8).cpu()))
+        found.append((name, (image * 255).round().to(torch.uint8).cpu()))
     return found

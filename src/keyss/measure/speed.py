@@ -19,6 +19,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import DECODED_SUFFIX, read_model, write_model
 from keyss.files.ply import read_ply
+from keyss.files.ply_rows import is_compressed
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_package, transform
 from keyss.measure.robustness.survival import Reopen
@@ -45,9 +46,9 @@ class ReaderResult:
 
     reader: str
     file: str
-    loads: bool | None  # whether all values are those that we read, to the last bit; None: not installed
+    loads: bool | None  # whether all values are those that we read, to the last bit; None: not tried
     gaussians: int | None = None  # that it finds
-    note: str | None = None  # why it fails, or how to install it
+    note: str | None = None  # why it fails or was not tried, or how to install it
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,9 @@ def readers(path: Path) -> list[ReaderResult]:
     if path.name.endswith(DECODED_SUFFIX):
         note = "a network makes its pictures: it is no 3DGS model"
         return [ReaderResult(name, path.name, False, note=note) for name, _ in programs]
+    if path.suffix != ".ply" or is_compressed(path):
+        note = "only a .ply of floats has every number as it is"
+        return [ReaderResult(name, path.name, None, note=note) for name, _ in programs]
     expected = _columns_of(read_ply(path))
     found: list[ReaderResult] = []
     for name, read in programs:

@@ -6,6 +6,7 @@ folder tests for its name: what it can do it declares, and what it finds it give
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -255,6 +256,19 @@ class Method(Protocol):
 
     def unpack(self, content: Content) -> Opened:
         """The secret in what a channel gave or what was handed over. Raises InputError for damage."""
+
+
+def role_of(index: int, scenes: int) -> str:
+    """What scene `index` of so many is called: the cover comes first, and a single secret has no number."""
+    return "cover" if index == 0 else "secret" if scenes == 2 else f"secret {index}"
+
+
+def check_above_zero(options: object, *names: str) -> None:
+    """Raise UsageError for an option that is not a number above 0: what is divided by it would be none."""
+    for name in names:
+        value = getattr(options, name)
+        if not 0 < value < math.inf:
+            raise UsageError(f"`{name}`: expected a number above 0, got {value}")
 
 
 @contextmanager

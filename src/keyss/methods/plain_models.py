@@ -10,7 +10,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import of_secret
 from keyss.fitting.plain import fit_scene
-from keyss.methods.base import Context, Training
+from keyss.methods.base import Context, Training, role_of
 
 
 def plain_models(
@@ -28,13 +28,12 @@ def plain_models(
     models = []
     for index, (scene, model) in enumerate(zip(scenes, given, strict=True)):
         if model is None:
-            role = "cover" if index == 0 else "secret" if len(scenes) == 2 else f"secret {index}"
             folder = context.checkpoints
             model = fit_scene(
                 scene,
                 replace(config, seed=config.seed_of(f"plain model {index}")),
                 device=context.device,
-                title=f"plain model of the {role} ({scene.name})",
+                title=f"plain model of the {role_of(index, len(scenes))} ({scene.name})",
                 checkpoint=folder / f"plain-{index}.safetensors" if folder else None,
                 resume=context.resume,
                 reporter=context.reporter if index == 0 else of_secret(context.reporter),

@@ -128,8 +128,10 @@ def _table(asked: PaperTable) -> Table:
         near = nearest(asked.table, TABLES)
         meant = f"did you mean {near}?" if near else f"expected one of {', '.join(TABLES)}"
         raise UsageError(f"no table is called {asked.table!r}; {meant}")
-    if asked.most is not None and asked.most < 1:
-        raise UsageError(f"`most`: expected at least 1, got {asked.most}")
+    for name in ("most", "width"):
+        value = getattr(asked, name)
+        if value is not None and value < 1:
+            raise UsageError(f"`{name}`: expected at least 1, got {value}")
     return TABLES[asked.table]
 
 

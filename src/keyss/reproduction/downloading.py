@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import re
 import shutil
 import stat
@@ -122,9 +123,17 @@ def unzip_scene(archive: Path, name: str, images: str, target: Path) -> None:
                 out.parent.mkdir(parents=True, exist_ok=True)
                 with file.open(member) as source, out.open("xb") as written:
                     shutil.copyfileobj(source, written, 1 << 20)
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, ValueError, RuntimeError) as error:
         # NotImplementedError, a RuntimeError, is an unknown compression; others are passwords.
-        raise InputError(f"{archive}: cannot be unpacked: {error}; remove it to fetch it again") from error
+        raise _damaged(archive, error) from error
+    except OSError as error:
+        if error.errno is None:  # as bz2 has it for damage
+            raise _damaged(archive, error) from error
+        raise
+
+
+def _damaged(archive: Path, error: Exception) -> InputError:
+    return InputError(f"{archive}: cannot be unpacked: {error}; remove it to fetch it again")
 
 
 def _members(

@@ -20,7 +20,7 @@ from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.ranks import here
-from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput
+from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput, role_of
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
 from keyss.rendering.orbit import TEST_EVERY, VIEWS
@@ -106,14 +106,14 @@ def plan_hiding(
     sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
     stages = []
     for index, (probe, each) in enumerate(zip(probes, inputs, strict=True)):
-        role = _role(index, len(inputs))
+        role = role_of(index, len(inputs))
         if not each.photos:
             views = VIEWS if trains else VIEWS // TEST_EVERY
             stages.append(
                 Stage(f"pictures of the {role}", 0, sizes[index], views * probe.picture(sizes[index]))
             )
         if each.model is None:
-            stages.append(_fitting(f"plain model of the {role}", options.fit, probe, sizes[index]))
+            stages.append(_fitting(plain_stage(role), options.fit, probe, sizes[index]))
     if method.trains:
         decoding = 0.0
         if outlook.decode is not None:
@@ -125,7 +125,7 @@ def plan_hiding(
     ):
         longer = Bound.of(training, options.fit.iterations if each.model is None else None)
         if bound and each.photos and not longer.equal and longer.steps is not None:
-            name = f"bound of the {_role(index, len(inputs))}"
+            name = f"bound of the {role_of(index, len(inputs))}"
             stages.append(_fitting(name, longer.config(options.fit), probe, sizes[index]))
     writing = _KEY_SECONDS * len(inputs[1:]) + _CODING_SECONDS * outlook.gaussians
     stages.append(Stage("encrypting, opening again", 0, outlook.gaussians, writing))
@@ -265,8 +265,9 @@ def _measuring(
     return 3 * sum(plain) + 3 * sum(own) + wrong * decoding
 
 
-def _role(index: int, inputs: int) -> str:
-    return "cover" if index == 0 else "secret" if inputs == 2 else f"secret {index}"
+def plain_stage(role: str) -> str:
+    """What the stage is called in which the plain model of `role_of` is fitted."""
+    return f"plain model of the {role}"
 
 
 def _floats(sh_degree: int) -> int:

@@ -24,6 +24,7 @@ from keyss.rendering import render_with_meta
 from keyss.rendering.decoding import decode_picture, draw_features
 
 PROBES = 3  # steps that are timed, after one that is not
+MOST_PROBED = 500_000  # Gaussians of a model that is made to be timed; more take longer in proportion
 NETWORK_PIXELS = 2**16  # that go through a network to time it: what it takes is even over pixels
 
 
@@ -49,7 +50,8 @@ class Probe:
         self.network = None if network is None else network.map(lambda values: values.to(device))
         if model is None:
             self.start = min(config.max_gaussians, len(scene.points) if len(scene.points) >= 100 else 20_000)
-            models = [_made_up(scene, count, config) for count in {self.start, config.max_gaussians}]
+            counts = {min(count, MOST_PROBED) for count in (self.start, config.max_gaussians)}
+            models = [_made_up(scene, count, config) for count in counts]
         else:
             self.start = len(model)
             models = [model.with_sh_degree(sh_degree) if trains else model]
@@ -150,7 +152,8 @@ def decoding_seconds(
     device: torch.device,
 ) -> float:
     """Seconds of a step's way through a decoder and back, of `count` Gaussians of as many harmonics."""
-    parameters = to_parameters(_made_up(scene, count, config), device)
+    made = min(count, MOST_PROBED)
+    parameters = to_parameters(_made_up(scene, made, config), device)
 
     def step(_: View) -> None:
         decoded = decode(to_gaussians(parameters))
@@ -159,7 +162,7 @@ def decoding_seconds(
         assert parameters["means"].grad is not None
         float(parameters["means"].grad.sum())
 
-    return _timed(step, [scene.test[0]] * (PROBES + 1))
+    return count / made * _timed(step, [scene.test[0]] * (PROBES + 1))
 
 
 def _timed(work: Callable[[View], object], views: Sequence[View]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import os
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ import msgspec
 
 from keyss.core.errors import KeyssError, OutputError, UsageError
 from keyss.files.atomic import write_bytes
+from keyss.files.reading import read_text
+from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
 from keyss.methods import registry
@@ -23,9 +26,9 @@ from keyss.runs.config import PathLike
 from keyss.runs.folder import check_not_published
 from keyss.runs.records import read_record
 from keyss.sweeps.engine import RETRIES
-from keyss.sweeps.job import JOB, LOG, Failure, Job, Result, checksum, result_of
+from keyss.sweeps.job import JOB, KEY_CHECK, LOG, RESULT, Failure, Job, Result, checksum, result_of
 from keyss.sweeps.manifest import Asset, read_manifest
-from keyss.sweeps.running import PRIVATE, Ended, How, Planned, claimed, run_all
+from keyss.sweeps.running import PRIVATE, Ended, How, Planned, claimed, make_private, run_all
 
 SUMMARY = f"{PRIVATE}/batch.csv"
 _JOBS, _CHECK = f"{PRIVATE}/jobs", f"{PRIVATE}/master-key-check.txt"
@@ -104,7 +107,7 @@ def hide_batch(
             except KeyssError as error:
                 found[asset.line] = AssetResult(asset.out, None, str(error))
         asked = how or How(jobs, ray, retries)
-        ended = run_all(out, f"batch of {len(assets)} assets", list(planned.values()), asked)
+        ended = run_all(f"batch of {len(assets)} assets", list(planned.values()), asked)
         for line, each in zip(planned, ended, strict=True):
             found[line] = _asset_result(each)
         write_bytes(out / SUMMARY, _summary([found[asset.line] for asset in assets]))
@@ -135,8 +138,7 @@ def _planned(
     """The asset's job. Raises InputError, OutputError and UsageError for what cannot be begun."""
     if asset.secret_file is not None and not is_model(asset.cover):
         raise UsageError(f"{asset.cover}: files are hidden in models, and this is the name of none")
-    if asset.key_file is not None:
-        read_key_file(asset.key_file)
+    key = None if asset.key_file is None else read_key_file(asset.key_file)[0]
     run = f"../../../{asset.out}"  # as seen from the job's folder: all of it may be moved
     place = out / asset.out
     job = Job(
@@ -153,11 +155,29 @@ def _planned(
     name = job.identity({each: checksum(each) for each in job.inputs})
     folder = out / _JOBS / name
     others = earlier.get(run, set()) - {name}
-    there = place.is_file() or (place.is_dir() and any(place.iterdir()))
-    if there and result_of(folder) is None and not overwrite and (others or name not in earlier.get(run, ())):
+    try:
+        there = place.is_file() or (place.is_dir() and any(place.iterdir()))
+    except OSError as error:
+        raise OutputError(f"cannot write {place}: {error.strerror}") from error
+    unfinished, known = result_of(folder) is None, name in earlier.get(run, ())
+    check = None if key is None else _key_check(key, name)
+    rekeyed = check is not None and (folder / KEY_CHECK).exists() and read_text(folder / KEY_CHECK) != check
+    if there and not overwrite and (rekeyed or (unfinished and (others or not known))):
         what = "was made from other inputs or options" if others else "is there, and not from this batch"
+        what = "was made with another key" if rekeyed else what
         raise OutputError(f"{place} {what}: `overwrite=True` replaces what keyss wrote there")
+    if check is not None:
+        make_private(folder)
+        if rekeyed:
+            (folder / RESULT).unlink(missing_ok=True)
+        write_bytes(folder / KEY_CHECK, check.encode())
     return Planned.of(job, folder)
+
+
+def _key_check(key: str, name: str) -> str:
+    """By what the key of a job is known again; a guess costs as much as one at what is published."""
+    salt = hashlib.sha256(b"keyss/v1/batch" + name.encode()).digest()[:SALT_BYTES]
+    return DerivedKey(key, KeyDerivation(salt=salt)).verifier().hex()
 
 
 def _earlier(out: Path) -> dict[str, set[str]]:

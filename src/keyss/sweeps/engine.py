@@ -89,6 +89,9 @@ def process_of(folder: Path, threads: int, command: Sequence[str]) -> subprocess
             stdout=log,
             stderr=log,
             env=environment(threads),
+            # Ctrl-C in a terminal reaches only whoever started it, who passes on one signal: at a second one
+            # it would not save what it has.
+            start_new_session=True,
         )
 
 

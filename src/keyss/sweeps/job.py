@@ -6,6 +6,7 @@
 | `result.json` | what it came to; there only when it is done, and never replaced |
 | `failed.json` | why the last attempt was refused |
 | `log.txt` | all that its attempts said |
+| `key-check.txt` | by what the key of a batch's key file is known again |
 | `lock` | held (flock) by the process that is at work |
 | `run/` | the folder that `keyss hide` writes, unless the job names another |
 
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -30,11 +31,12 @@ from keyss._version import __version__
 from keyss.core.errors import InputError
 from keyss.runs.records import read_record
 
-JOB, RESULT, FAILED, LOG, LOCK, RUN = (
+JOB, RESULT, FAILED, LOG, KEY_CHECK, LOCK, RUN = (
     "job.json",
     "result.json",
     "failed.json",
     "log.txt",
+    "key-check.txt",
     "lock",
     "run",
 )
@@ -76,7 +78,8 @@ class Job:
     def identity(self, checksums: Mapping[str, str]) -> str:
         """SHA-256, in hexadecimal, over all that the result follows from.
 
-        `checksums`: of `inputs`. Neither names nor places of files count, but for the folder of results.
+        `checksums`: of `inputs`. Neither names nor places of files count, but for the folder of results; nor
+        keys.
         """
 
         def content(path: str) -> str:
@@ -91,6 +94,7 @@ class Job:
             files=tuple(f"{Path(each).name} {content(each)}" for each in self.files),
             cover_model=self.cover_model and content(self.cover_model),
             secret_models=tuple(map(content, self.secret_models)),
+            key_files=(),
             master_key_file=None,
             key_names=(),
         )
@@ -137,24 +141,38 @@ def failure_of(folder: Path) -> Failure | None:
 def checksum(path: str) -> str:
     """SHA-256 of a file's bytes, or of the names and bytes of all files below a folder, hidden ones left out.
 
-    Of one path it is computed once in a process. Raises InputError.
+    Links are what they lead to. Of one path it is computed once in a process. Raises InputError, also for a
+    folder that leads into itself.
     """
     try:
         if not os.path.isdir(path):
             with open(path, "rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()
         digest = hashlib.sha256(b"folder")
-        for parent, folders, names in os.walk(path):
-            folders[:] = sorted(each for each in folders if not each.startswith("."))
-            for name in sorted(each for each in names if not each.startswith(".")):
-                whole = os.path.join(parent, name)
-                label = os.fsencode(os.path.relpath(whole, path))
-                with open(whole, "rb") as file:
-                    content = hashlib.file_digest(file, "sha256").digest()
-                digest.update(len(label).to_bytes(4, "big") + label + content)
+        for whole in _files_below(path):
+            label = os.fsencode(os.path.relpath(whole, path))
+            with open(whole, "rb") as file:
+                content = hashlib.file_digest(file, "sha256").digest()
+            digest.update(len(label).to_bytes(4, "big") + label + content)
         return digest.hexdigest()
     except OSError as error:
         raise InputError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
+
+
+def _files_below(folder: str, above: tuple[str, ...] = ()) -> Iterator[str]:
+    """In an order that the names decide. Raises OSError."""
+    real = os.path.realpath(folder)
+    if real in above:
+        raise InputError(f"{folder} leads into itself")
+    folders = []
+    for name in sorted(each for each in os.listdir(folder) if not each.startswith(".")):
+        whole = os.path.join(folder, name)
+        if os.path.isdir(whole):
+            folders.append(whole)
+        else:
+            yield whole
+    for each in folders:
+        yield from _files_below(each, (*above, real))
 
 
 @cache

@@ -66,10 +66,10 @@ class How:
         return LocalEngine(resources, self.retries, command)
 
 
-def run_all(out: Path, title: str, planned: Sequence[Planned], how: How) -> list[Ended]:
-    """Do all jobs that are not done, in a folder that nobody else may work in; what became of each.
+def run_all(title: str, planned: Sequence[Planned], how: How) -> list[Ended]:
+    """Do all jobs that are not done, in a folder that is `claimed`; what became of each.
 
-    Raises OutputError where another process is at work in `out`, and BackendError.
+    Raises OutputError and BackendError.
     """
     before = [result_of(each.folder) for each in planned]
     due = [each for each, result in zip(planned, before, strict=True) if result is None]

@@ -18,7 +18,7 @@ there. Paths are relative to the folder of the file.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
@@ -206,6 +206,8 @@ def _check_values(path: Path, spec: SweepSpec) -> None:
             raise InputError(f"{path}: seeds: expected 0 to {MOST_SEED}, got {seed}")
     if len(set(spec.seeds)) < len(spec.seeds):
         raise InputError(f"{path}: seeds: the same one is there twice")
+    _check_different(f"{path}: pairs", [label(pair) for pair in spec.pairs])
+    _check_different(f"{path}: methods", [asked.name or asked.method for asked in spec.methods])
     count = len(spec.pairs) * len(spec.seeds)
     grids = 0
     for index, asked in enumerate(spec.methods):
@@ -233,6 +235,13 @@ def _check_values(path: Path, spec: SweepSpec) -> None:
                 f"{path}: pairs[{index}].secret_models: expected none or one for each secret, got "
                 f"{len(pair.secret_models)}"
             )
+
+
+def _check_different(where: str, labels: Sequence[str]) -> None:
+    """Raise InputError for two that the tables would take for seeds of one."""
+    for index, each in enumerate(labels):
+        if (first := labels.index(each)) < index:
+            raise InputError(f"{where}[{index}]: called {each!r} as [{first}] is: give one a `name`")
 
 
 def _known_values(where: str, values: Collection[str], known: Collection[str]) -> None:

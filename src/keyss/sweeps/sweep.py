@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -17,7 +17,9 @@ from keyss.keys.generation import generate_key
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
 from keyss.methods import registry
+from keyss.rendering import Backend
 from keyss.runs.config import PathLike
+from keyss.runs.folder import check_not_published
 from keyss.sweeps.job import Job, checksum, result_of
 from keyss.sweeps.running import PRIVATE, Ended, How, Planned, claimed, make_private, run_all
 from keyss.sweeps.spec import SweepSpec, Variant, label, read_spec, variants
@@ -84,6 +86,7 @@ def sweep(
     children; a cell that fails is in the result.
     """
     path, out = Path(spec), Path(out)
+    check_not_published(out)
     found = read_spec(path)
     master = None if master_key_file is None else Path(master_key_file).absolute()
     if master is not None:
@@ -93,9 +96,10 @@ def sweep(
 
     def work() -> list[Ended]:
         _check_master(out, master)
-        return run_all(out, f"sweep of {len(cells)} cells", [each.planned for each in cells], asked)
+        return run_all(f"sweep of {len(cells)} cells", [each.planned for each in cells], asked)
 
-    make_private(out)
+    if not out.exists():  # what else is in one that is there may be for others
+        make_private(out)
     ended = claimed(out, work)
     return SweepResult(tuple(ended), tuple(write_tables(out, _numbers(cells, ended))))
 
@@ -175,6 +179,7 @@ def _planned(cell: Cell) -> tuple[float, int, str | None]:
             background=job.background,
             skip_missing=job.skip_missing,
             cover_model=job.cover_model,
+            device=cast(Backend, job.device),
         )
     except KeyssError as error:
         return 0.0, cell.planned.memory, str(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import socket
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -19,6 +20,10 @@ LOCALHOST = "127.0.0.1"
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}
 # What is given out at an address: its type, and what opens it or raises OSError.
 Contents = Mapping[str, tuple[str, Callable[[], BinaryIO]]]
+
+
+class _ServerIPv6(ThreadingHTTPServer):
+    address_family = socket.AF_INET6
 
 
 class PageServer:
@@ -40,7 +45,8 @@ class PageServer:
         everything["/favicon.ico"] = ("image/x-icon", lambda: BytesIO())
         self._folder = folder
         try:
-            self._server = ThreadingHTTPServer((host, port), _handler(everything, host in _LOCAL_NAMES))
+            kind = _ServerIPv6 if ":" in host else ThreadingHTTPServer
+            self._server = kind((host, port), _handler(everything, host in _LOCAL_NAMES))
         except (OSError, OverflowError) as error:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
@@ -49,7 +55,8 @@ class PageServer:
     def address(self) -> str:
         """Where the page is."""
         host, port = self._server.server_address[:2]
-        return f"http://{host!s}:{port}{self._folder}"
+        name = f"[{host!s}]" if ":" in str(host) else host
+        return f"http://{name!s}:{port}{self._folder}"
 
     def run(self) -> None:
         """Serve until `close` is called by another thread, or a signal ends it."""
@@ -88,7 +95,11 @@ def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
 
         def _answer(self, *, with_content: bool) -> None:
             # Another site whose name leads here must not read the model through a visitor's browser.
-            asked = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+            try:
+                asked = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+            except ValueError:
+                self.send_error(HTTPStatus.BAD_REQUEST)
+                return
             found = contents.get(unquote(urlsplit(self.path).path))
             if local and asked not in _LOCAL_NAMES:
                 self.send_error(HTTPStatus.FORBIDDEN)

@@ -165,7 +165,7 @@ class LearnedMethod:
             "hide",
             fingerprint={
                 "scenes": [scene.digest() for scene in scenes],
-                "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
+                "models": [model.digest() for model in models],
                 "keys": [
                     hashlib.sha256(key.verifier() + embedding.numpy().tobytes()).hexdigest()
                     for key, embedding in zip(derived, embeddings, strict=True)

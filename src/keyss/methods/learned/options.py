@@ -8,7 +8,13 @@ from typing import Annotated, Any, Literal, Self
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import CommandLineOption, MethodOptions, SceneInput, Training
+from keyss.methods.base import (
+    CommandLineOption,
+    MethodOptions,
+    SceneInput,
+    Training,
+    check_above_zero,
+)
 from keyss.methods.learned.decoder import DecoderShape, Mask, parse_mask
 
 # Of the training of secrets where only models are given: iterations at most, factor on the rates.
@@ -91,6 +97,9 @@ class LearnedOptions(MethodOptions):
                 f'`publish="{self.publish}"` is for secrets without a decoder, which takes every bit of the '
                 'published model: leave out `start="points"`'
             )
+        check_above_zero(self, "cover_weight", "secret_weight", "decoder_rate", "warm_rate", "secret_share")
+        if self.incorrect_every < 1:
+            raise UsageError(f"`incorrect_every`: expected at least 1, got {self.incorrect_every}")
         if self.clip_model is not None and self.key_encoder != "clip":
             raise UsageError(
                 '`clip_model` is for the key encoder clip: leave it out or set `key_encoder="clip"`'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -76,7 +75,7 @@ class JointPeer(ABC):
             fingerprint={
                 "method": self.name,
                 "scenes": [scene.digest() for scene in scenes],
-                "models": [hashlib.sha256(model.means.numpy().tobytes()).hexdigest() for model in models],
+                "models": [model.digest() for model in models],
                 "options": json.loads(json.dumps(asdict(options))),
             },
             seed=fit.known_seed,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeVar
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import PRESETS as FIT_PRESETS
-from keyss.methods.base import CommandLineOption, MethodOptions, Training
+from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +36,7 @@ class PeerOptions(MethodOptions):
                 f'`publish="{self.publish}"` is for methods that look for room in such a file; this one is '
                 'compared as it was published: leave it out, or take `method="learned"` or "carry"'
             )
+        check_above_zero(self, "cover_weight", "secret_weight", "network_rate")
         if not 0 <= self.common_poses <= 1:
             raise UsageError(f"`common_poses`: expected 0 to 1, got {self.common_poses}")
 

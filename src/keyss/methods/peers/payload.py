@@ -62,13 +62,7 @@ class HandedTensors:
             turn = torch.tensor(header.rotation, dtype=torch.float64)
             shift = torch.tensor(header.translation, dtype=torch.float64)
             frame = Similarity(header.scale, turn, shift)
-        except (
-            safetensors.SafetensorError,
-            msgspec.MsgspecError,
-            ValueError,
-            KeyError,
-            RuntimeError,
-        ) as error:
+        except _DAMAGE as error:
             reason = (str(error) or type(error).__name__).splitlines()[0][:200]
             raise InputError(f"what was handed over is damaged: {reason}") from error
         for name, value in tensors.items():

@@ -28,7 +28,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
@@ -228,6 +228,14 @@ class WaterGsRun(PeerRun):
 @dataclass(frozen=True, kw_only=True)
 class WaterGsOptions(PeerOptions):
     """See `PeerOptions`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if int(self.fit.iterations * self.fit.grow_stop) < 1:
+            raise UsageError(
+                "`fit`: expected at least one step before growth stops, for opacities are mapped then; got "
+                f"{self.fit.iterations} steps, and growth in {self.fit.grow_stop:g} of them"
+            )
 
 
 class WaterGsMethod(JointPeer):

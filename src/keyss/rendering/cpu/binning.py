@@ -112,7 +112,7 @@ def share_bounds(order, tile_bounds, starts):
 
 
 @inlined
-def _measure_columns(footprints, g, tile_columns, height, first_column, spans, place):
+def _measure_columns(footprints, g, height, first_column, spans, place):
     """The rows of pixels that an ellipse alpha >= 1/255 meets, for 8 columns of tiles.
 
     g is where its footprint starts. spans[place:] gets the first rows, spans[place + 8:] the last ones. At x
@@ -175,16 +175,14 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
                 last_column = min(floor(x + extent_x), tile_columns * TILE_WIDTH - 1) >> TILE_WIDTH_LOG2
                 first_columns[k] = first_column
                 columns[k] = last_column + 1 - first_column
-                _measure_columns(footprints, g, tile_columns, height, first_column, spans, 16 * k)
+                _measure_columns(footprints, g, height, first_column, spans, 16 * k)
             for k in range(size):
                 i = np.int64(at(order, start + k))
                 before = place
                 for column in range(columns[k]):
                     first_column = first_columns[k] + column
                     if column > 0 and column % 8 == 0:
-                        _measure_columns(
-                            footprints, i * PACKED, tile_columns, height, first_column, spans, 16 * k
-                        )
+                        _measure_columns(footprints, i * PACKED, height, first_column, spans, 16 * k)
                     first = np.int64(at(spans, 16 * k + column % 8))
                     last = np.int64(at(spans, 16 * k + 8 + column % 8))
                     for row in range(first >> TILE_HEIGHT_LOG2, (last >> TILE_HEIGHT_LOG2) + 1):
