@@ -66,6 +66,8 @@ def test_what_does_not_go_together_is_refused(
     hide = _arguments(folder, out)
     assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "leave out --secret")
     assert_refused(keyss(*hide, "--dry-run"), 2, "leave out --dry-run")
+    for flag, value in (("--min-psnr", 60), ("--seed", 0), ("--width", 100), ("--sh-degree", 1)):
+        assert_refused(keyss(*hide, flag, value), 2, f"leave out {flag}")
     photos = ("hide", "--cover", world / "a", "--secret-file", folder / "empty", "-o", out)
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
     stego, key = folder / "out" / "publish" / "stego.ply", ("--key-file", folder / "key0")

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from keyss._verbs import comparing
 from keyss._verbs.comparing import EVERY, within
+from keyss._verbs.shared_folder import alone_in
 from keyss.cli import main
 from keyss.core import OutputError, UsageError
 from keyss.methods import registry
@@ -117,6 +119,36 @@ def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: 
         compare(tmp_path / "a.ply", folders[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "gs-hider", "watergs"}
+
+
+def test_where_no_method_works_the_reasons_are_said_and_there_is_no_picture(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object, **more: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(comparing, "hide", full)
+    sizes = {"iterations": 20, "max_gaussians": 100, "seed": 1}
+    found = comparing.compare(*folders, methods=["3dgs"], out=tmp_path / "out", **sizes)  # type: ignore[arg-type]
+    assert [each.error for each in found.methods] == ["the disk is full"]
+    assert "the disk is full" in (tmp_path / "out" / "comparison.md").read_text()
+    assert not (tmp_path / "out" / "comparison.png").exists()
+
+
+def test_one_budget_and_one_process_for_a_folder(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without numbers the budget is that of the first method's preset."""
+    monkeypatch.setattr(comparing, "_PlainModels", None)  # so that it ends before anything is trained
+    out = tmp_path / "out"
+    with pytest.raises(TypeError):
+        comparing.compare(*folders, methods=["learned:quick"], out=out)
+    with pytest.raises(OutputError, match="other arguments"):
+        comparing.compare(*folders, methods=["carry"], out=out, resume=True)
+    with pytest.raises(TypeError):
+        comparing.compare(*folders, methods=["carry:quick"], out=out, resume=True)
+    with alone_in(out), pytest.raises(OutputError, match="is at work"):
+        comparing.compare(*folders, methods=["carry:quick"], out=out, resume=True)
 
 
 def test_all_is_every_method_and_keyss_as_published() -> None:

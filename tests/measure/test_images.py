@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -18,8 +18,10 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from keyss.core.errors import InputError
+from keyss.files.images import picture_names
 from keyss.fitting.losses import Target, ssim
 from keyss.measure import compare_images, lpips
+from tiny_scenes import ring_cameras
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -205,3 +207,10 @@ def test_flip_is_the_share_of_a_difference_that_is_seen() -> None:
     assert _only(black, white)["flip"] > 0.9
     weak, strong = (_only(_picture(), _noisy(_picture(), amount))["flip"] for amount in (5, 30))
     assert 0 < weak < strong < 1
+
+
+def test_every_picture_has_a_file_of_its_own() -> None:
+    camera = ring_cameras(1)[0]
+    names = ["a/b.png", "a_b.jpg", "c.png", "a_b-2.png"]
+    found = picture_names(replace(camera, name=name) for name in names)
+    assert found == ["a_b.png", "a_b-2.png", "c.png", "a_b-2-2.png"]

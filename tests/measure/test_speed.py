@@ -14,6 +14,7 @@ import torch
 from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
+from keyss.files.models import write_model
 from keyss.files.ply import write_ply
 from keyss.measure import speed as module
 from keyss.measure.robustness.survival import Reopened, Reopener
@@ -96,6 +97,14 @@ def test_other_peoples_readers_find_our_values(degree: int, tmp_path: Path) -> N
     found = {each.reader: each for each in readers(tmp_path / "a.ply")}
     for name in ("plyfile", "gsply"):
         assert found[name] == ReaderResult(name, "a.ply", True, 40)
+
+
+def test_what_has_no_exact_numbers_is_not_held_against_other_readers(tmp_path: Path) -> None:
+    for name in ("a.spz", "a.compressed.ply"):
+        write_model(tmp_path / name, random_gaussians(40))
+        assert {(each.loads, "only a .ply" in str(each.note)) for each in readers(tmp_path / name)} == {
+            (None, True)
+        }
 
 
 def test_splat_transform_finds_our_values(

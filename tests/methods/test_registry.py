@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -201,3 +201,22 @@ def test_what_lies_in_a_model_tells_its_method(method: str, kind: str, expected:
     opened = registry.open_model(stego, KEY)
     assert type(opened).__name__ == expected
     assert 0 < len(opened.reveal(stego)) <= 2500
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("learned", {"incorrect_every": 0}),
+        *((name, {"secret_weight": 0.0}) for name in ("learned", "3dgs-sh", "gs-hider")),
+        *((name, {"cover_weight": float("nan")}) for name in ("learned", "3dgs-decoder")),
+    ],
+)
+def test_what_would_be_divided_by_nothing_is_refused(name: str, changes: dict[str, float]) -> None:
+    options = next(iter(registry.METHODS[name].presets.values()))
+    with pytest.raises(UsageError, match=next(iter(changes))):
+        replace(options, **changes)
+
+
+def test_opacities_that_would_never_be_mapped_are_refused() -> None:
+    with pytest.raises(UsageError, match="before growth stops"):
+        registry.METHODS["watergs"].presets["best"].with_fit(iterations=1)

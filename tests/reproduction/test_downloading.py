@@ -200,6 +200,23 @@ def test_damage_is_said_and_leaves_nothing(
         downloaded(("garden",), folder)
 
 
+@pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damage_of_any_compression_is_said(
+    compression: int, contents: dict[str, bytes], tmp_path: Path
+) -> None:
+    path = tmp_path / "scenes.zip"
+    path.write_bytes(zipped(contents, compression))
+    with zipfile.ZipFile(path) as file:
+        info = file.getinfo("garden/sparse/0/images.bin")
+    data = bytearray(path.read_bytes())
+    start = info.header_offset + 30 + len(info.filename)
+    for offset in range(min(12, info.compress_size)):
+        data[start + offset] ^= 0x5A
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="cannot be unpacked"):
+        unzip_scene(path, "garden", "images_4", tmp_path / "garden")
+
+
 def test_a_table_says_which_scenes_it_needs(
     server: Behaviour, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

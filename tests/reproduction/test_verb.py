@@ -79,7 +79,7 @@ def test_what_is_done_is_not_done_again(
 
 
 def test_a_run_that_fails_is_said_and_the_others_go_on(
-    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch
+    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch, keyss: Callable[..., Said]
 ) -> None:
     def failing(*arguments: object, **more: object) -> None:
         raise InputError("not today")
@@ -90,6 +90,9 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
     verdicts = [each.verdict for each in found.claims]
     assert verdicts[0] in ("holds", "holds in part", "does not hold here")  # the run of before
     assert verdicts[1] == "not measured"
+    said = keyss("reproduce", "speed", *folders, *FLAGS, "-o", out)
+    assert (said.status, said.err.strip()) == (4, "keyss: error: 3 run(s) failed")
+    assert "not today" in said.out
 
 
 def test_other_sizes_scenes_and_seeds_need_another_folder(
@@ -120,6 +123,8 @@ def test_the_command(keyss: Callable[..., Said], out: Path, folders: list[Path],
     ]
     assert "5 to do" in planned.out
     assert keyss("reproduce", "single", folders[0], "-o", tmp_path / "new").status == 2
+    said = keyss("reproduce", "single", *folders, "--width", 0, "-o", tmp_path / "new")
+    assert (said.status, "--width" in said.err) == (2, True), said
     full = keyss("reproduce", "multi", "--scale", "full", "--data", tmp_path, "-o", tmp_path / "new")
     assert (full.status, "Mip-NeRF 360" in full.err) == (4, True)
 

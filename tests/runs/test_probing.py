@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from keyss import FitConfig, Secret, api
+from keyss.core import Gaussians, Scene
 from keyss.core.scene import View
 from keyss.keys import generate_key
 from keyss.methods import registry
@@ -73,3 +74,19 @@ def test_the_networks_of_plans_are_as_large_as_those_that_are_trained(channels: 
     assert [each.shape for each in untrained(channels).tensors()] == [
         each.shape for each in trained.tensors()
     ]
+
+
+def test_a_cap_that_is_none_is_not_filled_to_be_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probing, "MOST_PROBED", 300)
+    made: list[int] = []
+    make = probing._made_up
+
+    def counted(scene: Scene, count: int, config: FitConfig) -> Gaussians:
+        made.append(count)
+        return make(scene, count, config)
+
+    monkeypatch.setattr(probing, "_made_up", counted)
+    config = FitConfig(max_gaussians=10_000_000)
+    probe = probing.Probe(tiny_scene(), None, config, 3, torch.device("cpu"), True)
+    assert sorted(made) == [200, 300]  # as many as there are sparse points, and no more than may be
+    assert [count for count, *_ in probe.times] == [200, 300]

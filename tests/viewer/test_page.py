@@ -92,6 +92,7 @@ def test_the_server_gives_out_the_page_and_the_model_and_nothing_else(
     for path in ("/model/", "/model/..%2f..%2fetc/passwd", "/../../etc/passwd", "/page.html", "/a/b"):
         assert get(path)[0] == 404, path
     assert get("/", host="elsewhere.example")[0] == 403
+    assert get("/", host="[")[0] == 400
     with pytest.raises(OutputError, match="cannot serve"):
         ModelServer(model, port=port)
 
