@@ -1,6 +1,6 @@
 """What work takes as it grows: measured sizes, a model fitted to them, and a size four times as large.
 
-    python benchmarks/scaling.py                # a quarter of an hour on 2 cores
+    python benchmarks/scaling.py                # some minutes on 2 cores
     python benchmarks/scaling.py --only step    # of one kind of work
 
 The model is a sum of costs that are not negative: of a call, of each Gaussian, pixel, secret or photo, by
