@@ -96,7 +96,7 @@ def audit(
                 try:
                     finished.keep(name, PARTS[name](subject, seed, progress))
                 except KeyboardInterrupt as error:
-                    raise Interrupted(finished.folder, index, signal_of(error)) from error
+                    raise Interrupted(finished.folder, None, signal_of(error)) from error
                 finally:
                     progress.finish(finished.has(name))
             sections[name], own = finished.take(name)

@@ -114,8 +114,9 @@ def _library(package: str) -> Finding:
 def _cores() -> tuple[bool, str]:
     import torch
 
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return True, f"{usable} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
+    from keyss.sweeps.engine import usable_cores
+
+    return True, f"{usable_cores()} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
 
 
 def _gpu() -> tuple[bool, str]:

@@ -145,7 +145,8 @@ def explain(error: BaseException) -> tuple[int, str]:
                 saved = "nothing was saved"
                 if error.checkpoint is not None:
                     saved = "continue with the same command and `resume=True`"
-                word += f" at iteration {error.iteration}; {saved}"
+                where = "" if error.iteration is None else f" at iteration {error.iteration}"
+                word += f"{where}; {saved}"
             return 128 + signum, word
         case _ if _is_out_of_memory(error):
             return NO_ROOM, (

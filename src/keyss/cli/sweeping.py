@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from keyss.cli.arguments import Jobs, MasterKeyFile, OutFolder, Ray, optional
+from keyss.cli.arguments import Jobs, OutFolder, Ray, optional
 
 if TYPE_CHECKING:
     from keyss.sweeps.sweep import Estimate
@@ -25,7 +25,12 @@ def sweep(
     jobs: Jobs = None,
     ray: Ray = None,
     retries: Annotated[int, arg(metavar="N", help="How often a cell is tried again whose process died.")] = 2,
-    master_key_file: MasterKeyFile = None,
+    master_key_file: Annotated[
+        Path | None,
+        optional(
+            "FILE", "File with a key from which each cell gets its own (`keyss key-of`).", "one that is made"
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, arg(help="Print the cells and estimates of their time and memory; write nothing.")
     ] = False,

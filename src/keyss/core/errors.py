@@ -62,13 +62,13 @@ class KeyssWarning(UserWarning):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or another signal during long work, after `iteration` steps.
+    """Ctrl-C or another signal during long work, after `iteration` steps of a training.
 
     What is done was saved to `checkpoint` (None: there was none to write).
     """
 
     def __init__(
-        self, checkpoint: Path | None, iteration: int, signum: signal.Signals = signal.SIGINT
+        self, checkpoint: Path | None, iteration: int | None, signum: signal.Signals = signal.SIGINT
     ) -> None:
         super().__init__(signum)
         self.checkpoint = checkpoint
