@@ -48,7 +48,9 @@ def _rows(audits: list[Audit]) -> list[str]:
     attributes = ("position", "scale", "rotation", "opacity", "colour", "harmonics", "joint")
     rows: dict[str, Cell] = {
         "cover, dB (loss)": lambda a: _quality(a.images.cover, a.images.cover_baseline),
-        "secret, dB (loss, beside the plain model it started from)": lambda a: _quality(a.images.secrets[0], a.images.secret_baselines[0]),
+        "secret, dB (loss, beside the plain model it started from)": lambda a: _quality(
+            a.images.secrets[0], a.images.secret_baselines[0]
+        ),
         "wrong keys against the cover, mean": lambda a: f"{a.wrong_key.shown.vs_cover.mean:.2f}",
         "3D-Sinkhorn as published, sum (controls)": _sinkhorn,
         "composite score (eq. 10)": _score,

@@ -14,7 +14,7 @@ from keyss._verbs.asking import Secret
 from keyss._verbs.fitting import fit
 from keyss._verbs.hiding import hide
 from keyss._verbs.planning import plan
-from keyss._verbs.shared_folder import Begun, alone_in, begin, begun_before
+from keyss._verbs.shared_folder import Begun, alone_in, begin, begun_before, key_in
 from keyss.comparison.measuring import PlainCovers, measured
 from keyss.comparison.record import ComparedMethod, Comparison
 from keyss.comparison.sheet import sheet
@@ -22,10 +22,8 @@ from keyss.comparison.tables import markdown
 from keyss.core.errors import InputError, KeyssError, OutputError, UsageError
 from keyss.files.atomic import write_bytes
 from keyss.files.models import read_model
-from keyss.files.reading import read_text
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
-from keyss.keys import generate_key
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions
 from keyss.rendering import Backend, resolve_device
@@ -120,7 +118,7 @@ def compare(
     with alone_in(folder):
         seed = _begin(folder, told, seed, resume)
         fit = replace(fit, seed=seed)
-        key = read_text(folder / KEY).strip()
+        key = key_in(folder / KEY)
         changes = {"max_gaussians": fit.max_gaussians, "seed": seed}
         plain_models = _PlainModels(folder, {"cover": cover, "secret": secret}, fit, width, device, reporter)
         rows = []
@@ -269,7 +267,6 @@ def _begin(folder: Path, told: dict[str, Any], seed: int | None, resume: bool) -
             raise OutputError(f"{folder} holds a comparison with other arguments: give the same ones")
         return before.seed
     seed = FitConfig(seed=seed).seeded().known_seed
-    write_bytes(folder / KEY, f"{generate_key()}\n".encode())
     begin(folder, Begun(told=told, seed=seed))
     return seed
 
@@ -292,7 +289,7 @@ def fitted_once(
 
 def _runs(folder: Path, found: Comparison) -> list[tuple[str, HidingRun]]:
     """Those that came to something, by name."""
-    key = read_text(folder / KEY).strip()
+    key = key_in(folder / KEY)
     return [
         (each.name, open_run(_place(folder, each.name), [key] if each.capabilities.keys else []))
         for each in found.methods

@@ -14,13 +14,11 @@ from keyss._verbs.asking import Secret
 from keyss._verbs.comparing import fitted_once
 from keyss._verbs.hiding import hide
 from keyss._verbs.planning import plan
-from keyss._verbs.shared_folder import Begun, alone_in, begin, begun_before
+from keyss._verbs.shared_folder import Begun, alone_in, begin, begun_before, key_in
 from keyss.core.errors import KeyssError, OutputError
 from keyss.files.atomic import write_bytes
-from keyss.files.reading import read_text
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter, SilentReporter
-from keyss.keys import generate_key
 from keyss.methods import registry
 from keyss.methods.base import role_of
 from keyss.reproduction import downloading
@@ -156,7 +154,8 @@ def _run(
     if not missing:
         return
     place, width = asked.place(cell, group), asked.sizes["width"]
-    keys = [_key(asked.out, index) for index in range(1, len(group))] if _has_keys(cell) else []
+    indices = range(1, len(group)) if _has_keys(cell) else ()
+    keys = [key_in(asked.out / f"key-{index}.txt") for index in indices]
     if not is_run(place):
         fit = replace(asked.fit, seed=seed)
         cover, *others = (
@@ -195,14 +194,6 @@ def _known(asked: Setting, cell: Cell, group: Group) -> dict[str, float]:
 
 def _has_keys(cell: Cell) -> bool:
     return registry.METHODS[cell.method].capabilities.keys
-
-
-def _key(out: Path, index: int) -> str:
-    """The key of every secret with this number; made once."""
-    path = out / f"key-{index}.txt"
-    if not path.exists():
-        write_bytes(path, f"{generate_key()}\n".encode())
-    return read_text(path).strip()
 
 
 @contextmanager

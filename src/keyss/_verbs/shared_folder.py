@@ -9,7 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import OutputError
+from keyss.files.atomic import write_bytes
 from keyss.files.lock import lock
+from keyss.files.reading import read_text
+from keyss.keys import generate_key
 from keyss.runs.folder import check_not_published
 from keyss.runs.records import read_record, write_record
 
@@ -54,3 +57,10 @@ def begun_before(folder: Path) -> Begun | None:
 
 def begin(folder: Path, begun: Begun) -> None:
     write_record(folder / ARGUMENTS, begun)
+
+
+def key_in(path: Path) -> str:
+    """The key in a file of the folder, which is made once."""
+    if not path.exists():
+        write_bytes(path, f"{generate_key()}\n".encode())
+    return read_text(path).strip()

@@ -13,10 +13,9 @@ from keyss.audit.progress import PartProgress, PartResult
 from keyss.audit.subject import AuditSubject
 from keyss.core.errors import BackendError
 from keyss.files.images import picture_names
-from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.distances import against_controls
 from keyss.measure.histograms import histograms
-from keyss.measure.images import compare_images, photos_of, renders_of
+from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
 from keyss.measure.leaks.attacks import decoder_attack, file_attacks, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
 from keyss.measure.robustness.survival import breakdown_points
@@ -43,7 +42,6 @@ from keyss.runs.audit_record import (
 from keyss.runs.files import stego_in
 
 PICTURED_VIEWS = 3
-STEGANALYSED_VIEWS = 64
 
 AuditPart = Callable[[AuditSubject, int, PartProgress], PartResult[Any]]
 
@@ -122,9 +120,7 @@ def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
 
     Beside it, whether they tell those of two plain models apart: some learn any difference.
     """
-    # In the order of the photos' names, which is that of the camera's path more often than not.
-    ordered = sorted(subject.cover.views, key=lambda view: view.camera.name)
-    views = subsample_views(ordered, STEGANALYSED_VIEWS)
+    views = steganalysed(subject.cover.views)
     models = (subject.controls[0], subject.stego, subject.controls[1])
     plain, stego, control = (
         [image.numpy() for _, image in renders_of(model, subject.cover, views)] for model in models

@@ -25,8 +25,7 @@ from keyss.comparison.record import (
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.image_metrics import subsample_views
-from keyss.measure.images import compare_images, photos_of, renders_of
+from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
 from keyss.measure.robustness.changes import Change, purification, random_pruning
 from keyss.measure.robustness.conversions import converters
 from keyss.measure.robustness.survival import robustness
@@ -42,7 +41,6 @@ from keyss.runs.opening import HidingRun
 LOST = 0.25  # of the Gaussians
 GIVEN_UP = 0.01  # of the blending weight in the cover's views, by purification
 CONVERSIONS = ((".spz", "gsply"), ("compressed .ply", "splat-transform"))  # two formats, two programs
-STEGANALYSED_VIEWS = 64
 _ROUNDS = 5  # of timing pictures
 _PRUNED = "pruned"  # head of the column of what a model of any kind can be
 
@@ -108,8 +106,7 @@ class PlainCovers:
         return self._pictures(self.controls[0])
 
     def _pictures(self, model: Gaussians) -> list[NDArray[np.uint8]]:
-        ordered = sorted(self.scene.views, key=lambda view: view.camera.name)
-        views = subsample_views(ordered, STEGANALYSED_VIEWS)
+        views = steganalysed(self.scene.views)
         return [image.numpy() for _, image in renders_of(model, self.scene, views)]
 
 

@@ -19,7 +19,7 @@ from keyss.core.errors import BackendError, InputError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import picture_names, read_image
-from keyss.fitting.image_metrics import psnr
+from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.measure.lpips import lpips_alex
 from keyss.rendering import render
 
@@ -28,6 +28,7 @@ Doubles = npt.NDArray[np.float64]
 Pictures = Path | str | Sequence[tuple[str, Tensor | Pixels]]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+STEGANALYSED_VIEWS = 64
 RADIUS = 5  # SSIM's 11 x 11 window
 
 
@@ -157,6 +158,14 @@ def _flip(a: Tensor, b: Tensor) -> float:
 
 
 @torch.no_grad()
+def steganalysed(views: Sequence[View]) -> list[View]:
+    """At most `STEGANALYSED_VIEWS` of them, spread evenly over the camera's path.
+
+    In the order of the photos' names, which is that of the path more often than not.
+    """
+    return list(subsample_views(sorted(views, key=lambda view: view.camera.name), STEGANALYSED_VIEWS))
+
+
 def photos_of(views: Sequence[View]) -> list[tuple[str, Tensor]]:
     """Names and uint8 photos [H, W, 3] of views, as `renders_of` has its pictures."""
     names = picture_names(view.camera for view in views)
