@@ -76,8 +76,8 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     ) -> None:
         """By the meta of renders, or by the statistics of all ranks' renders.
 
-        Of renders it adds up what gsplat does, without picking out the Gaussians that are seen: on a CPU that
-        takes a twelfth of a small step.
+        Of renders it adds up what gsplat does, without picking out the Gaussians that are seen, which on a CPU
+        takes twice as long.
         """
         known = set(_STATISTICS) <= set(info)
         for values in [[info[name] for name in _STATISTICS]] if known else _seen_by_cameras(info):

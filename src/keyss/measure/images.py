@@ -157,7 +157,6 @@ def _flip(a: Tensor, b: Tensor) -> float:
     return float(flip.evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
 
 
-@torch.no_grad()
 def steganalysed(views: Sequence[View]) -> list[View]:
     """At most `STEGANALYSED_VIEWS` of them, spread evenly over the camera's path.
 
@@ -172,6 +171,7 @@ def photos_of(views: Sequence[View]) -> list[tuple[str, Tensor]]:
     return [(name, view.image) for name, view in zip(names, views, strict=True)]
 
 
+@torch.no_grad()
 def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> list[tuple[str, Tensor]]:
     """Names and uint8 pictures [H, W, 3], on the CPU, of a model from the cameras of views of a scene."""
     background, found = scene.background.to(model.device), []

@@ -20,7 +20,7 @@ MAX_FREE = 40  # buffers kept while nobody uses them: what one call needs, and s
 WORTH_KEEPING = 2**15  # bytes; smaller ones come from numpy
 
 # Free buffers by the number of their return, so the longest unused come first, and these numbers by capacity:
-# a training step asks some thirty times, and looking at all buffers each time would take 5 % of a small one.
+# a training step asks some thirty times, and to look at all buffers would nearly double what that takes.
 # A loan may end in the garbage collector at any moment, so there is no lock, only operations that are atomic.
 _free: dict[int, Array] = {}
 _returns: dict[int, list[int]] = {}
