@@ -186,10 +186,9 @@ def _together(communicate: Callable[[], object]) -> None:
     """What takes all ranks. Raises OtherProcessError where one of them is gone."""
     try:
         communicate()
-    except torch.OutOfMemoryError:
-        raise
     except RuntimeError as error:  # torch has no class of its own for what gloo finds
+        if type(error).__name__ == "OutOfMemoryError":  # which lies elsewhere in older versions
+            raise
         raise OtherProcessError(
-            f"another of the {_joined.count} processes that train together has ended "
-            f"({(str(error).splitlines() or ['no reason'])[0][:200]})"
+            f"another of the {_joined.count} processes that train together has ended"
         ) from error
