@@ -76,7 +76,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     ) -> None:
         """By the meta of renders, or by the statistics of all ranks' renders.
 
-        Of renders it adds up what gsplat does, without picking out the Gaussians that are seen, which on a CPU
+        Of renders it adds up what gsplat does, without picking out the Gaussians that are seen: on a CPU that
         takes twice as long.
         """
         known = set(_STATISTICS) <= set(info)
