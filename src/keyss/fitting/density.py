@@ -67,7 +67,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         if info is None:
             return ranks.sum(trained, [loss])[0], {}
         found: dict[str, Any] = dict.fromkeys(_STATISTICS)
-        super()._update_state(params, found, info)
+        self._update_state(params, found, info)
         loss, *sums = ranks.sum(trained, [loss, *(found[name] for name in _STATISTICS)])
         return loss, dict(zip(_STATISTICS, sums, strict=True))
 
