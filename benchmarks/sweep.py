@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import api, write_model
 from channels.low_bits.trained_like import trained_like
-from keyss.sweeps.engine import usable_cores
+from keyss._processes import usable_cores
 from keyss.sweeps.running import How
 
 SPEC = """\

@@ -18,6 +18,29 @@ def reporter(console: Console | None = None) -> ProgressLines:
     return ProgressLines(console, None if level < 1 or console.is_terminal else 1.0)
 
 
+class _Bars:
+    """The lines of all trainings of the moment, below each other: a terminal has room for one such block."""
+
+    def __init__(self) -> None:
+        self.progress: Progress | None = None
+        self.open = 0
+
+    def add(self, made: Callable[[], Progress]) -> Progress:
+        """The block with one line more; a new one where there is none."""
+        if self.progress is None:
+            self.progress = made()
+            self.progress.start()
+        self.open += 1
+        return self.progress
+
+    def close(self) -> None:
+        """A line is done; what all are is drawn a last time."""
+        self.open -= 1
+        if self.open == 0 and self.progress is not None:
+            self.progress.stop()
+            self.progress = None
+
+
 class ProgressLines:
     """A `Reporter` on a task of rich, which knows the speed of the recent past and the time that is left.
 
@@ -29,16 +52,34 @@ class ProgressLines:
     loss_every = 0
 
     def __init__(
-        self, console: Console, every: float | None = None, timer: Callable[[], float] = time.monotonic
+        self,
+        console: Console,
+        every: float | None = None,
+        timer: Callable[[], float] = time.monotonic,
+        bars: _Bars | None = None,
     ) -> None:
         self.console = console
         self.live = console.is_terminal
         self.every = (0.25 if self.live else 10.0) if every is None else every
         self.timer = timer
+        self.bars = bars or _Bars()
         self.task: Task | None = None
 
+    def beside(self) -> ProgressLines:
+        """Of another training at the same time: in a terminal the line below."""
+        return ProgressLines(self.console, self.every, self.timer, self.bars)
+
     def start(self, title: str, iterations: int, iteration: int) -> None:
-        self.progress = Progress(
+        self.progress = self.bars.add(self._block)
+        number = self.progress.add_task(title, total=iterations, completed=iteration, facts="starting")
+        self.task = next(task for task in self.progress.tasks if task.id == number)
+        self.shown, self.numbers = self.timer(), ""
+        if not self.live:
+            where = f", continuing at {iteration}" if iteration else ""
+            self._say(f"{title}: {iterations} steps{where}")
+
+    def _block(self) -> Progress:
+        return Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
@@ -49,13 +90,6 @@ class ProgressLines:
             disable=not self.live,
             get_time=self.timer,
         )
-        self.progress.add_task(title, total=iterations, completed=iteration, facts="starting")
-        self.task = self.progress.tasks[0]
-        self.shown, self.numbers = self.timer(), ""
-        self.progress.start()
-        if not self.live:
-            where = f", continuing at {iteration}" if iteration else ""
-            self._say(f"{title}: {iterations} steps{where}")
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         task = self.task
@@ -81,8 +115,8 @@ class ProgressLines:
         if task is None:
             return
         spent = f"in {clock(task.elapsed or 0)}"
-        self.progress.update(task.id, facts=_joined(spent, self.numbers))
-        self.progress.stop()  # draws the line a last time
+        self.progress.update(task.id, facts=_joined(spent, self.numbers), refresh=True)
+        self.bars.close()
         if not self.live:
             how = "done" if task.finished else f"stopped at {task.completed}"
             self._say(_joined(f"{task.description}: {how} {spent}", self.numbers))

@@ -26,13 +26,14 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions
+from keyss.methods.plain_models import plain_stage
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import PathLike
 from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import HidingRun, as_scene, open_run
-from keyss.runs.planning import PlannedRun, plain_stage
+from keyss.runs.planning import PlannedRun
 from keyss.runs.records import read_record, write_record
 
 RECORD, TABLE, PICTURE, KEY = "comparison.json", "comparison.md", "comparison.png", "key.txt"

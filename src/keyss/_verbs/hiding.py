@@ -29,7 +29,7 @@ from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
 from keyss.methods.base import Context, KeyedSource, Method, MethodOptions, Opened, Source, Stego
 from keyss.methods.handed import pack
-from keyss.methods.plain_models import Bound, fit_bound, plain_models
+from keyss.methods.plain_models import Bound, fit_bounds, plain_models
 from keyss.methods.registry import open_handed
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
@@ -285,14 +285,13 @@ def _longer(
 ) -> dict[int, Gaussians]:
     """Plain 3DGS of the scenes that were trained for longer than their plain models, by their index."""
     sizes = [len(stego.gaussians), *(len(each.reveal(stego.gaussians)) for each in stego.opened)]
-    found = {}
-    for index, (each, scene, model, size) in enumerate(zip(bounds, scenes, plain, sizes, strict=True)):
-        if each.equal or each.steps is None or not photos[index]:
-            continue
+    configs = {
         # A secret that lost Gaussians for want of room is compared with one that has no more.
-        config = each.config(options.fit, size if size < len(model) else None)
-        found[index] = fit_bound(scene, config, index, context)
-    return found
+        index: each.config(options.fit, size if size < len(model) else None)
+        for index, (each, model, size) in enumerate(zip(bounds, plain, sizes, strict=True))
+        if not each.equal and each.steps is not None and photos[index]
+    }
+    return fit_bounds(scenes, configs, context)
 
 
 def _measured(

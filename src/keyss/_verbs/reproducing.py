@@ -21,6 +21,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import Reporter, SilentReporter
 from keyss.methods import registry
 from keyss.methods.base import role_of
+from keyss.methods.plain_models import plain_stage
 from keyss.reproduction import downloading
 from keyss.reproduction.asking import PaperTable, Setting, benchmark_scenes, setting_of
 from keyss.reproduction.measuring import MEASURES
@@ -31,7 +32,7 @@ from keyss.runs.config import PathLike
 from keyss.runs.files import MODEL, is_run
 from keyss.runs.folder import read_manifest
 from keyss.runs.opening import open_run
-from keyss.runs.planning import PlannedRun, plain_stage
+from keyss.runs.planning import PlannedRun
 from keyss.runs.records import read_record, write_record
 
 _PLAIN, _SCENES = "plain", "scenes"

@@ -114,7 +114,7 @@ def _library(package: str) -> Finding:
 def _cores() -> tuple[bool, str]:
     import torch
 
-    from keyss.sweeps.engine import usable_cores
+    from keyss._processes import usable_cores
 
     return True, f"{usable_cores()} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
 

@@ -10,6 +10,7 @@ from keyss.core.errors import BackendError
 
 if TYPE_CHECKING:
     from keyss.fitting.loop import Reporter
+    from keyss.progress import ProgressLines
 
 FOLDER = "private/tensorboard"  # of a run: what is trained on may be secret
 
@@ -41,7 +42,7 @@ class TensorBoardReporter:
 
     loss_every = 10  # steps
 
-    def __init__(self, shown: Reporter, folder: Path, writer: Any) -> None:
+    def __init__(self, shown: ProgressLines, folder: Path, writer: Any) -> None:
         self.shown, self.folder, self.writer = shown, folder, writer
         self.open: Any = None
         self.last: dict[str, float] = {}
@@ -63,6 +64,9 @@ class TensorBoardReporter:
             self.last = seen
             for name, value in seen.items():
                 self.open.add_scalar(name, value, iteration)
+
+    def beside(self) -> TensorBoardReporter:
+        return TensorBoardReporter(self.shown.beside(), self.folder, self.writer)
 
     def note(self, line: str) -> None:
         self.shown.note(line)

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -25,12 +25,11 @@ from keyss.fitting.checkpoint import State, load_checkpoint, pack_state, save_ch
 from keyss.fitting.ranks import here
 from keyss.fitting.sampling import own_randomness
 
-_ENDING = tuple(
+ENDING = tuple(
     signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
 )
 
-
-_REMEDY = "continue with the same command and `resume=True`"
+REMEDY = "continue with the same command and `resume=True`"
 
 
 class TrainingRun(Protocol):
@@ -101,6 +100,14 @@ class ModelReporter(Protocol):
         """The same reporter, for the training of a secret's model."""
 
 
+@runtime_checkable
+class SeveralReporter(Protocol):
+    """A reporter that can be told of several trainings at the same time."""
+
+    def beside(self) -> Reporter:
+        """One for another training, while this one is told of its own."""
+
+
 def of_secret(reporter: Reporter | None) -> Reporter | None:
     """What the training of a secret's model reports to."""
     return reporter.of_secret() if isinstance(reporter, ModelReporter) else reporter
@@ -159,9 +166,8 @@ def train(
     if _threads.spinning and torch.get_num_threads() > 1:
         warnings.warn(_SPINNING, KeyssWarning, stacklevel=2)
     spent = 0.0
-    # Those that end a process are left to do so where there is nothing to save.
-    signals = (signal.SIGINT,) if checkpoint is None and ranks.count == 1 else _ENDING
-    with _deferred(signals) as interrupted, own_randomness(seed):
+    saves = checkpoint is not None or ranks.count > 1
+    with deferred(saves=saves) as interrupted, own_randomness(seed):
         if checkpoint is not None and resume and checkpoint.exists():
             tensors, meta = load_checkpoint(checkpoint)
             if meta.get("fingerprint") != fingerprint:
@@ -217,7 +223,7 @@ def train(
             save()
         except OtherProcessError as error:
             save(before)
-            saved_to = "nothing was saved" if checkpoint is None else _REMEDY
+            saved_to = "nothing was saved" if checkpoint is None else REMEDY
             raise OtherProcessError(f"{error}; {saved_to}") from error
         finally:
             reporter.finish()
@@ -225,10 +231,11 @@ def train(
 
 
 @contextmanager
-def _deferred(signals: Sequence[signal.Signals]) -> Iterator[Callable[[], signal.Signals | None]]:
+def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
     """Turn signals into a flag that is looked at between steps; a second one acts at once.
 
-    Signals that the process ignores stay ignored, as those of a program that `nohup` started.
+    Those that end a process are left to do so unless something `saves` then. Signals that the process ignores
+    stay ignored, as those of a program that `nohup` started.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
@@ -247,7 +254,7 @@ def _deferred(signals: Sequence[signal.Signals]) -> Iterator[Callable[[], signal
         for signum, handler in previous.items():
             signal.signal(signum, handler)
 
-    handlers = {signum: signal.getsignal(signum) for signum in signals}
+    handlers = {signum: signal.getsignal(signum) for signum in (ENDING if saves else (signal.SIGINT,))}
     # None: a handler that is not Python's, which could not be put back.
     previous = {signum: old for signum, old in handlers.items() if old not in (signal.SIG_IGN, None)}
     try:

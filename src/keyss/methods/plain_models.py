@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import of_secret
-from keyss.fitting.plain import fit_scene
+from keyss.fitting.side_by_side import Fit, fit_scenes
 from keyss.methods.base import Context, Training, role_of
 
 
@@ -22,24 +22,27 @@ def plain_models(
     """Plain models of the scenes on the CPU, in their own frames; those that are not given are fitted.
 
     Each from a seed of its own, which follows from that of `config`: what one model tells of its seed tells
-    nothing of the others'.
-    Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
+    nothing of the others'. See `fit_scenes` for what it raises.
     """
-    models = []
-    for index, (scene, model) in enumerate(zip(scenes, given, strict=True)):
-        if model is None:
-            folder = context.checkpoints
-            model = fit_scene(
-                scene,
-                replace(config, seed=config.seed_of(f"plain model {index}")),
-                device=context.device,
-                title=f"plain model of the {role_of(index, len(scenes))} ({scene.name})",
-                checkpoint=folder / f"plain-{index}.safetensors" if folder else None,
-                resume=context.resume,
-                reporter=context.reporter if index == 0 else of_secret(context.reporter),
-            ).gaussians
-        models.append(model)
-    return models
+    missing = {
+        index: _fit(
+            scene,
+            replace(config, seed=config.seed_of(f"plain model {index}")),
+            f"{plain_stage(role_of(index, len(scenes)))} ({scene.name})",
+            f"plain-{index}",
+            index,
+            context,
+        )
+        for index, (scene, model) in enumerate(zip(scenes, given, strict=True))
+        if model is None
+    }
+    fitted = _fitted(missing, context)
+    return [fitted[index] if model is None else model for index, model in enumerate(given)]
+
+
+def plain_stage(role: str) -> str:
+    """What the fitting of the plain model of `role_of` is called."""
+    return f"plain model of the {role}"
 
 
 @dataclass(frozen=True)
@@ -66,15 +69,34 @@ class Bound:
         return replace(fit, iterations=self.steps, max_gaussians=most)
 
 
-def fit_bound(scene: Scene, config: FitConfig, index: int, context: Context) -> Gaussians:
-    """The bound of scene `index` of a hiding, on the CPU, from a seed of its own; see `plain_models`."""
-    folder = context.checkpoints
-    return fit_scene(
+def fit_bounds(
+    scenes: Sequence[Scene], configs: Mapping[int, FitConfig], context: Context
+) -> dict[int, Gaussians]:
+    """The bounds of some scenes of a hiding, by their index, from seeds of their own; see `plain_models`."""
+    fits = {
+        index: _fit(
+            scenes[index],
+            replace(config, seed=config.seed_of(f"bound {index}")),
+            f"plain 3DGS of as many steps ({scenes[index].name})",
+            f"bound-{index}",
+            index,
+            context,
+        )
+        for index, config in configs.items()
+    }
+    return _fitted(fits, context)
+
+
+def _fit(scene: Scene, config: FitConfig, title: str, name: str, index: int, context: Context) -> Fit:
+    return Fit(
         scene,
-        replace(config, seed=config.seed_of(f"bound {index}")),
-        device=context.device,
-        title=f"plain 3DGS of as many steps ({scene.name})",
-        checkpoint=folder / f"bound-{index}.safetensors" if folder else None,
-        resume=context.resume,
-        reporter=context.reporter if index == 0 else of_secret(context.reporter),
-    ).gaussians
+        config,
+        title,
+        context.checkpoints / f"{name}.safetensors" if context.checkpoints else None,
+        context.reporter if index == 0 else of_secret(context.reporter),
+    )
+
+
+def _fitted(fits: Mapping[int, Fit], context: Context) -> dict[int, Gaussians]:
+    models = fit_scenes(list(fits.values()), device=context.device, resume=context.resume)
+    return dict(zip(fits, models, strict=True))

@@ -11,7 +11,7 @@ import resource
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,8 +20,9 @@ from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.ranks import here
+from keyss.fitting.side_by_side import SIDE_BY_SIDE, Fit, at_once, process_bytes
 from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput, role_of
-from keyss.methods.plain_models import Bound
+from keyss.methods.plain_models import Bound, plain_stage
 from keyss.progress import about
 from keyss.rendering.orbit import TEST_EVERY, VIEWS
 from keyss.runs.probing import Probe, decoding_seconds
@@ -104,7 +105,7 @@ def plan_hiding(
         for probe, network in zip(probes, networks, strict=True)
     ]
     sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
-    stages = []
+    stages, plain, bounds = list[Stage](), list[Fit](), list[Fit]()
     for index, (probe, each) in enumerate(zip(probes, inputs, strict=True)):
         role = role_of(index, len(inputs))
         if not each.photos:
@@ -113,7 +114,8 @@ def plan_hiding(
                 Stage(f"pictures of the {role}", 0, sizes[index], views * probe.picture(sizes[index]))
             )
         if each.model is None:
-            stages.append(_fitting(plain_stage(role), options.fit, probe, sizes[index]))
+            plain.append(Fit(scenes[index], options.fit, plain_stage(role)))
+            stages.append(_fitting(plain[-1].title, options.fit, probe, sizes[index]))
     if method.trains:
         decoding = 0.0
         if outlook.decode is not None:
@@ -125,8 +127,10 @@ def plan_hiding(
     ):
         longer = Bound.of(training, options.fit.iterations if each.model is None else None)
         if bound and each.photos and not longer.equal and longer.steps is not None:
-            name = f"bound of the {role_of(index, len(inputs))}"
-            stages.append(_fitting(name, longer.config(options.fit), probe, sizes[index]))
+            name, config = f"bound of the {role_of(index, len(inputs))}", longer.config(options.fit)
+            bounds.append(Fit(scenes[index], config, name))
+            stages.append(_fitting(name, config, probe, sizes[index]))
+    stages, processes = _side_by_side(stages, (plain, bounds), device)
     writing = _KEY_SECONDS * len(inputs[1:]) + _CODING_SECONDS * outlook.gaussians
     stages.append(Stage("encrypting, opening again", 0, outlook.gaussians, writing))
     stages.append(
@@ -140,7 +144,8 @@ def plan_hiding(
         if not each.photos and trains
     )
     # Parameters, gradients and moments, twice more all that a checkpoint holds while it is written.
-    memory = _resident_bytes() + pictures + (state * (4 + 2 * _STATE_COPIES) if trains else 3 * state)
+    trained = state * (4 + 2 * _STATE_COPIES) if trains else 3 * state
+    memory = _resident_bytes() + pictures + max(trained, processes)
     return Plan(
         method=method.name,
         stages=tuple(stages),
@@ -216,6 +221,18 @@ def _fitting(name: str, config: FitConfig, probe: Probe, most: int) -> Stage:
     return Stage(name, config.iterations, most, seconds)
 
 
+def _side_by_side(
+    stages: Sequence[Stage], groups: Sequence[Sequence[Fit]], device: torch.device
+) -> tuple[list[Stage], int]:
+    """The stages where fits of a group are done at the same time; bytes that their processes take."""
+    factors, most = dict[str, float](), 0
+    for fits in groups:
+        if (count := at_once(fits, device)) > 1:
+            factors |= {fit.title: SIDE_BY_SIDE for fit in fits}
+            most = max(most, sum(sorted(map(process_bytes, fits))[-count:]))
+    return [replace(each, seconds=each.seconds * factors.get(each.name, 1.0)) for each in stages], most
+
+
 def _hiding(config: FitConfig, probes: Sequence[Probe], outlook: Outlook, decoding: float) -> Stage:
     """The method's own training: a picture of every scene that it draws, and `decoding` seconds, a step."""
     drawn = [(probe, count) for probe, count in zip(probes, outlook.drawn, strict=True) if count]
@@ -263,11 +280,6 @@ def _measuring(
     wrong *= method.capabilities.keys
     decoding = sum(own[:1]) * len(own[1:]) + sum(own[1:])
     return 3 * sum(plain) + 3 * sum(own) + wrong * decoding
-
-
-def plain_stage(role: str) -> str:
-    """What the stage is called in which the plain model of `role_of` is fitted."""
-    return f"plain model of the {role}"
 
 
 def _floats(sh_degree: int) -> int:

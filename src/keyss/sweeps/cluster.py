@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from keyss._processes import how_it_ended
 from keyss.core.errors import BackendError
 from keyss.sweeps.engine import (
     RETRIES,
@@ -20,7 +21,6 @@ from keyss.sweeps.engine import (
     Resources,
     Task,
     Watcher,
-    how_it_ended,
     process_of,
 )
 from keyss.sweeps.worker import REFUSED

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from keyss._processes import available_memory, command, environment, usable_cores
 from keyss.core.errors import UsageError
 from keyss.sweeps.job import LOG
 
 RETRIES = 2  # of a job whose process died
-WORKER = (sys.executable, "-m", "keyss.sweeps.worker")
-
-# Read by the libraries that compute on several threads when they are loaded.
-_THREADS = (
-    *("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
-    *("NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
-)
+WORKER = command("keyss.sweeps.worker")
 
 
 @dataclass(frozen=True)
@@ -80,11 +73,11 @@ class Engine(Protocol):
         """Returns when each is done, was refused, or has died once more than it may."""
 
 
-def process_of(folder: Path, threads: int, command: Sequence[str]) -> subprocess.Popen[bytes]:
+def process_of(folder: Path, threads: int, worker: Sequence[str]) -> subprocess.Popen[bytes]:
     """A process that does the job in `folder`, and that ends when this one does. Raises OSError."""
     with (folder / LOG).open("ab") as log:
         return subprocess.Popen(
-            [*command, str(folder)],
+            [*worker, str(folder)],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,
@@ -93,30 +86,3 @@ def process_of(folder: Path, threads: int, command: Sequence[str]) -> subprocess
             # it would not save what it has.
             start_new_session=True,
         )
-
-
-def environment(threads: int) -> Mapping[str, str]:
-    """This process's, with so many threads for whatever computes."""
-    return {**os.environ, **dict.fromkeys(_THREADS, str(threads))}
-
-
-def how_it_ended(status: int) -> str:
-    """Of the exit status of a process that left no result."""
-    return f"killed by signal {-status}" if status < 0 else f"exit status {status}"
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def available_memory() -> int | None:
-    """Bytes that could be had now; None where the system does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    found = {name: int(rest.split()[0]) * 1024 for name, _, rest in (line.partition(":") for line in lines)}
-    return found.get("MemAvailable")

@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from keyss.sweeps.engine import RETRIES, WORKER, Resources, Task, Watcher, how_it_ended, process_of
+from keyss._processes import how_it_ended
+from keyss.sweeps.engine import RETRIES, WORKER, Resources, Task, Watcher, process_of
 from keyss.sweeps.worker import REFUSED
 
 _POLL = 0.05  # s

@@ -11,13 +11,13 @@ import fcntl
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from keyss._processes import end_with_parent
 from keyss.core.errors import KeyssError, OutputError
 from keyss.files.atomic import write_bytes
 from keyss.sweeps.job import FAILED, JOB, LOCK, RESULT, Failure, Job, Result, result_of
@@ -32,7 +32,7 @@ def main(arguments: list[str]) -> int:
 
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, _on_signal)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     try:
         return attempt(Path(arguments[0]), perform)
     except KeyboardInterrupt:
@@ -76,13 +76,6 @@ def held(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _end_with_parent() -> None:
-    """Ends this process at once when the pipe ends: nothing is lost, for files appear when they are whole."""
-    while os.read(0, 1024):
-        pass
-    os._exit(128 + signal.SIGHUP)
 
 
 def _on_signal(signum: int, frame: FrameType | None) -> None:
