@@ -113,3 +113,41 @@ def test_it_may_be_used_again(timer: Timer, terminal: bool) -> None:
         lines.update(2, 0, {})
         lines.finish()
     assert [text(screen).count(title) > 1 for title in ("cover", "secret")] == [True, True]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_two_trainings_have_a_line_each(timer: Timer, terminal: bool) -> None:
+    """The one that begins first is above, and a line stays when its training is done."""
+    screen = console(terminal)
+    cover = ProgressLines(screen, timer=timer)
+    secret = cover.beside()
+    cover.start("cover", 20, 0)
+    secret.start("secret", 40, 0)
+    for iteration in range(1, 41):
+        timer.now += 1
+        if iteration <= 20:
+            cover.update(iteration, 300, {})
+        if iteration == 20:
+            cover.finish()
+        secret.update(iteration, 500, {})
+    secret.finish()
+    shown = text(screen)
+    if terminal:
+        last = shown.rsplit("cover", 1)[1]
+        assert "20/20 in 0:20, 300 Gaussians" in last
+        assert "\nsecret" in last
+        assert "40/40 in 0:40, 500 Gaussians" in last
+        assert "10/20 1.0 it/s, 0:10 left" in shown
+    else:
+        assert shown.splitlines() == [
+            "cover: 20 steps",
+            "secret: 40 steps",
+            "cover: 10/20, 1.0 it/s, 0:10 left, 300 Gaussians",
+            "secret: 10/40, 1.0 it/s, 0:30 left, 500 Gaussians",
+            "cover: 20/20, 1.0 it/s, 0:00 left, 300 Gaussians",
+            "cover: done in 0:20, 300 Gaussians",
+            "secret: 20/40, 1.0 it/s, 0:20 left, 500 Gaussians",
+            "secret: 30/40, 1.0 it/s, 0:10 left, 500 Gaussians",
+            "secret: 40/40, 1.0 it/s, 0:00 left, 500 Gaussians",
+            "secret: done in 0:40, 500 Gaussians",
+        ]

@@ -11,7 +11,9 @@ import pytest
 
 from cli.said import SMALL, Said, assert_refused
 from files.scene_files import write_nerfstudio
+from keyss.cli.tensorboard import FOLDER, reporter
 from keyss.files import read_model
+from keyss.fitting.loop import SeveralReporter
 
 Run = Callable[..., Said]
 
@@ -41,6 +43,23 @@ def test_losses_come_back(keyss: Run, scene: Path) -> None:
     # What trains is the same, watched or not.
     keyss("fit", scene, "-o", scene.parent / "plain", *SMALL[2:], "--seed", 0)
     assert (out / "model.ply").read_bytes() == (scene.parent / "plain" / "model.ply").read_bytes()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_two_trainings_at_the_same_time_have_a_run_each(tmp_path: Path) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    cover = reporter(tmp_path, tensorboard=True)
+    assert isinstance(cover, SeveralReporter)
+    secret = cover.beside()
+    for title, each in (("cover", cover), ("secret", secret)):
+        each.start(title, 10, 0)
+    for factor, each in ((1.0, cover), (2.0, secret)):
+        each.update(10, 100, {"loss": factor})
+        each.finish()
+    for title, loss in (("cover", 1.0), ("secret", 2.0)):
+        found = events.EventAccumulator(str(tmp_path / FOLDER / title))
+        found.Reload()
+        assert [each.value for each in found.Scalars("loss")] == [loss]
 
 
 def test_without_it_nothing_is_begun(keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

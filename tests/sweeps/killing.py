@@ -13,33 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from keyss.core import BackendError
+from other_processes import command_of, descendants, until
 from sweeps.fakes import DRIVER
-
-
-def until(there: Callable[[], object], seconds: float = 120) -> None:
-    deadline = time.monotonic() + seconds
-    while not there():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def descendants(pid: int) -> list[int]:
-    """Processes that this one has started, and those that they have."""
-    found = []
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            found += [int(each) for each in task.read_text().split()]
-        except OSError:  # it is gone
-            continue
-    return found + [each for child in found for each in descendants(child)]
-
-
-def command_of(pid: int) -> str:
-    """Empty for a process that is gone."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-    except OSError:
-        return ""
 
 
 def results(out: Path) -> dict[str, tuple[int, int]]:

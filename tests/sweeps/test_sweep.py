@@ -23,8 +23,9 @@ from keyss.sweeps.running import How
 from keyss.sweeps.spec import read_spec, variants
 from keyss.sweeps.sweep import estimates
 from keyss.sweeps.tables import CellNumbers, half_interval, summaries, write_tables
+from other_processes import until
 from sweeps.fakes import DRIVER, REAL, fake, real_spec, training_spec, write_spec
-from sweeps.killing import kill_until_done, results, until
+from sweeps.killing import kill_until_done, results
 
 GOOD = """
 pairs:
