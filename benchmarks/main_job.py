@@ -4,8 +4,9 @@
     python benchmarks/main_job.py --cover bonsai --secret fox --fits
 
 `keyss hide` as it is typed, in a process of its own, with the working tree and with the older commit in
-turns. With `--fits` also `keyss fit` of both scenes: one after the other with all threads, and side by side
-with half of them each. Each tree first hides for a few steps, so that its kernels are compiled.
+turns. With `--fits` also the plain models alone: one after the other with all threads, and side by side with
+half of them each, as `keyss hide` fits them. Each tree first hides for a few steps, so that its kernels are
+compiled.
 """
 
 from __future__ import annotations
@@ -19,6 +20,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from keyss import FitConfig
+from keyss.files import load_scene
+from keyss.fitting.side_by_side import Fit, fit_scenes
+
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = "Xq7Rf2LmZ9aT+001"
@@ -44,7 +51,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         found = hidings(options, Path(name))
         if options.fits:
-            found |= fits(options, Path(name))
+            found |= fits(options)
     print(f"{options.iterations} steps, {options.threads} thread(s); the least of {options.repeats}\n")
     print("| | seconds | processor seconds |\n| --- | --- | --- |")
     for what, times in found.items():
@@ -61,29 +68,28 @@ def hidings(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]
         trees = {"hide, this tree": ROOT, **older}
         for what, tree in trees.items():
             few = ["--iterations", FEW, "--min-psnr", 0, "-o", folder / f"first, {what}"]
-            timed(tree, [[*job, *few]], options.threads)
+            timed(tree, [*job, *few], options.threads)
         for number in range(options.repeats):
             for what, tree in trees.items():
                 command = [*job, "--iterations", options.iterations, "-o", folder / f"{number}, {what}"]
-                found.setdefault(what, []).append(timed(tree, [command], options.threads))
+                found.setdefault(what, []).append(timed(tree, command, options.threads))
     return found
 
 
-def fits(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]:
-    """The plain models of both scenes, with as many threads in all."""
-    steps = ["--iterations", options.iterations]
+def fits(options: argparse.Namespace) -> dict[str, list[Times]]:
+    """The plain models of both scenes, in this process and in two, with as many threads in all."""
+    torch.set_num_threads(options.threads)
+    config = FitConfig(iterations=options.iterations, max_gaussians=options.max_gaussians, seed=0)
+    scenes = [load_scene(each, width=options.width) for each in (options.cover, options.secret)]
+    both = [Fit(scene, config, scene.name) for scene in scenes]
     found: dict[str, list[Times]] = {"fits, one after the other": [], "fits, side by side": []}
-    for number in range(options.repeats):
-        for what, times in found.items():
-            commands: list[Command] = [
-                ["fit", scene.resolve(), *sizes(options), *steps, "-o", folder / f"{number}, {what}, {role}"]
-                for role, scene in (("cover", options.cover), ("secret", options.secret))
-            ]
-            if what == "fits, side by side":
-                times.append(timed(ROOT, commands, max(1, options.threads // 2)))
-            else:
-                alone = [timed(ROOT, [command], options.threads) for command in commands]
-                times.append((sum(each[0] for each in alone), sum(each[1] for each in alone)))
+    for _ in range(options.repeats):
+        for (what, times), groups in zip(found.items(), ([[fit] for fit in both], [both]), strict=True):
+            print(what, flush=True)
+            before, start = processor_seconds(), time.perf_counter()
+            for group in groups:
+                fit_scenes(group)
+            times.append((time.perf_counter() - start, processor_seconds() - before))
     return found
 
 
@@ -105,21 +111,19 @@ def older_tree(commit: str | None, place: Path) -> Iterator[dict[str, Path]]:
         subprocess.run([*git, "remove", "--force", place], check=True)
 
 
-def timed(tree: Path, commands: list[Command], threads: int) -> Times:
-    """What the `keyss` of a tree takes for commands at the same time. Raises SystemExit where one fails."""
+def timed(tree: Path, command: Command, threads: int) -> Times:
+    """What the `keyss` of a tree takes for a command. Raises CalledProcessError where it fails."""
     environment = os.environ | {f"{library}_NUM_THREADS": str(threads) for library in LIBRARIES}
     environment["PYTHONPATH"] = str(tree / "src")
-    before, start = os.times(), time.perf_counter()
-    running = [
-        subprocess.Popen([sys.executable, "-m", "keyss", *map(str, command)], env=environment, cwd=tree)
-        for command in commands
-    ]
-    statuses = [process.wait() for process in running]
-    if any(statuses):
-        raise SystemExit("a command failed")
-    seconds, after = time.perf_counter() - start, os.times()
-    spent = [each.children_user + each.children_system for each in (before, after)]
-    return seconds, spent[1] - spent[0]
+    before, start = processor_seconds(), time.perf_counter()
+    line = [sys.executable, "-m", "keyss", *map(str, command)]
+    subprocess.run(line, env=environment, cwd=tree, check=True)
+    return time.perf_counter() - start, processor_seconds() - before
+
+
+def processor_seconds() -> float:
+    """Of this process and of those that it has started, so far."""
+    return sum(os.times()[:4])
 
 
 if __name__ == "__main__":

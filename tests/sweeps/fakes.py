@@ -13,9 +13,10 @@ TESTS = str(Path(__file__).parents[1])
 # Takes a moment, and publishes what follows from the job alone. A job whose cover has "broken" in its name is
 # refused; one with "mortal" dies in its first two attempts.
 PROGRAM = """
-import hashlib, os, signal, sys, threading, time
+import hashlib, os, signal, sys, time
 from dataclasses import dataclass
 from pathlib import Path
+from keyss._processes import end_with_parent
 from keyss.core.errors import InputError
 from keyss.sweeps import worker
 from keyss.sweeps.job import Result
@@ -40,7 +41,7 @@ def perform(job, folder):
     numbers = {"cover.psnr": 30.0 + seed}
     return Result(name=job.name, seconds=0.1, published=published, sha256=digest, numbers=numbers)
 
-threading.Thread(target=worker._end_with_parent, daemon=True).start()
+end_with_parent()
 sys.exit(worker.attempt(Path(sys.argv[1]), perform))
 """
 

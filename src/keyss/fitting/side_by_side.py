@@ -36,7 +36,7 @@ from keyss.fitting.ranks import here
 LEAST_STEPS = 1000  # of a training, for which a process is worth the two seconds that it takes to start
 SIDE_BY_SIDE = 0.75  # of the time that two trainings take one after the other: see docs/scaling.md
 
-_PROCESS_BYTES = 400 << 20  # libraries, and the pictures of a step
+_PROCESS_BYTES = 500 << 20  # libraries, and the pictures of a step
 _COPIES = 16  # numbers that a training holds for one of a model: moments, gradients, what a step makes
 _POLL = 0.1  # seconds
 _ALONE = "with OMP_NUM_THREADS=1 in the environment fits are one after the other, which takes less memory"
