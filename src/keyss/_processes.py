@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 import signal
+import site
 import sys
 import sysconfig
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 # Read by the libraries that compute on several threads when they are loaded.
@@ -18,22 +20,42 @@ _THREADS = (
     *("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
     *("NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
 )
-_SECRET = "KEYSS_KEY"  # none of these processes reads it
+_KEY = "KEYSS_KEY"  # none of these processes reads it
+_STARTED = "KEYSS_STARTED_BY_KEYSS"
 _ROOT = str(Path(__file__).parents[1])  # where keyss lies
+_CGROUPS = Path("/sys/fs/cgroup")
+
+
+def can_start() -> bool:
+    """Whether this process may start others.
+
+    One that keyss has started may not, since it was given so many cores and so much memory; nor can a program
+    that is no Python interpreter: a frozen app, or a host that embeds Python.
+    """
+    name = Path(sys.executable or "").name
+    return name.startswith("python") and not getattr(sys, "frozen", False) and _STARTED not in os.environ
 
 
 def command(module: str) -> tuple[str, ...]:
     """What runs a module of keyss; nothing is imported from the folder that it is started in."""
-    return (sys.executable, "-P", "-m", module)
+    return (sys.executable, "-I" if sys.flags.isolated else "-P", "-m", module)
 
 
 def environment(threads: int) -> dict[str, str]:
     """This process's, with so many threads for whatever computes, and without a key."""
-    found = {**os.environ, **dict.fromkeys(_THREADS, str(threads))}
-    found.pop(_SECRET, None)
-    if _ROOT not in (sysconfig.get_path("purelib"), sysconfig.get_path("platlib")):
-        found["PYTHONPATH"] = os.pathsep.join(filter(None, (_ROOT, found.get("PYTHONPATH"))))
+    found = {**os.environ, **dict.fromkeys(_THREADS, str(threads)), _STARTED: "1"}
+    found.pop(_KEY, None)
+    paths = [each for each in found.get("PYTHONPATH", "").split(os.pathsep) if each]
+    # Before the standard library, where a folder of packages must not be.
+    if os.path.realpath(_ROOT) not in {os.path.realpath(each) for each in (*paths, *_package_folders())}:
+        found["PYTHONPATH"] = os.pathsep.join((_ROOT, *paths))
     return found
+
+
+def _package_folders() -> list[str]:
+    """Where Python looks for packages by itself."""
+    found = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), *site.getsitepackages()]
+    return [*found, site.getusersitepackages()]
 
 
 def end_with_parent() -> None:
@@ -63,10 +85,32 @@ def usable_cores() -> int:
 
 
 def available_memory() -> int | None:
-    """Bytes that could be had now; None where the system does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    found = {name: int(rest.split()[0]) * 1024 for name, _, rest in (line.partition(":") for line in lines)}
-    return found.get("MemAvailable")
+    """Bytes that could be had now, by this machine and by the control group of a container.
+
+    None where the system does not tell.
+    """
+    found = _available_in_group()
+    with suppress(OSError, KeyError):
+        there = _numbers(Path("/proc/meminfo"))["MemAvailable:"] * 1024
+        found = there if found is None else min(found, there)
+    return found
+
+
+def _available_in_group() -> int | None:
+    """What the limits of control groups (version 2) leave; None without one."""
+    found: list[int] = []
+    with suppress(OSError, IndexError):
+        inside = Path("/proc/self/cgroup").read_text().split("::", 1)[1].splitlines()[0].lstrip("/")
+        folder = _CGROUPS / inside
+        for group in (folder, *folder.parents[: len(Path(inside).parts)]):
+            with suppress(OSError, ValueError, KeyError):  # ValueError: "max", which is no limit
+                limit = int((group / "memory.max").read_text())
+                used = int((group / "memory.current").read_text())
+                found.append(limit - used + _numbers(group / "memory.stat")["inactive_file"])  # is given back
+    return max(0, min(found)) if found else None
+
+
+def _numbers(path: Path) -> dict[str, int]:
+    """Of lines that begin with a name and a number. Raises OSError."""
+    lines = (line.split() for line in path.read_text().splitlines())
+    return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}

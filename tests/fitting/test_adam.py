@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -156,3 +158,14 @@ def test_numbers_that_end_near_zero_have_uniform_low_bits() -> None:
     for bit in range(4):
         ones = float((small >> bit & 1).mean())
         assert abs(ones - 0.5) < 5 * 0.5 / len(small) ** 0.5, (bit, ones, len(small))
+
+
+def test_training_does_not_load_the_compiler_of_torch() -> None:
+    """It takes a second, in every process that trains."""
+    code = (
+        "import sys, torch; from keyss.fitting.adam import RowAdam; "
+        "p = torch.nn.Parameter(torch.ones(2, 3)); adam = RowAdam([p]); p.grad = torch.ones(2, 3); adam.step(); adam.zero_grad(); "
+        "adam.load_state_dict(adam.state_dict()); print('torch._dynamo' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"

@@ -8,26 +8,27 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from keyss import FitConfig, LearnedOptions, Secret, hide
 from keyss.core import Gaussians, InputError
-from keyss.core.errors import OtherProcessError
+from keyss.core.errors import KeyssWarning, OtherProcessError
 from keyss.core.gaussians import same_bits
 from keyss.fitting import Interrupted, side_by_side, worker
-from keyss.fitting.checkpoint import load_checkpoint
+from keyss.fitting.checkpoint import steps_done
 from keyss.fitting.loop import SilentReporter
 from keyss.fitting.side_by_side import LEAST_STEPS, Fit, at_once, fit_scenes, process_bytes
+from keyss.runs.files import bound_names, plain_names
 from other_processes import command_of, descendants, until
 from tiny_scenes import tiny_scene
-
-pytestmark = pytest.mark.counted
 
 CONFIG = FitConfig(
     iterations=150, max_gaussians=260, grow_start=0.1, grow_every=20, evaluate_every=50, seed=0
@@ -37,57 +38,70 @@ CPU = torch.device("cpu")
 
 
 class Recorder(SilentReporter):
-    """Keeps what it is told, and does something at one step of any training, or as the first begins."""
+    """Keeps what it is told; once, when all trainings have begun and one is at a step, it does something."""
 
-    def __init__(self, at: int = -1, loss_every: int = 0) -> None:
-        self.at, self.loss_every = at, loss_every
+    def __init__(self, at: int = -1, loss_every: int = 0, count: int = 2) -> None:
+        self.at, self.loss_every, self.count = at, loss_every, count
         self.all = [self]
         self.said: list[tuple[object, ...]] = []
+        self.act: Callable[[], None] | None = None
 
     def beside(self) -> Recorder:
-        other = Recorder(self.at or -1, self.loss_every)
-        other.act, other.all = self.act, self.all  # type: ignore[method-assign]
+        other = Recorder(self.at, self.loss_every, self.count)
+        other.act, other.all = self._act_once, self.all
         self.all.append(other)
         return other
 
-    def act(self) -> None: ...
+    def _act_once(self) -> None:
+        act, self.act = self.act, None
+        if act is not None:
+            act()
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self.said.append(("start", title, iterations, iteration))
         if self.at == 0:
-            self.at = -1
-            self.act()
+            self._act_once()
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         self.said.append(("update", iteration, gaussians, numbers))
-        if 0 < self.at <= iteration:
-            self.at = -1
-            self.act()
+        begun = sum(any(what == "update" for what, *_ in each.said) for each in self.all)
+        if 0 < self.at <= iteration and begun == self.count:
+            self._act_once()
 
     def finish(self) -> None:
         self.said.append(("finish",))
 
 
-class Signalled(Recorder):
+def acting(at: int, act: Callable[[], object]) -> Recorder:
+    found = Recorder(at)
+    found.act = lambda: (act(), None)[1]
+    return found
+
+
+def signalled(at: int, signum: int = signal.SIGINT) -> Recorder:
     """Sends this process a signal."""
-
-    def __init__(self, at: int, signum: int = signal.SIGINT) -> None:
-        super().__init__(at)
-        self.signum = signum
-
-    def act(self) -> None:
-        os.kill(os.getpid(), self.signum)
+    return acting(at, lambda: os.kill(os.getpid(), signum))
 
 
 @pytest.fixture
-def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also fits of a few steps are done at the same time, and two threads are there."""
+def children(monkeypatch: pytest.MonkeyPatch) -> list[side_by_side._Child]:
+    """Those that are started, also for fits of a few steps: as if there were two threads and much memory."""
+    found: list[side_by_side._Child] = []
+    start = side_by_side._start
+
+    def noted(*arguments: Any) -> side_by_side._Child:
+        found.append(start(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr(side_by_side, "_start", noted)
     monkeypatch.setattr(side_by_side, "LEAST_STEPS", 1)
     monkeypatch.setattr(side_by_side.torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(side_by_side._processes, "usable_cores", lambda: 2)
+    monkeypatch.setattr(side_by_side._processes, "available_memory", lambda: None)
+    return found
 
 
-at_the_same_time = pytest.mark.usefixtures("_at_once")
+at_the_same_time = pytest.mark.usefixtures("children")
 
 
 def fits_of(
@@ -109,9 +123,10 @@ def one_by_one(fits: Sequence[Fit]) -> list[Gaussians]:
     return [model for fit in fits for model in fit_scenes([replace(fit, checkpoint=None, reporter=None)])]
 
 
+@pytest.mark.counted
 @at_the_same_time
 def test_models_are_the_same_to_the_bit_and_all_report(tmp_path: Path) -> None:
-    reporter = Recorder(loss_every=60)
+    reporter = Recorder(loss_every=60, count=3)
     fits = fits_of(tmp_path, CONFIG, reporter, count=3)
     models = fit_scenes(fits)
     for model, other in zip(models, one_by_one(fits), strict=True):
@@ -131,34 +146,29 @@ def test_models_are_the_same_to_the_bit_and_all_report(tmp_path: Path) -> None:
         assert losses == [60, 120]
 
 
-@at_the_same_time
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_all_save_and_go_on_to_the_same_models(tmp_path: Path, signum: signal.Signals) -> None:
-    with pytest.raises(Interrupted) as caught:
-        fit_scenes(fits_of(tmp_path, replace(CONFIG, iterations=20_000), Signalled(100, signum)))
-    assert caught.value.args == (signum,)
-    assert caught.value.checkpoint == tmp_path / "0.safetensors"
-    assert descendants(os.getpid()) == []
-    steps = [load_checkpoint(tmp_path / f"{seed}.safetensors")[1]["iteration"] for seed in range(2)]
-    assert all(0 < each < 20_000 for each in steps)
-
-
+@pytest.mark.counted
 @at_the_same_time
 def test_an_interrupted_pair_resumes_to_the_same_models(tmp_path: Path) -> None:
-    config = replace(CONFIG, iterations=600)
-    with pytest.raises(Interrupted):
-        fit_scenes(fits_of(tmp_path, config, Signalled(150)))
+    config = replace(CONFIG, iterations=700)
+    with pytest.raises(Interrupted) as caught:
+        fit_scenes(fits_of(tmp_path, config, signalled(50)))
+    assert caught.value.args == (signal.SIGINT,)
+    assert caught.value.checkpoint == tmp_path / "0.safetensors"
+    assert descendants(os.getpid()) == []
     reporter = Recorder()
     fits = fits_of(tmp_path, config, reporter)
+    before = [steps_done(fit.checkpoint) for fit in fits]
     resumed = fit_scenes(fits, resume=True)
-    assert any(int(str(each.said[0][3])) >= 100 for each in reporter.all)  # it goes on, it does not begin
+    assert [each.said[0][3] for each in reporter.all] == [steps for steps in before if steps < 700]
+    assert min(before) < 700
+    assert max(before) >= 50
     for model, other in zip(resumed, one_by_one(fits), strict=True):
         assert same_bits(model, other)
 
 
 @at_the_same_time
-def test_what_is_interrupted_before_it_has_begun_ends_at_once() -> None:
-    reporter = Signalled(0)
+def test_a_signal_while_processes_load_ends_it_at_once() -> None:
+    reporter = signalled(0)
     started = time.monotonic()
     with pytest.raises(Interrupted) as caught:
         fit_scenes(fits_of(None, ENDLESS, reporter))
@@ -168,21 +178,54 @@ def test_what_is_interrupted_before_it_has_begun_ends_at_once() -> None:
     assert descendants(os.getpid()) == []
 
 
-@at_the_same_time
-def test_a_second_signal_ends_it_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("at", "order"), [(0, 1), (0, -1), (50, -1)])
+def test_a_signal_to_all_processes_interrupts(
+    tmp_path: Path, children: list[side_by_side._Child], at: int, order: int
+) -> None:
+    """As systems end a whole service, in any order."""
+
+    def to_all() -> None:
+        for pid in [os.getpid(), *(child.process.pid for child in children)][::order]:
+            os.kill(pid, signal.SIGTERM)
+
+    with pytest.raises(Interrupted) as caught:
+        fit_scenes(fits_of(tmp_path, ENDLESS, acting(at, to_all)))
+    assert caught.value.args == (signal.SIGTERM,)
+    assert len(list(tmp_path.iterdir())) == (2 if at else 0)
+
+
+def test_a_second_signal_ends_it_at_once(tmp_path: Path, children: list[side_by_side._Child]) -> None:
     """When processes do not answer, for example."""
 
-    class Twice(Recorder):
-        def act(self) -> None:
-            for child in descendants(os.getpid()):
-                os.kill(child, signal.SIGSTOP)
-            os.kill(os.getpid(), signal.SIGINT)
-            signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
-            signal.setitimer(signal.ITIMER_REAL, 0.5)
+    def twice() -> None:
+        for child in children:
+            os.kill(child.process.pid, signal.SIGSTOP)
+        os.kill(os.getpid(), signal.SIGINT)
+        signal.setitimer(signal.ITIMER_REAL, 0.5)
 
-    with pytest.raises(KeyboardInterrupt):
-        fit_scenes(fits_of(tmp_path, ENDLESS, Twice(1)))
+    before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            fit_scenes(fits_of(tmp_path, ENDLESS, acting(1, twice)))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
     assert descendants(os.getpid()) == []
+
+
+def test_what_is_started_with_ctrl_c_ignored_goes_on(children: list[side_by_side._Child]) -> None:
+    """As by a script in its background: Ctrl-C comes to processes as well, and nothing comes of it."""
+
+    def to_all() -> None:
+        for pid in [os.getpid(), *(child.process.pid for child in children)]:
+            os.kill(pid, signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        models = fit_scenes(fits_of(None, CONFIG, acting(1, to_all)))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert len(models) == 2
 
 
 @at_the_same_time
@@ -194,25 +237,43 @@ def test_an_error_of_one_comes_through_and_stops_the_others(tmp_path: Path) -> N
     assert descendants(os.getpid()) == []
 
 
+@pytest.mark.counted
 @at_the_same_time
-def test_a_process_that_is_killed_is_told_and_the_others_save(tmp_path: Path) -> None:
-    class Kill(Recorder):
-        def act(self) -> None:
-            os.kill(min(descendants(os.getpid())), signal.SIGKILL)
+def test_errors_that_nobody_expects_are_those_of_a_fit_in_this_process() -> None:
+    good, bad = fits_of(None, ENDLESS)
+    first = bad.scene.train[0]
+    views = (replace(first, camera=replace(first.camera, K=torch.eye(2))), *bad.scene.train[1:])
+    bad = replace(bad, scene=replace(bad.scene, train=views))
+    with pytest.raises(ValueError, match="K") as alone:
+        fit_scenes([bad])
+    with pytest.raises(type(alone.value)) as caught:
+        fit_scenes([good, bad])
+    assert str(caught.value) == str(alone.value)
+    assert "fit_scene" in caught.value.__notes__[0]  # where it came up
+    # Of what cannot even be said to a process.
+    odd = replace(ENDLESS, max_gaussians=np.int64(260))
+    with pytest.raises(TypeError, match="int64"):
+        fit_scenes(fits_of(None, odd))
+    assert descendants(os.getpid()) == []
 
-    with pytest.raises(OtherProcessError, match=r"fit 0 ended \(killed by signal 9\); continue with"):
-        fit_scenes(fits_of(tmp_path, ENDLESS, Kill(50)))
+
+def test_a_process_that_is_killed_is_told_and_the_others_save(
+    tmp_path: Path, children: list[side_by_side._Child]
+) -> None:
+    killing = acting(50, lambda: children[0].process.kill())
+    with pytest.raises(OtherProcessError) as caught:
+        fit_scenes(fits_of(tmp_path, ENDLESS, killing))
+    said = str(caught.value)
+    assert said.startswith("the process for the fit 0 has ended (killed by signal 9); nothing was saved")
+    assert "OMP_NUM_THREADS=1" in said
     assert [path.name for path in tmp_path.iterdir()] == ["1.safetensors"]
 
 
-@at_the_same_time
-def test_a_signal_that_only_a_process_gets_interrupts_all(tmp_path: Path) -> None:
-    class Terminate(Recorder):
-        def act(self) -> None:
-            os.kill(min(descendants(os.getpid())), signal.SIGTERM)
-
+def test_a_signal_that_only_a_process_gets_interrupts_all(
+    tmp_path: Path, children: list[side_by_side._Child]
+) -> None:
     with pytest.raises(Interrupted) as caught:
-        fit_scenes(fits_of(tmp_path, ENDLESS, Terminate(50)))
+        fit_scenes(fits_of(tmp_path, ENDLESS, acting(50, lambda: children[0].process.terminate())))
     assert caught.value.args == (signal.SIGTERM,)
     assert {path.name for path in tmp_path.iterdir()} == {"0.safetensors", "1.safetensors"}
 
@@ -223,6 +284,7 @@ def test_processes_end_with_whoever_started_them(tmp_path: Path) -> None:
         "side_by_side.LEAST_STEPS = 1\n"
         "side_by_side.torch.set_num_threads(2)\n"
         "side_by_side._processes.usable_cores = lambda: 2\n"
+        "side_by_side._processes.available_memory = lambda: None\n"
         "side_by_side.fit_scenes(fits_of(None, ENDLESS))"
     )
     paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
@@ -230,7 +292,7 @@ def test_processes_end_with_whoever_started_them(tmp_path: Path) -> None:
     try:
         until(lambda: len(descendants(driver.pid)) == 2)
         children = descendants(driver.pid)
-        assert all(worker.MODULE in command_of(each) for each in children)
+        until(lambda: all(worker.MODULE in command_of(each) for each in children))
     finally:
         driver.kill()
         driver.wait()
@@ -238,10 +300,23 @@ def test_processes_end_with_whoever_started_them(tmp_path: Path) -> None:
 
 
 @at_the_same_time
-def test_a_process_that_cannot_be_started_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(side_by_side.sys, "executable", "/nowhere/python")
-    with pytest.raises(OtherProcessError, match=r"fit 0 \(No such file or directory\); with OMP_NUM"):
-        fit_scenes(fits_of(None, CONFIG))
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        ("/nowhere/python", "No such file or directory"),
+        ("false", "exit status 1 while it was loading"),
+    ],
+)
+def test_where_no_process_can_be_started_fits_are_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, program: str, reason: str
+) -> None:
+    monkeypatch.setattr(side_by_side._processes, "command", lambda module: (program,))
+    reporter = Recorder()
+    with pytest.warns(KeyssWarning, match=f"one after the other, .*: {reason}"):
+        models = fit_scenes(fits_of(None, CONFIG, reporter))
+    assert len(models) == 2
+    starts = [what for each in reporter.all for what, *_ in each.said if what in ("start", "finish")]
+    assert starts.count("start") == starts.count("finish") >= 2
 
 
 @at_the_same_time
@@ -254,40 +329,42 @@ def test_one_after_the_other_where_a_reporter_cannot_be_told_of_several(
     assert len(models) == 2
 
 
-@at_the_same_time
-def test_hiding_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    options = LearnedOptions(fit=replace(CONFIG, iterations=60), iterations=20, publish="any")
-    found, begun = [], []
-    start = side_by_side._Child.start
-    monkeypatch.setattr(
-        side_by_side._Child, "start", staticmethod(lambda *args: begun.append(args) or start(*args))
+@pytest.mark.filterwarnings("ignore:.*appended Gaussians")
+def test_hiding_gives_the_same_bytes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, children: list[side_by_side._Child]
+) -> None:
+    """Plain models and bounds of both scenes."""
+    options = LearnedOptions(
+        fit=replace(CONFIG, iterations=60), iterations=90, start="points", hidden=(8, 8), branch=8
     )
+    found = []
     for least in (1, 10**6):
         monkeypatch.setattr(side_by_side, "LEAST_STEPS", least)
         secret = Secret(tiny_scene(1), "a key of many characters: 93hXmQ2")
         out = tmp_path / str(least)
         hide(tiny_scene(0), [secret], method=options, bound=True, out=out, min_psnr=0)
-        names = ("publish/stego.ply", "private/plain/cover.ply", "private/plain/secret.ply")
-        found.append([(out / name).read_bytes() for name in names if (out / name).exists()])
-        assert len(found[0]) >= 1
+        names = ("publish/stego.ply", *plain_names(1), *bound_names(1))
+        found.append([(out / name).read_bytes() for name in names])
     assert found[0] == found[1]
-    assert len(begun) == 2
+    assert len(children) == 4
 
 
 @pytest.mark.parametrize(
-    ("steps", "threads", "cores", "memory", "device", "expected"),
+    ("steps", "threads", "cores", "memory", "device", "can_start", "expected"),
     [
-        ([LEAST_STEPS] * 2, 2, 2, None, "cpu", 2),
-        ([LEAST_STEPS] * 3, 2, 2, None, "cpu", 2),
-        ([LEAST_STEPS] * 3, 16, 16, None, "cpu", 3),
-        ([LEAST_STEPS] * 3, 16, 1, None, "cpu", 1),
-        ([LEAST_STEPS] * 2, 1, 2, None, "cpu", 1),
-        ([LEAST_STEPS] * 3, 16, 16, 2.5, "cpu", 2),
-        ([LEAST_STEPS] * 3, 16, 16, 0.5, "cpu", 1),
-        ([LEAST_STEPS, LEAST_STEPS - 1], 2, 2, None, "cpu", 1),
-        ([LEAST_STEPS], 2, 2, None, "cpu", 1),
-        ([], 2, 2, None, "cpu", 1),
-        ([LEAST_STEPS] * 2, 2, 2, None, "cuda", 1),
+        ([LEAST_STEPS] * 2, 2, 2, None, "cpu", True, 2),
+        ([LEAST_STEPS] * 3, 2, 2, None, "cpu", True, 2),
+        ([LEAST_STEPS] * 3, 16, 16, None, "cpu", True, 3),
+        ([LEAST_STEPS] * 3, 16, 1, None, "cpu", True, 1),
+        ([LEAST_STEPS] * 2, 1, 2, None, "cpu", True, 1),
+        ([LEAST_STEPS] * 3, 16, 16, 2.5, "cpu", True, 2),
+        ([LEAST_STEPS] * 3, 16, 16, 0.5, "cpu", True, 1),
+        ([LEAST_STEPS] * 2, 2, 2, None, "cpu", False, 1),
+        ([LEAST_STEPS, LEAST_STEPS - 1], 2, 2, None, "cpu", True, 1),
+        ([LEAST_STEPS, LEAST_STEPS - 1, LEAST_STEPS], 4, 4, None, "cpu", True, 2),
+        ([LEAST_STEPS], 2, 2, None, "cpu", True, 1),
+        ([], 2, 2, None, "cpu", True, 1),
+        ([LEAST_STEPS] * 2, 2, 2, None, "cuda", True, 1),
     ],
 )
 def test_how_many_at_once(
@@ -297,6 +374,7 @@ def test_how_many_at_once(
     cores: int,
     memory: float | None,
     device: str,
+    can_start: bool,
     expected: int,
 ) -> None:
     fits = [Fit(tiny_scene(), replace(CONFIG, iterations=each), "fit") for each in steps]
@@ -305,7 +383,9 @@ def test_how_many_at_once(
     monkeypatch.setattr(
         side_by_side,
         "_processes",
-        SimpleNamespace(usable_cores=lambda: cores, available_memory=lambda: there),
+        SimpleNamespace(
+            can_start=lambda: can_start, usable_cores=lambda: cores, available_memory=lambda: there
+        ),
     )
     assert at_once(fits, torch.device(device)) == expected
 

@@ -37,6 +37,10 @@ def _memory() -> str:
     except ImportError:
         return ""
     unit = 1 if sys.platform == "darwin" else 1024
-    return (
-        f", with at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6:,.0f} MB of memory"
+    own, others = (
+        f"{resource.getrusage(whose).ru_maxrss * unit / 1e6:,.0f} MB"
+        for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     )
+    # Of processes that it started, such as those that fit models side by side, the system tells the largest.
+    besides = f", and {others} in another process" if others != "0 MB" else ""
+    return f", with at most {own} of memory{besides}"

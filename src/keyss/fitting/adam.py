@@ -56,6 +56,15 @@ def _adam(
             p[i] = fused_multiply_add(-steps[i], quotient, p[i])
 
 
+def _as_written(name: str) -> Any:
+    """A method of torch's optimizers, without what keeps `torch.compile` from it.
+
+    That would load torch's compiler, for a second, and nothing here is compiled.
+    """
+    method = getattr(torch.optim.Optimizer, name)
+    return getattr(method, "__wrapped__", method)
+
+
 class RowAdam(torch.optim.Adam):
     """torch's Adam (Kingma and Ba 2015) with an optional `lr_scale` in each param group.
 
@@ -63,6 +72,11 @@ class RowAdam(torch.optim.Adam):
     the learning rate of each number is multiplied. State and other options are torch's. On a CPU the
     results do not depend on the number of threads.
     """
+
+    add_param_group = _as_written("add_param_group")
+    load_state_dict = _as_written("load_state_dict")
+    state_dict = _as_written("state_dict")
+    zero_grad = _as_written("zero_grad")
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]

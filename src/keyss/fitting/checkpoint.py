@@ -50,6 +50,17 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
 
 
+def steps_done(path: Path | None) -> int:
+    """Steps that a checkpoint has; 0 without one, or with one that `load_checkpoint` refuses."""
+    if path is None or not path.exists():
+        return 0
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return int(json.loads((file.metadata() or {})["meta"])["iteration"])
+    except (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError):
+        return 0
+
+
 def pack_optimizers(parameters: Parameters, optimizers: Optimizers) -> State:
     """Parameters and their Adam moments as flat names: `means`, `means.exp_avg`, ..."""
     state: State = {}

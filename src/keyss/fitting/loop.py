@@ -102,7 +102,7 @@ class ModelReporter(Protocol):
 
 @runtime_checkable
 class SeveralReporter(Protocol):
-    """A reporter that can be told of several trainings at the same time."""
+    """A reporter that can be told of several trainings at the same time, some ten times a second of each."""
 
     def beside(self) -> Reporter:
         """One for another training, while this one is told of its own."""

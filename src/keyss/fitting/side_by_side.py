@@ -8,14 +8,16 @@ process would wait for Python's lock.
 
 from __future__ import annotations
 
+import builtins
+import os
 import queue
 import signal
 import subprocess
-import sys
 import threading
+import warnings
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,13 +25,13 @@ import torch
 
 from keyss import _processes
 from keyss.core import errors
-from keyss.core.errors import InputError, Interrupted, KeyssError, OtherProcessError, signal_of
+from keyss.core.errors import Interrupted, KeyssWarning, OtherProcessError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting import worker
-from keyss.fitting.checkpoint import State, load_checkpoint
+from keyss.fitting.checkpoint import State, steps_done
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import REMEDY, Reporter, SeveralReporter, SilentReporter, deferred
+from keyss.fitting.loop import ENDING, REMEDY, Reporter, SeveralReporter, SilentReporter, deferred
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.ranks import here
 
@@ -39,7 +41,6 @@ SIDE_BY_SIDE = 0.75  # of the time that two trainings take one after the other: 
 _PROCESS_BYTES = 500 << 20  # libraries, and the pictures of a step
 _COPIES = 16  # numbers that a training holds for one of a model: moments, gradients, what a step makes
 _POLL = 0.1  # seconds
-_ALONE = "with OMP_NUM_THREADS=1 in the environment fits are one after the other, which takes less memory"
 
 
 @dataclass(frozen=True)
@@ -58,17 +59,22 @@ def fit_scenes(
 ) -> list[Gaussians]:
     """Their models, as `fit_scene` gives them and with its errors; at the same time where `at_once` says so.
 
-    One after the other where a reporter cannot be told of several. On Ctrl-C all save their checkpoints.
-    Where one fails or its process is killed (OtherProcessError), the others save theirs.
+    One after the other where a reporter cannot be told of several, or no process can be started, of which
+    KeyssWarning tells. On Ctrl-C, and where one fails, those that have begun save their checkpoints. Raises
+    OtherProcessError where the process of one is killed.
     """
     found: dict[int, Gaussians] = {}
-    done = [_done(fit) if resume else 0 for fit in fits]
-    long = [index for index, fit in enumerate(fits) if fit.config.iterations - done[index] >= LEAST_STEPS]
-    if all(fit.reporter is None or isinstance(fit.reporter, SeveralReporter) for fit in fits):
-        size = at_once([fits[index] for index in long], torch.device(device))
-        if size > 1:
-            asked = [(fits[index], done[index]) for index in long]
-            found = dict(zip(long, _fit_in_processes(asked, size, resume), strict=True))
+    tellable = all(fit.reporter is None or isinstance(fit.reporter, SeveralReporter) for fit in fits)
+    if tellable and at_once(fits, torch.device(device)) > 1:
+        done = [steps_done(fit.checkpoint) if resume else 0 for fit in fits]
+        left = [index for index, fit in enumerate(fits) if fit.config.iterations - done[index] >= LEAST_STEPS]
+        if (size := at_once([fits[index] for index in left], torch.device(device))) > 1:
+            asked = [(fits[index], done[index]) for index in left]
+            try:
+                found = dict(zip(left, _fit_in_processes(asked, size, resume), strict=True))
+            except _NoProcessError as error:
+                said = f"fits are done one after the other, for no process could be started for them: {error}"
+                warnings.warn(said, KeyssWarning, stacklevel=2)
     for index, fit in enumerate(fits):
         if index not in found:
             found[index] = fit_scene(
@@ -84,21 +90,17 @@ def fit_scenes(
 
 
 def at_once(fits: Sequence[Fit], device: torch.device) -> int:
-    """How many of them are fitted at the same time: 1 where that is not possible or does not pay.
+    """How many of those with LEAST_STEPS are fitted at the same time; 1: they are fitted one after the other.
 
-    On a CPU, as many as there are threads and memory for.
+    On a CPU, as many as there are threads, cores and memory for. One where several processes train together
+    (torchrun), and where no processes can be started.
     """
-    if (
-        len(fits) < 2
-        or device.type != "cpu"
-        or here().count > 1
-        or not sys.executable
-        or min(fit.config.iterations for fit in fits) < LEAST_STEPS
-    ):
+    long = [fit for fit in fits if fit.config.iterations >= LEAST_STEPS]
+    if len(long) < 2 or device.type != "cpu" or here().count > 1 or not _processes.can_start():
         return 1
-    most = min(len(fits), torch.get_num_threads(), _processes.usable_cores())
+    most = min(len(long), torch.get_num_threads(), _processes.usable_cores())
     if (there := _processes.available_memory()) is not None:
-        most = min(most, there // max(map(process_bytes, fits)))
+        most = min(most, there // max(map(process_bytes, long)))
     return max(1, most)
 
 
@@ -109,72 +111,62 @@ def process_bytes(fit: Fit) -> int:
     return _PROCESS_BYTES + sum(each.nbytes for each in pictures) + 4 * _COPIES * numbers
 
 
-def _done(fit: Fit) -> int:
-    """Steps that its checkpoint has; 0 without one, or with one that the fit will refuse."""
-    try:
-        if fit.checkpoint is not None and fit.checkpoint.exists():
-            return int(load_checkpoint(fit.checkpoint)[1]["iteration"])
-    except (InputError, KeyError):
-        pass
-    return 0
+class _NoProcessError(Exception):
+    """A process cannot be started, or does not come so far that it could be told what to do."""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Child:
     """A fit in a process of its own."""
 
     fit: Fit
     reporter: Reporter
     process: subprocess.Popen[bytes]
+    answers: int  # descriptor, to be read
     model: Gaussians | None = None
-    reporting: bool = True
+    ready: bool = False  # all that it needs is loaded
+    begun: bool = False  # has something that can be saved
+    reporting: bool = False
+    threads: int | None = None  # to be told
     writing: threading.Lock = field(default_factory=threading.Lock)
 
-    @staticmethod
-    def start(fit: Fit, done: int, reporter: Reporter, threads: int) -> _Child:
-        """One that goes on after `done` steps, with so many threads. Raises OtherProcessError."""
+    def talk(self, order: worker.Order, heard: queue.SimpleQueue[_Heard]) -> None:
+        """Say what to do, and pass on what it answers, in the end why that ends; on a thread of its own."""
+        end: Exception | None = None
         try:
-            process = subprocess.Popen(
-                _processes.command(worker.MODULE),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=_processes.environment(threads),
-                start_new_session=True,  # Ctrl-C in a terminal reaches whoever starts it, who passes it on
-            )
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise OtherProcessError(f"no process for the {fit.title} ({reason}); {_ALONE}") from error
-        reporter.start(fit.title, fit.config.iterations, done)
-        return _Child(fit, reporter, process)
+            with os.fdopen(self.answers, "rb") as answers:
+                assert self.process.stdin is not None
+                # It may end before it has read all: its exit status says how.
+                with self.writing, suppress(BrokenPipeError):
+                    worker.send_order(self.process.stdin, order, self.fit.scene)
+                while (found := worker.receive(answers)) is not None:
+                    heard.put((self, *found))
+        except Exception as error:
+            end = error
+            self.process.kill()
+        heard.put((self, end, {}))
 
-    def talk(self, resume: bool, told: queue.SimpleQueue[_Heard]) -> None:
-        """Say what to do, and pass on what it tells, then None; on a thread of its own."""
-        order = worker.Order(
-            train=len(self.fit.scene.train),
-            test=len(self.fit.scene.test),
-            config=self.fit.config,
-            title=self.fit.title,
-            checkpoint=None if self.fit.checkpoint is None else str(self.fit.checkpoint),
-            resume=resume,
-            loss_every=self.reporter.loss_every,
-        )
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        try:
-            with self.writing:
-                worker.send_order(self.process.stdin, order, self.fit.scene)
-            while (message := worker.receive(self.process.stdout)) is not None:
-                told.put((self, *message))
-        except OSError:  # it has ended, and its exit status says how
-            pass
-        finally:
-            told.put((self, None, {}))
+    def say_threads(self) -> None:
+        """Pass on their number, unless it is still being told what to do."""
+        if self.threads is not None and self.writing.acquire(blocking=False):
+            try:
+                self._say(worker.Threads(self.threads))
+            finally:
+                self.threads = None
+                self.writing.release()
 
-    def share(self, threads: int) -> None:
-        """Have it compute with so many threads from now on."""
+    def stop(self) -> None:
+        """Have it save its state and end. What has not begun has nothing to save."""
+        if not self.begun:
+            self.process.kill()
+            return
+        with self.writing:
+            self._say(worker.Stop())
+
+    def _say(self, message: worker.Message) -> None:
         assert self.process.stdin is not None
-        with self.writing, suppress(OSError):
-            worker.send(self.process.stdin, worker.Threads(threads))
+        with suppress(BrokenPipeError):
+            worker.send(self.process.stdin, message)
 
     def finish(self) -> None:
         """Nothing more is reported."""
@@ -183,68 +175,63 @@ class _Child:
             self.reporter.finish()
 
     def close(self) -> None:
-        """Nothing is left of the process, however far it was; its thread has ended."""
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            with suppress(OSError):
-                pipe.close()
-        self.finish()
+        """Leave nothing of the process, whatever it does."""
+        self.process.kill()
+        self.process.wait()
+        with self.writing, suppress(BrokenPipeError):
+            assert self.process.stdin is not None
+            self.process.stdin.close()
 
 
-_Heard = tuple[_Child, worker.Told | None, State]
+# What a process answers, or None or an error: nothing more comes.
+_Heard = tuple[_Child, worker.Message | Exception | None, State]
 
 
 def _fit_in_processes(asked: Sequence[tuple[Fit, int]], size: int, resume: bool) -> list[Gaussians]:
-    """The models of fits, of which `size` run at the same time. Raises the first error, or Interrupted.
+    """The models of fits, of which `size` run at the same time. `asked`: with steps that are done already.
 
-    `asked`: with steps that are done already.
+    Raises _NoProcessError, the first error of a fit, or Interrupted.
     """
     fits = [fit for fit, _ in asked]
-    told: queue.SimpleQueue[_Heard] = queue.SimpleQueue()
     waiting = deque((*each, reporter) for each, reporter in zip(asked, _reporters(fits), strict=True))
     running: list[_Child] = []
     children: list[_Child] = []  # those, and those that have ended
-    threads: list[threading.Thread] = []
+    heard: queue.SimpleQueue[_Heard] = queue.SimpleQueue()
     error: Exception | Interrupted | None = None
-    try:
-        with deferred(saves=any(fit.checkpoint is not None for fit in fits)) as interrupted:
-            while running or (waiting and error is None):
-                while waiting and error is None and len(running) < size:
-                    child = _Child.start(*waiting.popleft(), _share(size))
-                    children.append(child)
-                    running.append(child)
-                    threads.append(threading.Thread(target=child.talk, args=(resume, told), daemon=True))
-                    threads[-1].start()
-                found: Exception | Interrupted | None = None
+    with ExitStack() as stack, deferred(saves=any(fit.checkpoint for fit in fits)) as interrupted:
+        while running or (waiting and error is None):
+            while waiting and error is None and len(running) < size:
                 try:
-                    child, message, tensors = told.get(timeout=_POLL)
-                except queue.Empty:
-                    pass
-                else:
-                    found = _hear(child, message, tensors)
-                    if message is None:
-                        running.remove(child)
-                        for each in running if not waiting else ():
-                            each.share(_share(len(running)))
-                if found is None and (signum := interrupted()):
-                    found = Interrupted(None, None, signum)
-                if error is None and found is not None:
-                    error = found
-                    for each in running:  # saves its state, and ends
-                        each.process.terminate()
-            if isinstance(error, Interrupted):
-                saved = [fit.checkpoint for fit in fits if fit.checkpoint and fit.checkpoint.exists()]
-                error = Interrupted(saved[0] if saved else None, None, signal_of(error))
-            if error is not None:
-                raise error
-    finally:
-        for child in children:
-            child.process.kill()
-            child.process.wait()
-        for thread in threads:
-            thread.join()
-        for child in children:
-            child.close()
+                    child = _start(stack, *waiting[0], _share(size), resume, heard)
+                except _NoProcessError:
+                    if not running:
+                        raise
+                    size = len(running)  # until one of them has ended
+                    break
+                waiting.popleft()
+                children.append(child)
+                running.append(child)
+            found: Exception | Interrupted | None = None
+            with suppress(queue.Empty):
+                child, message, tensors = heard.get(timeout=_POLL)
+                found = _hear(child, message, tensors)
+                if message is None or isinstance(message, Exception):
+                    running.remove(child)
+                    for each in () if waiting else running:
+                        each.threads = _share(len(running))
+            for each in running:
+                each.say_threads()
+            stopping = error is not None
+            # A signal may have come to processes as well, and comes before what they say of it.
+            error = Interrupted(None, None, signum) if (signum := interrupted()) else error or found
+            if error is not None and not stopping:
+                for each in running:
+                    each.stop()
+        if isinstance(error, Interrupted):
+            saved = [fit.checkpoint for fit in fits if fit.checkpoint and fit.checkpoint.exists()]
+            raise Interrupted(saved[0] if saved else None, None, errors.signal_of(error))
+        if error is not None:
+            raise error
     return [child.model for child in children if child.model is not None]
 
 
@@ -262,27 +249,101 @@ def _share(processes: int) -> int:
     return max(1, torch.get_num_threads() // processes)
 
 
-def _hear(child: _Child, told: worker.Told | None, tensors: State) -> Exception | Interrupted | None:
-    """Pass on what a process tells; None where it has ended. What all fits are to be stopped for."""
-    match told:
+def _start(
+    stack: ExitStack,
+    fit: Fit,
+    done: int,
+    reporter: Reporter,
+    threads: int,
+    resume: bool,
+    heard: queue.SimpleQueue[_Heard],
+) -> _Child:
+    """A fit that goes on after `done` steps; `stack` ends it. Raises _NoProcessError."""
+    answers, theirs = os.pipe()
+    # It inherits this: Ctrl-C comes to all processes of a terminal, and this one says what is to be done.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        process = subprocess.Popen(
+            [*_processes.command(worker.MODULE), str(theirs)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            pass_fds=[theirs],
+            env=_processes.environment(threads),
+        )
+    except OSError as error:
+        os.close(answers)
+        raise _NoProcessError(error.strerror or str(error)) from error
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        os.close(theirs)
+    child = _Child(fit, reporter, process, answers)
+    stack.callback(child.finish)
+    order = worker.Order(
+        train=len(fit.scene.train),
+        test=len(fit.scene.test),
+        config=fit.config,
+        title=fit.title,
+        checkpoint=None if fit.checkpoint is None else str(fit.checkpoint),
+        resume=resume,
+        loss_every=reporter.loss_every,
+    )
+    thread = threading.Thread(target=child.talk, args=(order, heard), daemon=True)
+    thread.start()
+    stack.callback(thread.join)
+    stack.callback(child.close)
+    child.reporting = True
+    reporter.start(fit.title, fit.config.iterations, done)
+    return child
+
+
+def _hear(
+    child: _Child, message: worker.Message | Exception | None, tensors: State
+) -> Exception | Interrupted | None:
+    """Pass on what a process answers. What all fits are to be stopped for."""
+    match message:
+        case worker.Ready():
+            child.ready = True
         case worker.Progress(iteration, gaussians, numbers):
+            child.begun = True
             child.reporter.update(iteration, gaussians, numbers)
         case worker.Fitted():
             child.model = Gaussians(**tensors)
             child.finish()
-        case worker.Stopped():  # as it was told to, or by a signal that nothing else got
-            return Interrupted(None, None, signal.SIGTERM)
-        case worker.Failed(name, message):
-            return _error(name, message)
+        case worker.Stopped(signum):  # as it was told to, or by a signal that only it got
+            return Interrupted(None, None, signal.Signals(signum))
+        case worker.Failed():
+            return _error(message)
+        case Exception():
+            return message
         case None if child.model is None:
-            how = _processes.how_it_ended(child.process.wait())
-            saved = "nothing was saved" if child.fit.checkpoint is None else REMEDY
-            return OtherProcessError(f"the process of the {child.fit.title} ended ({how}); {saved}; {_ALONE}")
+            return _end(child)
     return None
 
 
-def _error(name: str, message: str) -> Exception:
-    kind = getattr(errors, name, None)
-    if isinstance(kind, type) and issubclass(kind, KeyssError):
-        return kind(message)
-    return MemoryError(message)
+def _end(child: _Child) -> Exception | Interrupted:
+    """Of a process that has ended without having said why."""
+    status = child.process.wait()
+    if -status in ENDING:
+        return Interrupted(None, None, signal.Signals(-status))
+    if not child.ready and status > 0:
+        return _NoProcessError(f"{_processes.how_it_ended(status)} while it was loading")
+    there = child.fit.checkpoint is not None and child.fit.checkpoint.exists()
+    said = f"the process for the {child.fit.title} has ended ({_processes.how_it_ended(status)}); "
+    said += REMEDY if there else "nothing was saved"
+    if status == -signal.SIGKILL:  # as systems do that are short of memory
+        said += "; with OMP_NUM_THREADS=1 in the environment fits need less memory, one after the other"
+    return OtherProcessError(said)
+
+
+def _error(failed: worker.Failed) -> Exception:
+    """That of a process, as if it had come up here."""
+    for module in (errors, builtins):
+        kind = getattr(module, failed.error, None)
+        if isinstance(kind, type) and issubclass(kind, Exception):
+            with suppress(TypeError):  # of those that need more than a message
+                error = kind(failed.message)
+                error.add_note(failed.trace)
+                return error
+    error = RuntimeError(f"{failed.error}: {failed.message}")
+    error.add_note(failed.trace)
+    return error

@@ -1,8 +1,8 @@
-"""The process that fits one plain model for another process: `python -m keyss.fitting.worker`.
+"""The process that fits one plain model for another process: `python -m keyss.fitting.worker DESCRIPTOR`.
 
-Its standard input says what to fit, and its standard output tells how far it is and ends with the model, both
-as messages of tensors and JSON. It writes nothing to the disk but the checkpoint, and ends when whoever
-started it does.
+Its standard input says what to fit; a pipe, of which it gets the descriptor, takes how far it is and in the
+end the model. Both are messages of tensors and JSON. It writes nothing to the disk but the checkpoint, and
+ends when whoever started it does.
 """
 
 from __future__ import annotations
@@ -13,20 +13,19 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from dataclasses import dataclass, fields
 from pathlib import Path
-from types import FrameType
 from typing import IO, get_args
 
 import msgspec
 import torch
 
-from keyss.core.errors import Interrupted, KeyssError
+from keyss.core.errors import Interrupted, signal_of
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.fitting.checkpoint import State, pack_state, unpack_state
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import ENDING
 from keyss.fitting.plain import fit_scene
 
 MODULE = "keyss.fitting.worker"
@@ -63,6 +62,16 @@ class Threads:
 
 
 @dataclass(frozen=True)
+class Stop:
+    """Save the state, and end."""
+
+
+@dataclass(frozen=True)
+class Ready:
+    """All that is needed is loaded."""
+
+
+@dataclass(frozen=True)
 class Progress:
     """See `Reporter.update`."""
 
@@ -75,36 +84,37 @@ class Progress:
 class Fitted:
     """The end: the message has the model's tensors."""
 
-    seconds: float
-
 
 @dataclass(frozen=True)
 class Stopped:
-    """The end after a signal: the checkpoint is there, if there was to be one."""
+    """The end after a signal, or `Stop`: the checkpoint is there, if there was to be one."""
+
+    signum: int
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The end with an error, of a class of `keyss.core.errors`, or MemoryError."""
+    """The end with an error."""
 
-    error: str
+    error: str  # its class
     message: str
+    trace: str
 
 
-Told = Order | OneView | Threads | Progress | Fitted | Stopped | Failed
-_KINDS: dict[str, type[Told]] = {kind.__name__: kind for kind in get_args(Told)}
+Message = Order | OneView | Threads | Stop | Ready | Progress | Fitted | Stopped | Failed
+_KINDS: dict[str, type[Message]] = {kind.__name__: kind for kind in get_args(Message)}
 
 
-def send(file: IO[bytes], told: Told, tensors: State | None = None) -> None:
+def send(file: IO[bytes], message: Message, tensors: State | None = None) -> None:
     """Write a message. Raises OSError where nobody reads."""
-    meta = {"kind": type(told).__name__, "told": msgspec.to_builtins(told)}
+    meta = {"kind": type(message).__name__, "message": msgspec.to_builtins(message)}
     data = pack_state(tensors or {}, meta)
     file.write(len(data).to_bytes(_SIZE_BYTES, "little"))
     file.write(data)
     file.flush()
 
 
-def receive(file: IO[bytes]) -> tuple[Told, State] | None:
+def receive(file: IO[bytes]) -> tuple[Message, State] | None:
     """The next message; None at the end, also in the middle of one."""
     size = file.read(_SIZE_BYTES)
     if len(size) < _SIZE_BYTES:
@@ -113,7 +123,7 @@ def receive(file: IO[bytes]) -> tuple[Told, State] | None:
     if len(data) < length:
         return None
     tensors, meta = unpack_state(data)
-    return msgspec.convert(meta["told"], _KINDS[meta["kind"]]), tensors
+    return msgspec.convert(meta["message"], _KINDS[meta["kind"]]), tensors
 
 
 def send_order(file: IO[bytes], order: Order, scene: Scene) -> None:
@@ -141,40 +151,40 @@ def receive_order(file: IO[bytes]) -> tuple[Order, Scene] | None:
     return order, Scene("", tuple(views[: order.train]), tuple(views[order.train :]), **rest)
 
 
-class _Teller:
-    """A `Reporter` that writes messages, and does between steps what came in the meantime."""
+class _Sender:
+    """A `Reporter` that sends messages, and does between two steps what was asked for in the meantime."""
 
     def __init__(self, file: IO[bytes], loss_every: int) -> None:
         self.file, self.loss_every = file, loss_every
-        self.told = 0.0
+        self.sent = 0.0  # when, the last time
         self.numbers: dict[str, float] = {}
-        self.signalled = False
-        self.threads: int | None = None  # to be used from now on
-
-    def on_signal(self, signum: int, frame: FrameType | None) -> None:
-        """Of signals that come before the training has a handler of its own, or after it."""
-        self.signalled = True
+        self.threads: int | None = None
+        self.stop = False
 
     def listen(self, file: IO[bytes]) -> None:
-        """On a thread of its own: what whoever started this process has to say, until it ends."""
+        """On a thread of its own: what whoever started this process has to say, until that ends."""
         while (found := receive(file)) is not None:
-            if isinstance(found[0], Threads):
-                self.threads = found[0].count
+            match found[0]:
+                case Threads(count):
+                    self.threads = count
+                case Stop():
+                    self.stop = True
         os._exit(128 + signal.SIGHUP)  # nothing is lost, for a checkpoint appears when it is whole
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self.iterations = iterations
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
-        if self.signalled:
-            self.signalled = False
-            signal.raise_signal(signal.SIGINT)
+        if self.stop:
+            self.stop = False
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+            signal.raise_signal(signal.SIGINT)  # which the training takes for Ctrl-C
         if self.threads is not None:  # torch counts them for each thread that computes
             torch.set_num_threads(self.threads)
             self.threads = None
-        if numbers == self.numbers and iteration < self.iterations and time.monotonic() - self.told < _EVERY:
+        if numbers == self.numbers and iteration < self.iterations and time.monotonic() - self.sent < _EVERY:
             return
-        self.told, self.numbers = time.monotonic(), dict(numbers)
+        self.sent, self.numbers = time.monotonic(), dict(numbers)
         send(self.file, Progress(iteration, gaussians, self.numbers))
 
     def note(self, line: str) -> None: ...
@@ -182,47 +192,45 @@ class _Teller:
     def finish(self) -> None: ...
 
 
-def main() -> int:
+def main(descriptor: int) -> int:
     """Fit what the standard input says; the exit status."""
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever a library prints is not a message
-    if (found := receive_order(sys.stdin.buffer)) is None:  # whoever asked has gone
-        return 1
-    order, scene = found
-    teller = _Teller(answers, order.loss_every)
-    threading.Thread(target=teller.listen, args=(sys.stdin.buffer,), daemon=True).start()
-    for signum in ENDING:
-        signal.signal(signum, teller.on_signal)
-    try:
-        send(answers, *_fit(order, scene, teller))
-    except BrokenPipeError:
-        return 1
+    # Ctrl-C in a terminal comes to this process, too, where it is blocked from the start: whoever started it
+    # says `Stop`. Then there has to be a handler that a training can take the place of.
+    signal.signal(signal.SIGINT, lambda signum, frame: None)
+    with os.fdopen(descriptor, "wb") as answers:
+        try:
+            send(answers, Ready())
+            if (found := receive_order(sys.stdin.buffer)) is None:  # whoever asked has gone
+                return 1
+            order, scene = found
+            sender = _Sender(answers, order.loss_every)
+            threading.Thread(target=sender.listen, args=(sys.stdin.buffer,), daemon=True).start()
+            send(answers, *_fit(order, scene, sender))
+        except BrokenPipeError:
+            return 1
     return 0
 
 
-def _fit(order: Order, scene: Scene, teller: _Teller) -> tuple[Told, State]:
+def _fit(order: Order, scene: Scene, sender: _Sender) -> tuple[Message, State]:
     try:
-        result = fit_scene(
+        model = fit_scene(
             scene,
             order.config,
             title=order.title,
             checkpoint=Path(order.checkpoint) if order.checkpoint else None,
             resume=order.resume,
-            reporter=teller,
-        )
-    except Interrupted:
-        return Stopped(), {}
-    except (KeyssError, MemoryError) as error:
-        return Failed(type(error).__name__, str(error)), {}
-    except RuntimeError as error:
-        if "can't allocate memory" not in str(error):  # torch has no class of its own for it
-            raise
-        return Failed(MemoryError.__name__, str(error)), {}
-    model = result.gaussians
-    return Fitted(result.seconds), {each.name: getattr(model, each.name) for each in fields(Gaussians)}
+            reporter=sender,
+        ).gaussians
+    except Interrupted as interrupt:
+        return Stopped(signal_of(interrupt)), {}
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        return Failed(type(error).__name__, str(error), traceback.format_exc()), {}
+    return Fitted(), {each.name: getattr(model, each.name) for each in fields(Gaussians)}
 
 
 if __name__ == "__main__":
-    status = main()
+    status = main(int(sys.argv[1]))
     atexit._run_exitfuncs()
     os._exit(status)  # to clean up would take the interpreter another second

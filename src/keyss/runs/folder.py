@@ -234,7 +234,8 @@ class RunFolder:
 
     def _has_checkpoints(self) -> bool:
         folder = self.path / _CHECKPOINTS
-        return folder.is_dir() and any(folder.iterdir())
+        # What begins with a dot is what a killed process did not write to its end.
+        return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
 
     def _save(self, manifest: Manifest) -> None:
         write_record(self.path / MANIFEST, manifest)

@@ -187,10 +187,10 @@ def disk_bytes(method: Method, options: MethodOptions, inputs: Sequence[SceneInp
     appends = options.publish == "any" and options.channel == "appended"
     published = _file_bytes(sizes[0] + _APPENDED * sum(sizes[1:]), degrees[0]) if appends else plain[0]
     if not method.trains:
-        return sum(plain) + published + _STATE_COPIES * (sum(fitted) + max(fitted, default=0)) + _OTHER_BYTES
+        return sum(plain) + published + 2 * _STATE_COPIES * sum(fitted) + _OTHER_BYTES
     trained = min(_file_bytes(sum(sizes), options.fit.sh_degree), sum(plain) + max(plain))
     published = max(trained, published)
-    checkpoints = _STATE_COPIES * (2 * trained + sum(fitted))
+    checkpoints = 2 * _STATE_COPIES * max(trained, sum(fitted)) + _STATE_COPIES * min(trained, sum(fitted))
     return sum(plain) + published + checkpoints + _OTHER_BYTES
 
 
