@@ -164,7 +164,8 @@ def test_training_does_not_load_the_compiler_of_torch() -> None:
     """It takes a second, in every process that trains."""
     code = (
         "import sys, torch; from keyss.fitting.adam import RowAdam; "
-        "p = torch.nn.Parameter(torch.ones(2, 3)); adam = RowAdam([p]); p.grad = torch.ones(2, 3); adam.step(); adam.zero_grad(); "
+        "p = torch.nn.Parameter(torch.ones(2, 3)); p.grad = torch.ones(2, 3); "
+        "adam = RowAdam([p]); adam.step(); adam.zero_grad(); "
         "adam.load_state_dict(adam.state_dict()); print('torch._dynamo' in sys.modules)"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from keyss.core import Gaussians, InputError, UsageError
-from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint
+from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint, steps_done
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.fitting.loop import Interrupted, SilentReporter
@@ -94,6 +94,15 @@ def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
         path.write_bytes(data[:size])
         with pytest.raises(InputError):
             load_checkpoint(path)
+        assert steps_done(path) == 0
+
+
+def test_how_many_steps_a_checkpoint_has(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    assert steps_done(None) == steps_done(path) == 0
+    for told, steps in (({"iteration": 7}, 7), ({"iteration": None}, 0), ({}, 0)):
+        save_checkpoint(path, {"a": torch.ones(3)}, told)
+        assert steps_done(path) == steps
 
 
 def test_a_scene_without_points_starts_from_random_ones() -> None:
