@@ -127,8 +127,17 @@ class _Child:
     ready: bool = False  # all that it needs is loaded
     begun: bool = False  # has something that can be saved
     reporting: bool = False
-    threads: int | None = None  # to be told
+    thread: threading.Thread | None = None  # that talks to it
+    threads: int | None = None  # for it to compute with, which it is not told yet
     writing: threading.Lock = field(default_factory=threading.Lock)
+
+    def begin(self, order: worker.Order, done: int, heard: queue.SimpleQueue[_Heard]) -> None:
+        """Have it go on after `done` steps; what it answers goes to `heard`."""
+        thread = threading.Thread(target=self.talk, args=(order, heard), daemon=True)
+        thread.start()
+        self.thread = thread
+        self.reporting = True
+        self.reporter.start(self.fit.title, self.fit.config.iterations, done)
 
     def talk(self, order: worker.Order, heard: queue.SimpleQueue[_Heard]) -> None:
         """Say what to do, and pass on what it answers, in the end why that ends; on a thread of its own."""
@@ -174,13 +183,16 @@ class _Child:
             self.reporting = False
             self.reporter.finish()
 
-    def close(self) -> None:
+    def end(self) -> None:
         """Leave nothing of the process, whatever it does."""
         self.process.kill()
         self.process.wait()
-        with self.writing, suppress(BrokenPipeError):
+        if self.thread is not None:
+            self.thread.join()
+        with suppress(BrokenPipeError):
             assert self.process.stdin is not None
             self.process.stdin.close()
+        self.finish()
 
 
 # What a process answers, or None or an error: nothing more comes.
@@ -277,7 +289,7 @@ def _start(
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         os.close(theirs)
     child = _Child(fit, reporter, process, answers)
-    stack.callback(child.finish)
+    stack.callback(child.end)
     order = worker.Order(
         train=len(fit.scene.train),
         test=len(fit.scene.test),
@@ -287,12 +299,7 @@ def _start(
         resume=resume,
         loss_every=reporter.loss_every,
     )
-    thread = threading.Thread(target=child.talk, args=(order, heard), daemon=True)
-    thread.start()
-    stack.callback(thread.join)
-    stack.callback(child.close)
-    child.reporting = True
-    reporter.start(fit.title, fit.config.iterations, done)
+    child.begin(order, done, heard)
     return child
 
 
