@@ -33,7 +33,7 @@ def can_start() -> bool:
     that is no Python interpreter: a frozen app, or a host that embeds Python.
     """
     name = Path(sys.executable or "").name
-    return name.startswith("python") and not getattr(sys, "frozen", False) and _STARTED not in os.environ
+    return name.lower().startswith("python") and not getattr(sys, "frozen", False) and _STARTED not in os.environ
 
 
 def command(module: str) -> tuple[str, ...]:
