@@ -117,7 +117,11 @@ def _photos(pairs: list[list[str]], width: int) -> None:
     scenes = {scene: load_scene(scene, width=width) for scene, _ in pairs}
     for (cover, cover_path), (secret, secret_path) in permutations(pairs, 2):
         model, hidden = read_model(cover_path), read_model(secret_path)
-        stego = embed(model, [(KEY, hidden)])
+        try:
+            stego = embed(model, [(KEY, hidden)])
+        except KeyssError as error:
+            print(f"{secret} in {cover}: {error}", flush=True)
+            continue
         found = extract(stego, KEY).gaussians
         kept = stego[_kept(len(stego))]
         left = extract(kept, KEY)

@@ -32,8 +32,8 @@ def can_start() -> bool:
     One that keyss has started may not, since it was given so many cores and so much memory; nor can a program
     that is no Python interpreter: a frozen app, or a host that embeds Python.
     """
-    name = Path(sys.executable or "").name
-    return name.lower().startswith("python") and not getattr(sys, "frozen", False) and _STARTED not in os.environ
+    python = Path(sys.executable or "").name.lower().startswith("python")
+    return python and not getattr(sys, "frozen", False) and _STARTED not in os.environ
 
 
 def command(module: str) -> tuple[str, ...]:
