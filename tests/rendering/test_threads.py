@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from typing import ClassVar
 
 import pytest
 import torch
@@ -110,6 +111,25 @@ def test_an_error_on_a_helper_thread_is_raised() -> None:
 
     with pytest.raises(RuntimeError, match="the helper failed"):
         parallel.run(kernel)
+
+
+def test_a_kernel_is_loaded_by_the_thread_that_calls_it() -> None:
+    """Else Ctrl-C, which comes to that thread, could leave a helper waiting for a lock for ever."""
+    seen: list[str] = []
+
+    class Kernel:
+        overloads: ClassVar[dict[str, str]] = {}
+
+        def __call__(self, counter: object) -> None:
+            seen.append(threading.current_thread().name)
+            self.overloads["loaded"] = ""
+
+    torch.set_num_threads(2)
+    kernel = Kernel()
+    parallel.run(kernel)
+    assert seen == [threading.current_thread().name]
+    parallel.run(kernel)
+    assert len(seen) >= 2  # a helper may come too late to be called
 
 
 def test_spawned_processes_draw_the_same() -> None:

@@ -30,7 +30,9 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
     """
     counter = np.zeros(1, np.int64)
     helpers = min(torch.get_num_threads(), _CORES) - 1
-    if helpers < 1:
+    # The first call loads a kernel, which one thread does while the others wait. Ctrl-C at that moment may
+    # leave a lock of LLVM's bindings locked: nobody may be waiting for a helper that waits for it.
+    if helpers < 1 or not getattr(kernel, "overloads", True):
         kernel(counter, *arguments)
         return
     tasks = [_pool(helpers).submit(kernel, counter, *arguments) for _ in range(helpers)]
