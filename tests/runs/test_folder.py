@@ -263,3 +263,20 @@ def test_clearing_leaves_what_is_not_ours(tmp_path: Path) -> None:
     clear(run)
     clear(run)
     assert not run.exists()
+
+
+def test_a_folder_that_a_stage_wrote_is_replaced_and_one_with_anything_else_is_not(tmp_path: Path) -> None:
+    def write(folder: Path) -> None:
+        folder.mkdir()
+        (folder / "photo.png").write_bytes(b"photo")
+
+    for overwrite in (False, True, True):
+        with RunFolder(tmp_path / "run", "scenes", overwrite=overwrite).work() as run:
+            run.write({"scenes/a": write})
+    (tmp_path / "run/scenes/a/mine.txt").write_text("mine")
+    with (
+        pytest.raises(OutputError, match="keyss did not write it"),
+        RunFolder(tmp_path / "run", "scenes", overwrite=True).work() as run,
+    ):
+        run.write({"scenes/a": write})
+    assert (tmp_path / "run/scenes/a/photo.png").read_bytes() == b"photo"

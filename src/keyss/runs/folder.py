@@ -344,7 +344,10 @@ def _refuse_foreign(folder: Path, name: str) -> None:
         )
     if not (target.is_symlink() or target.exists()):
         return
-    if not any(name in names for names in read_manifest(folder).files.values()):
+    ours = {each for names in read_manifest(folder).files.values() for each in names}
+    inside = target.rglob("*") if target.is_dir() and not target.is_symlink() else ()
+    files = [str(path.relative_to(folder)) for path in inside if path.is_symlink() or not path.is_dir()]
+    if name not in ours and not (files and ours.issuperset(files)):
         raise OutputError(
             f"{target} is in the way, and keyss did not write it: move it, or choose another folder"
         )
