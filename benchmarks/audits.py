@@ -15,12 +15,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from keyss.audits import Audit, read_audit
 from keyss.files.atomic import write_bytes
-from keyss.measure import composite_score
-from keyss.measure.images import ImageComparison
-from keyss.measure.robustness.survival import mean_over_draws
-from keyss.report.verdicts import detector_rocs
-from keyss.runs.audit_record import Audit, read_audit
+from keyss.measure import ImageComparison, composite_score, mean_over_draws
 
 BEGIN, END = "<!-- audits: begin -->", "<!-- audits: end -->"
 Cell = Callable[[Any], str]  # of an `Audit`, whose parts may be None: see `_try`
@@ -59,9 +56,7 @@ def _rows(audits: list[Audit]) -> list[str]:
             for name in attributes
         },
         "classifier, AUC (controls)": _classifier,
-        "StegExpose, AUC (controls)": lambda a: _auc(a, "StegExpose"),
-        "sealwatch SPA, AUC (controls)": lambda a: _auc(a, "sealwatch SPA"),
-        "sealwatch SPAM, AUC (controls)": lambda a: _auc(a, "sealwatch SPAM"),
+        "StegExpose, AUC (controls)": lambda a: _auc(a),
         "largest leak above controls, dB": lambda a: _leak(a, "psnr", 2),
         "largest leak above controls, SSIM": lambda a: _leak(a, "ssim", 3),
         "the same after the best fit of colours, dB": lambda a: _leak(a, "psnr_fitted", 2),
@@ -106,10 +101,9 @@ def _classifier(audit: Any) -> str:
     return f"{stego:.3f} ({control:.3f})"
 
 
-def _auc(audit: Audit, detector: str) -> str:
-    rocs = [each for program in ("StegExpose", "sealwatch") for each in detector_rocs(audit, program)]
-    found = next((each for each in rocs if each.name == detector), None)
-    return f"{found.stego.auc:.2f} ({found.control.auc:.2f})" if found and found.control else ""
+def _auc(audit: Audit) -> str:
+    found = audit.stegexpose
+    return f"{found.stego.fused.auc:.2f} ({found.control.fused.auc:.2f})" if found else ""
 
 
 def _leak(audit: Any, score: str, digits: int) -> str:

@@ -27,15 +27,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits.layout import record_capacity
-from keyss.channels.low_bits.usable import usable_carriers
+from keyss.channels import LOW_BITS, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
-from keyss.methods.records.encoding import record_request
+from keyss.methods import record_request
 from keyss.rendering import render
-from keyss.rendering.difference import cost
+from keyss.rendering.difference import psnr_between
 from methods.carry.carried import embed, extract
 
 KEY = "the key of the benchmark"
@@ -65,7 +64,9 @@ def main() -> None:
 def _capacities() -> None:
     print("Gaussians that fit in 100,000 carriers, by SH degree of the secret (0, 1, 2, 3):")
     for degree in range(4):
-        fits = [record_capacity([record_request(1, other)], 100_000, degree) for other in range(4)]
+        fits = [
+            LOW_BITS.room(100_000, degree).record_capacity([record_request(1, other)]) for other in range(4)
+        ]
         print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
 
 
@@ -106,8 +107,8 @@ def _models(paths: list[Path]) -> None:
         carried = extract(stego, KEY)
         print(
             f"{cover} ({len(stego):,}, {usable.mean():.0%} usable) carries {secret} ({carried.count:,}, "
-            f"{carried.bits} bits): cover before and after {cost(models[cover], stego):.1f} dB, "
-            f"secret and its own model {cost(models[secret], carried.gaussians):.1f} dB",
+            f"{carried.bits} bits): cover before and after {psnr_between(models[cover], stego):.1f} dB, "
+            f"secret and its own model {psnr_between(models[secret], carried.gaussians):.1f} dB",
             flush=True,
         )
 

@@ -1,6 +1,6 @@
-"""What carrying in the codes of published files costs and holds: the tables of docs/codes.md.
+"""What carrying in the codes of published files costs and holds: the tables of docs/channels.md.
 
-    python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/codes.md
+    python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/channels.md
     python benchmarks/codes.py --attributes bonsai=cover.ply
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
     python benchmarks/stealth.py --quick --pairs $(cat FOLDER/pairs)
@@ -23,10 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-from keyss.channels.base import Payload
-from keyss.channels.codes import CodesCover, CodesReader
+from keyss.channels import SUFFIXES, CodesChannel, CodesReader, Payload
 from keyss.channels.codes.fields import format_of
-from keyss.channels.codes.published import SUFFIXES, coded, prepare
 from keyss.core import Gaussians, Scene
 from keyss.files.atomic import write_bytes
 from keyss.files.formats import compressed_ply, sog, spz
@@ -34,11 +32,11 @@ from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.measure.images import psnr
+from keyss.methods import most_visible
 from keyss.methods.records import whole
-from keyss.methods.records.encoding import most_visible
 from keyss.methods.records.precision import fitted
 from keyss.rendering import render
-from keyss.rendering.difference import cost
+from keyss.rendering.difference import psnr_between
 from keyss.rendering.orbit import scene_of_model
 
 import numpy as np
@@ -82,16 +80,16 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         model = in_morton_order(cover[1])
         untouched = format_.dequantise(format_.quantise(model))
         start = time.monotonic()
-        room: CodesCover = prepare(cover[1], name)
-        kept, encoded = fitted(own, room.capacity * 1023 // 1024 - 128, prune=True)
-        stego = coded(room.embed([(KEY, Payload("carry", encoded))]))
+        room = CodesChannel(name).prepare(cover[1])
+        kept, encoded = fitted(own, room.capacity - room.overhead, prune=True)
+        stego = room.embed([(KEY, Payload("carry", encoded))])
         file = format_.serialise(stego.codes)
         hiding = time.monotonic() - start
         start = time.monotonic()
-        opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data).gaussians
+        opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
-        bits = 8 * room.capacity / len(model)
-        most = room.capacity * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
+        bits = 8 * room.size / len(model)
+        most = room.size * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
         in_format = format_.dequantise(format_.quantise(in_morton_order(kept)))
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
@@ -99,8 +97,8 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         ]
         found.append(
             f"| {cover[0]} | {len(model):,} | {format_of(stego.codes).name} | {bits:.1f} "
-            f"| {numbers[0]:.2f} / {numbers[1]:.2f} | {cost(untouched, stego):.1f} | 1 : {1 / most:.1f} "
-            f"| {numbers[2]:.2f} / {numbers[3]:.2f} | {hiding:.1f}, {revealing:.1f} |"
+            f"| {numbers[0]:.2f} / {numbers[1]:.2f} | {psnr_between(untouched, stego):.1f} "
+            f"| 1 : {1 / most:.1f} | {numbers[2]:.2f} / {numbers[3]:.2f} | {hiding:.1f}, {revealing:.1f} |"
         )
         print(found[-1], flush=True)
     return found
@@ -109,18 +107,18 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
 def attributes(name: str, model: Gaussians) -> None:
     """What each attribute costs alone: PSNR in dB against the untouched file, and bits of a Gaussian."""
     for format_name in FORMATS:
-        cover = prepare(model, format_name)
-        untouched = coded(cover.codes)
-        written = coded(cover.embed([(KEY, Payload("carry", b""))]))
-        found = [f"all {cost(untouched, written):.1f} dB"]
+        cover = CodesChannel(format_name).prepare(model)
+        untouched = cover.cover
+        written = cover.embed([(KEY, Payload("carry", b""))])
+        found = [f"all {psnr_between(untouched, written):.1f} dB"]
         for attribute in dict.fromkeys(each.name for each in cover.fields):
             own = [each.name == attribute for each in cover.fields]
             free = [each & one for each, one in zip(cover.free, own, strict=True)]
             bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
             # Others may not change: too few are free to hold anything, so the bits that are get noise.
             noise = np.random.default_rng(0).integers(0, 2, cover.room.bits).astype(np.uint8)
-            changed = coded(replace(cover, free=free)._written(noise, os.urandom(32)))
-            found.append(f"{attribute} {bits:.1f} bits {cost(untouched, changed):.1f} dB")
+            changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
+            found.append(f"{attribute} {bits:.1f} bits {psnr_between(untouched, changed):.1f} dB")
         print(f"{name}, {format_name}: {', '.join(found)}", flush=True)
 
 
@@ -130,13 +128,13 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
     found = []
     for each in models:
         scene, _, path = each.partition("=")
-        cover = prepare(read_model(path), format_name)
+        cover = CodesChannel(format_name).prepare(read_model(path))
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )
         payload = Payload("carry", os.urandom(cover.capacity * 9 // 10))
         write_model(plain, read_model(path))
-        write_model(stego, coded(cover.embed([(KEY, payload)])))
+        write_model(stego, cover.embed([(KEY, payload)]))
         found.append(f"{scene}={plain}:{stego}")
     (folder / "pairs").write_text("\n".join(found))
 

@@ -21,7 +21,7 @@ from keyss.core import BackendError, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
 from keyss.measure.robustness.conversions import find_package, transform
-from keyss.rendering.difference import cost
+from keyss.rendering.difference import psnr_between
 
 import numpy as np
 import torch
@@ -93,7 +93,7 @@ def through(path: Path, suffix: str, writer: Writer) -> tuple[float, float, list
         write_model(source, before)
         writer(source, target)
         after, size = read_model(target), target.stat().st_size
-    return size / len(before), cost(before, after), changes(before, after)
+    return size / len(before), psnr_between(before, after), changes(before, after)
 
 
 def changes(before: Gaussians, after: Gaussians) -> list[tuple[float, float]]:

@@ -21,6 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
+from keyss.files import read_model
 
 import numpy as np
 import torch
@@ -31,13 +32,12 @@ from channels.low_bits import payloads
 from channels.low_bits.holder import seen_by_holder
 from channels.low_bits.trained_like import keys
 from keyss.core import UsageError
-from keyss.files.models import read_model
-from keyss.measure.stealth.detection import Examples, learned_detectors, single_detectors
-from keyss.measure.stealth.suite import stealth_statistics
-from keyss.methods.records.encoding import most_visible
+from keyss.measure import stealth_statistics
+from keyss.methods import most_visible
 from methods.carry import carried
+from stealth_detection import Examples, learned_detectors, single_detectors
 
-MOST_OTHERS = 3
+MAX_OTHERS = 3
 SHARE = 8  # secrets are at most one such part of the cover's Gaussians
 PAYLOAD_BYTES = (500, 3000)
 KINDS = ("carried", "sealed")
@@ -104,13 +104,13 @@ def _counted(job: Job) -> dict[tuple[str, int], dict[str, float]]:
     cover = read_model(job.cover)
     secrets = [
         most_visible(read_model(path), int(random.integers(len(cover) // (2 * SHARE), len(cover) // SHARE)))
-        for path in random.choice(job.others, 1 + MOST_OTHERS)
+        for path in random.choice(job.others, 1 + MAX_OTHERS)
     ]
     data = [os.urandom(int(random.integers(*PAYLOAD_BYTES))) for _ in secrets]
     found = {}
     for beside in (0, 1):
-        count = 1 + beside * int(random.integers(1, MOST_OTHERS + 1))
-        owned = [keys((1 + MOST_OTHERS) * job.index + each) for each in range(count)]
+        count = 1 + beside * int(random.integers(1, MAX_OTHERS + 1))
+        owned = [keys((1 + MAX_OTHERS) * job.index + each) for each in range(count)]
         for kind in KINDS:
             if kind == "carried":
                 stego = carried.embed_derived(cover, list(zip(owned, secrets[:count], strict=True)))

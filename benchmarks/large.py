@@ -31,10 +31,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits import LOW_BITS
-from keyss.channels.rooms import room_in
-from keyss.methods.records.embedding import embed_models, embed_whole
-from keyss.methods.records.encoding import subsampled_counts
+from keyss.channels import LOW_BITS
+from keyss.methods import embed_models, embed_whole, most_visible, record_request
 from keyss.rendering.difference import Viewpoints
 from keyss.runs.revealing import reveal_model
 
@@ -134,10 +132,13 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
             cover, secret = readers.map(read_model, (folder / "cover.ply", folder / "secret.ply"))
         if options.publish == "ply":
             prepared = LOW_BITS.prepare(cover)
-            counts = subsampled_counts(prepared, [secret]) if options.prune else [hidden]
-            stego = embed_models(prepared, [KEY], [secret], counts, "carry").stego
+            if options.prune:
+                secret = most_visible(
+                    secret, prepared.record_capacity([record_request(hidden, secret.sh_degree)])
+                )
+            stego = embed_models(prepared, [KEY], [secret]).stego
         else:
-            room, views = room_in(cover, options.publish, "appended"), Viewpoints.around(secret)
+            room, views = options.place.prepare(cover), Viewpoints.around(secret)
             stego = embed_whole(room, [KEY], [secret], [views], prune=options.prune).stego
         write_model(published, stego)
     else:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from keyss import FitConfig
 from keyss.files import load_scene
-from keyss.fitting.side_by_side import LEAST_STEPS, Fit, fit_scenes
+from keyss.fitting.side_by_side import MIN_STEPS, Fit, fit_scenes
 
 import torch
 
@@ -48,8 +48,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=2)
     options = parser.parse_args()
-    if options.fits and options.iterations < LEAST_STEPS:
-        parser.error(f"--fits: fewer than {LEAST_STEPS} steps are not done side by side")
+    if options.fits and options.iterations < MIN_STEPS:
+        parser.error(f"--fits: fewer than {MIN_STEPS} steps are not done side by side")
     with tempfile.TemporaryDirectory() as name:
         found = hidings(options, Path(name))
         if options.fits:

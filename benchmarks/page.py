@@ -21,7 +21,7 @@ from pathlib import Path
 
 import keyss
 from keyss.core.gaussians import Gaussians
-from keyss.methods.carry.options import CarryOptions
+from keyss.methods import CarryOptions
 from keyss.viewer.page import export_html
 
 import torch

@@ -1,4 +1,4 @@
-"""What a hiding is worth after other people's programs converted it: the table of docs/appended.md.
+"""What a hiding is worth after other people's programs converted it: the table of docs/channels.md.
 
     python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10] [--only NAME ...]
 
@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from keyss import reveal
 from codes import against_photos
-from keyss.core.errors import BackendError, KeyssError
-from keyss.measure.robustness.conversions import Converter, converters
+from keyss.core import BackendError, Gaussians, KeyssError
+from keyss.files import read_model, write_model
+from keyss.measure import Converter, converters
 from keyss.runs.opening import HidingRun, open_run
 
 
@@ -29,15 +31,23 @@ def row(run: HidingRun, name: str, converter: Converter | None) -> str:
         raise SystemExit(f"{run.folder} has no plain model of its cover")
     stego, size, untouched = run.stego, 0, 0
     if converter is not None:
-        changed, before = converter(stego), converter(plain)
-        stego, size, plain, untouched = changed.gaussians, changed.bytes, before.gaussians, before.bytes
+        (stego, size), (plain, untouched) = _converted(converter, stego), _converted(converter, plain)
     try:
-        revealed = f"{against_photos(reveal(stego, run.keys[0]), secret):.2f}"
+        revealed = f"{against_photos(reveal(stego, run.keys[0]).gaussians, secret):.2f}"
     except KeyssError as error:
         revealed = f"lost ({type(error).__name__})"
     covers = [against_photos(each, cover) for each in (plain, stego)]
     sizes = f"{untouched / 1e6:.2f} / {size / 1e6:.2f}" if size else ""
     return f"| {name} | {sizes} | {covers[0]:.2f} / {covers[1]:.2f} | {revealed} |"
+
+
+def _converted(converter: Converter, model: Gaussians) -> tuple[Gaussians, int]:
+    """A model after conversion and back, and the bytes of the converted file."""
+    with TemporaryDirectory() as folder:
+        source = Path(folder) / "source.ply"
+        write_model(source, model)
+        there, back = converter.there_and_back(source, Path(folder))
+        return read_model(back), there.stat().st_size
 
 
 def main() -> None:

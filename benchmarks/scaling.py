@@ -19,13 +19,13 @@ from pathlib import Path
 
 from keyss import read_model, write_model
 from benchmark_record import processor_name
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels import LOW_BITS
 from keyss.core import Gaussians
 from keyss.files.images import read_image
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
-from keyss.methods.records.embedding import embed_models
+from keyss.methods import embed_models
 from keyss.rendering import render
 from keyss.runs.revealing import reveal_model
 from rasterizer import camera_before, load_kernels, made_up
@@ -106,7 +106,7 @@ def carry_seconds(size: Size) -> float:
 
         def carry() -> None:
             prepared, hidden = LOW_BITS.prepare(read_model(cover)), read_model(secret)
-            stego = embed_models(prepared, keys, [hidden] * secrets, [len(hidden)] * secrets, "carry").stego
+            stego = embed_models(prepared, keys, [hidden] * secrets).stego
             write_model(Path(name) / "stego.ply", stego)
 
         return best_of(1, carry)
@@ -119,7 +119,7 @@ def reveal_seconds(size: Size) -> float:
         key, stego = "the key of the benchmark, 9fK2", Path(name) / "stego.ply"
         hidden = trained(count, 1)
         prepared = LOW_BITS.prepare(trained(count, 0))
-        write_model(stego, embed_models(prepared, [key], [hidden], [count], "carry").stego)
+        write_model(stego, embed_models(prepared, [key], [hidden[:count]]).stego)
 
         def reveal() -> None:
             found = reveal_model(read_model(stego), key, device=torch.device("cpu"))

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
+from keyss.files import read_model
 
 import numpy as np
 import numpy.typing as npt
@@ -38,16 +39,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
-from keyss.files.models import read_model
-from keyss.measure.stealth.confirmation import candidate_scores, confirmed
-from keyss.measure.stealth.detection import Detection, Examples, learned_detectors, single_detectors
-from keyss.measure.stealth.predictor import BitPredictor, sample
-from keyss.measure.stealth.suite import stealth_statistics
+from keyss.measure import candidate_scores, stealth_statistics
 from methods.carry import carried
+from stealth_detection import Detection, Examples, confirmed, learned_detectors, single_detectors
+from stealth_predictor import BitPredictor, sample
 
 PART_SIZES = (2000, 5000)
 PAYLOAD_BYTES = 4000
-TRAINING_ROWS, MOST_TRAINED_ON = 20_000, 20  # of the predictor
+TRAINING_ROWS, MAX_TRAINED_ON = 20_000, 20  # of the predictor
 CANDIDATES = 24
 SHOWN = 8  # single statistics in the table
 
@@ -195,7 +194,7 @@ def _predicted(
     found: list[dict[str, float]] = [{} for _ in pieces]
     for scene in dict.fromkeys(file.scene for file in plain):
         others = [each for file, each in zip(plain, samples, strict=True) if file.scene != scene]
-        predictor = BitPredictor.of_samples(others[:: -(-len(others) // MOST_TRAINED_ON)])
+        predictor = BitPredictor.of_samples(others[:: -(-len(others) // MAX_TRAINED_ON)])
         own = [index for index, (file, _, _) in enumerate(pieces) if file.scene == scene]
         judge: Callable[[Gaussians], dict[str, float]] = partial(_judged, predictor)
         for index, row in zip(

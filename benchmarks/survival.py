@@ -17,14 +17,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from keyss.api import SecretFile, convert, hide_files, reveal_file
-from keyss.core import Gaussians, InputError, WrongKeyError
-from keyss.core.errors import BackendError
-from keyss.files.models import read_model
-from keyss.files.scenes import load_scene
+from keyss import Secret, convert, hide, reveal
+from colours import FORMATS, OTHERS, Change
+from keyss.core import BackendError, Gaussians, InputError, WrongKeyError
+from keyss.files import load_scene, read_model
 from keyss.keys import derivation
-from keyss.measure.robustness.changes import fine_tuning
-from robust import FORMATS, OTHERS, Change
+from keyss.measure import fine_tuning
+from keyss.methods import HiddenFile
 
 import numpy as np
 import torch
@@ -56,7 +55,7 @@ def survives(model: Gaussians, data: bytes, change: Change) -> str:
     except BackendError as error:
         return f"not measured: {error}"
     try:
-        return "opens" if reveal_file(changed, KEY).data == data else "damaged"
+        return "opens" if reveal(changed, KEY).file == HiddenFile("file", data) else "damaged"
     except (WrongKeyError, InputError):
         return "lost"
 
@@ -79,8 +78,8 @@ def main() -> None:
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(0))
         model = model[order[: asked.gaussians]]
     data = np.random.default_rng(0).bytes(asked.bytes)
-    secret = SecretFile(data, KEY, "file")
-    made = {name: hide_files(model, [secret], **options) for name, options in CHANNELS.items()}
+    secret = Secret(file=data, key=KEY, name="file")
+    made = {name: hide(model, [secret], **options) for name, options in CHANNELS.items()}
     print(f"{asked.model.stem}, {len(model):,} Gaussians, a file of {asked.bytes} bytes\n")
     print(f"| what becomes of the model | {' | '.join(made)} |")
     print("| --- |" + " --- |" * len(made))

@@ -20,10 +20,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from keyss import api, write_model
+import keyss
+from keyss import write_model
 from channels.low_bits.trained_like import trained_like
 from keyss._processes import usable_cores
-from keyss.sweeps.running import How
+from keyss.many import ManyResult
 
 SPEC = """\
 pairs:
@@ -46,17 +47,17 @@ def main() -> None:
         write_model(folder / "secret.ply", trained_like(options.count // 2, 1))
         spec = folder / "sweep.yaml"
         spec.write_text(SPEC + "seeds: [0]\n")
-        _seconds(spec, folder / "first", How(1))  # kernels are compiled then
+        _seconds(spec, folder / "first", 1)  # kernels are compiled then
         spec.write_text(SPEC + f"seeds: {list(range(options.cells))}\n")
         found = {}
         if cores is not None:
             os.sched_setaffinity(0, cores[:1])
-            found["serial"] = _seconds(spec, folder / "serial", How(1))
+            found["serial"] = _seconds(spec, folder / "serial", 1)
             os.sched_setaffinity(0, cores)
-        found["one at a time"] = _seconds(spec, folder / "one", How(1))
-        found["all cores"] = _seconds(spec, folder / "all", How(usable_cores()))
+        found["one at a time"] = _seconds(spec, folder / "one", 1)
+        found["all cores"] = _seconds(spec, folder / "all", usable_cores())
         if options.ray:
-            found["all cores, Ray"] = _seconds(spec, folder / "ray", How(usable_cores(), ray="local"))
+            found["all cores, Ray"] = _seconds(spec, folder / "ray", usable_cores(), ray="local")
     first = next(iter(found))
     print(f"{options.cells} cells, {usable_cores()} cores\n")
     print(f"| | seconds | of `{first}` |\n| --- | --- | --- |")
@@ -64,11 +65,12 @@ def main() -> None:
         print(f"| {what} | {seconds:.1f} | {seconds / found[first]:.2f} |")
 
 
-def _seconds(spec: Path, out: Path, how: How) -> float:
+def _seconds(spec: Path, out: Path, jobs: int, ray: str | None = None) -> float:
     """Raises SystemExit where a cell failed."""
     start = time.perf_counter()
-    if failed := api.sweep(spec, out, how=how).failed:
-        raise SystemExit(f"{len(failed)} cells failed: see {failed[0].folder / 'log.txt'}")
+    found = keyss.sweep(spec, out, jobs=jobs, ray=ray)
+    if isinstance(found, ManyResult) and found.failed:
+        raise SystemExit(f"{len(found.failed)} cells failed: {found.failed[0].error}")
     return time.perf_counter() - start
 
 

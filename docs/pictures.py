@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from keyss import load_scene, read_model
-from keyss._verbs.filming import shown, wiped
-from keyss.demo.run import COMPARISON, COVER, KEY, SCENES, SECRET, SECRET_PLY, VIEWER
+from keyss.api.filming import shown, wiped
+from keyss.demo import COMPARISON, COVER, KEY, SCENES, SECRET, SECRET_PLY, VIEWER
 from keyss.rendering.paths import around
 from keyss.rendering.view import render as picture_of
 from keyss.runs.files import STEGO
@@ -35,7 +35,7 @@ SWITCHES = (
 WINDOW = (900, 560)  # pixels of the page
 WIDTH, HEIGHT, GAP = 640, 398, 6  # to which it is shrunk, twice
 PATIENCE = 300_000  # milliseconds: nothing here has a GPU
-MOST_BYTES = 200_000
+MAX_BYTES = 200_000
 
 
 def main() -> None:
@@ -91,9 +91,9 @@ def page(demo: Path) -> bytes:
         both.quantize(colours, Image.Quantize.MEDIANCUT, dither=Image.Dither.FLOYDSTEINBERG).save(
             data, "PNG", optimize=True
         )
-        if data.tell() <= MOST_BYTES:
+        if data.tell() <= MAX_BYTES:
             return data.getvalue()
-    raise SystemExit(f"viewer.png has more than {MOST_BYTES:,} bytes in 32 colours")
+    raise SystemExit(f"viewer.png has more than {MAX_BYTES:,} bytes in 32 colours")
 
 
 @torch.no_grad()

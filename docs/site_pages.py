@@ -18,9 +18,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 import keyss
-import keyss.api
 from keyss.cli import main
-from keyss.cli.commands import ALL
+from keyss.cli.commands import MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
@@ -81,19 +80,18 @@ def tour() -> str:
 def commands() -> str:
     """What `--help` says of every command, as it is."""
     text = "# Commands\n\nWhat `keyss COMMAND --help` says.\n"
-    for command in ALL:
+    for command in MODULES:
         said = io.StringIO()
         plain = mock.patch.dict(os.environ, {"COLUMNS": "100", "NO_COLOR": "1"})
         with plain, redirect_stdout(said), suppress(SystemExit):
-            main([command.__name__, "--help"])
+            main([command, "--help"])
         lines = "\n".join(line.rstrip() for line in said.getvalue().strip().splitlines())
-        text += f"\n## {command.__name__}\n\n```text\n{lines}\n```\n"
+        text += f"\n## {command}\n\n```text\n{lines}\n```\n"
     return text
 
 
 def reference() -> str:
-    """One entry for each public name of the package and of `keyss.api`, in the order of their lists."""
-    text = "# Python reference\n\nThe public names of `keyss`, then those that are in `keyss.api` alone.\n"
+    """One entry for each public name of the package."""
+    text = "# Python reference\n\nThe public names of `keyss`.\n"
     names = [f"keyss.{name}" for name in keyss.__all__ if not name.startswith("_")]
-    names += [f"keyss.api.{name}" for name in keyss.api.__all__ if name not in keyss.__all__]
     return text + "".join(f"\n::: {name}\n" for name in names)

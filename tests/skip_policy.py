@@ -13,7 +13,6 @@ import pytest
 ALLOWED = (
     r"CUDA",  # CI has no GPU
     r"no real scenes in ",  # photos are not part of the repository
-    r"sealwatch does not load",  # it wants torchvision, and PyPI's does not load beside a torch for CPUs
 )
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)

@@ -10,14 +10,12 @@ from typing import Any
 import pytest
 
 import keyss
-from keyss import CarryOptions, Gaussians, LearnedOptions, Secret
+from keyss import CarryOptions, Gaussians, Secret
 from keyss.core import KeyssError
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions, SceneInput
+from keyss.methods import MethodOptions, Source, registry
 
 pytestmark = pytest.mark.real
 NAMES = ("biker", "guitar", "inria_cuda_7000", "playbot_lod2", "playbot_lod4")
-OPTIONS = {"learned": LearnedOptions, "carry": CarryOptions}
 CPU_SECONDS = 5.0  # of this process: what others do on the machine does not count
 KEY = "a key of many characters: 93hXmQ2"
 
@@ -29,15 +27,15 @@ def models(real_data: Path) -> dict[str, Gaussians]:
 
 def refusal(options: MethodOptions, *models: Gaussians) -> str | None:
     """What is said before the first step, None if nothing is."""
-    inputs = [SceneInput(model, photos=False) for model in models]
+    sources = [Source(model, photos=False) for model in models]
     try:
-        registry.of_options(options).prepare(inputs, options)
+        registry.of_options(options).prepare(sources, options)
     except KeyssError as error:
         return str(error)
     return None
 
 
-def named_ways(method: str, message: str) -> list[MethodOptions]:
+def named_ways(message: str) -> list[MethodOptions]:
     """The options that the advice at the end of a message names, each group of them a way."""
     ways = []
     for group in re.findall(r"`([^`]+)`", message.rpartition("; ")[2]):
@@ -46,25 +44,23 @@ def named_ways(method: str, message: str) -> list[MethodOptions]:
             given[name] = {"True": True}.get(value, value.strip('"'))
         if "sh_degree" in given:
             given["sh_degree"] = int(given["sh_degree"])
-        ways.append(OPTIONS[given.pop("method", method)](**given))
+        ways.append(CarryOptions(**given))
     return ways
 
 
-@pytest.mark.parametrize("method", OPTIONS)
 @pytest.mark.parametrize("cover", NAMES)
-def test_every_pair_is_accepted_or_shown_a_way(models: dict[str, Gaussians], method: str, cover: str) -> None:
+def test_every_pair_is_accepted_or_shown_a_way(models: dict[str, Gaussians], cover: str) -> None:
     for name, secret in models.items():
         start = time.process_time()
-        said = refusal(OPTIONS[method](), models[cover], secret)
+        said = refusal(CarryOptions(), models[cover], secret)
         assert time.process_time() - start < CPU_SECONDS, name
         if said is None:
             continue
-        ways = named_ways(method, said)
+        ways = named_ways(said)
         assert ways, said
-        assert ways[-1].publish == "any" or ways[-1] == LearnedOptions()
+        assert ways[-1].publish == "any"
         for way in ways:
             then = refusal(way, models[cover], secret)
-            # A cover of degree 0 that 'method="learned"' hides in has a further choice to make.
             assert then is None, (name, said, then)
 
 

@@ -34,7 +34,7 @@ const workers = {
     onResolve({ filter: /^source:/ }, ({ path, resolveDir }) => ({
       path: join(resolveDir, path.slice('source:'.length)), namespace: 'worker',
     }));
-    onLoad({ filter: /.*/, namespace: 'worker' }, async ({ path }) => ({ contents: await bundled(path), loader: 'text' }));
+    onLoad({ filter: /.*/, namespace: 'worker' }, async ({ path }) => ({ contents: await bundled(path, [workers]), loader: 'text' }));
   },
 };
 

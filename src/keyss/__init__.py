@@ -5,41 +5,56 @@
     hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
     reveal("runs/hidden/publish/stego.ply", key, out="treasure.ply")
 
-The names below are loaded at first use (PEP 562), so that the command line answers at once.
+Each name below is loaded at its first use, so that `import keyss` is quick.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from keyss import _threads  # noqa: F401  before anything imports torch
-from keyss._version import __version__
+from keyss._lazy import lazily
+from keyss._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from keyss.api import HideResult, Secret, evaluate, fit, hide, render, reveal, verify
-    from keyss.core import Camera, Gaussians, KeyssError, KeyssWarning, Scene, View, WrongKeyError
-    from keyss.files import load_scene, read_model, write_model
-    from keyss.fitting import FitConfig
-    from keyss.keys import generate_key
-    from keyss.methods.registry import CarryOptions, LearnedOptions
-    from keyss.runs.describe import info
-
-__all__ = ["HideResult", "Secret", "__version__", "evaluate", "fit", "hide", "render", "reveal", "verify"]
-__all__ += ["Camera", "Gaussians", "KeyssError", "KeyssWarning", "Scene", "View", "WrongKeyError"]
-__all__ += ["CarryOptions", "FitConfig", "LearnedOptions"]
-__all__ += ["generate_key", "info", "load_scene", "read_model", "write_model"]
-
-# Where they are, what is quickly imported first: the first of these modules that has a name gives it.
-_HOMES = ("core", "keys", "files", "fitting", "methods.registry", "runs.describe", "api")
-
-
-def __getattr__(name: str) -> Any:
-    for home in _HOMES if name in __all__ else ():
-        module = importlib.import_module(f"keyss.{home}")
-        if hasattr(module, name):
-            globals()[name] = value = getattr(module, name)
-            return value
-    raise AttributeError(f"module 'keyss' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    from keyss.api.asking import HideResult as HideResult, Secret as Secret
+    from keyss.api.converting import convert as convert
+    from keyss.api.fitting import fit as fit
+    from keyss.api.hiding import hide as hide
+    from keyss.api.looking import evaluate as evaluate, render as render
+    from keyss.api.opening import reveal as reveal, verify as verify
+    from keyss.audits.run import audit as audit
+    from keyss.core import Gaussians as Gaussians, KeyssError as KeyssError, WrongKeyError as WrongKeyError
+    from keyss.files import load_scene as load_scene, read_model as read_model, write_model as write_model
+    from keyss.fitting import FitConfig as FitConfig
+    from keyss.keys import generate_key as generate_key
+    from keyss.many.batch import hide_batch as hide_batch
+    from keyss.many.comparing import compare as compare
+    from keyss.many.reproducing import reproduce as reproduce
+    from keyss.many.sweeping import sweep as sweep
+    from keyss.methods import CarryOptions as CarryOptions, KeyssOptions as KeyssOptions
+    from keyss.runs.describe import info as info
+    from keyss.runs.revealing import Revealed as Revealed
+else:
+    __getattr__, __dir__, __all__ = lazily(
+        __name__,
+        {
+            "keyss.api.asking": ["HideResult", "Secret"],
+            "keyss.api.converting": ["convert"],
+            "keyss.api.fitting": ["fit"],
+            "keyss.api.hiding": ["hide"],
+            "keyss.api.looking": ["evaluate", "render"],
+            "keyss.api.opening": ["reveal", "verify"],
+            "keyss.audits.run": ["audit"],
+            "keyss.core": ["Gaussians", "KeyssError", "WrongKeyError"],
+            "keyss.files": ["load_scene", "read_model", "write_model"],
+            "keyss.fitting": ["FitConfig"],
+            "keyss.keys": ["generate_key"],
+            "keyss.many.batch": ["hide_batch"],
+            "keyss.many.comparing": ["compare"],
+            "keyss.many.reproducing": ["reproduce"],
+            "keyss.many.sweeping": ["sweep"],
+            "keyss.methods": ["CarryOptions", "KeyssOptions"],
+            "keyss.runs.describe": ["info"],
+            "keyss.runs.revealing": ["Revealed"],
+        },
+    )
+    __all__ += ["__version__"]

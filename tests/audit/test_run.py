@@ -13,16 +13,15 @@ import torch
 
 import keyss
 from keyss import Secret
-from keyss.audit import parts
-from keyss.audit.progress import PartProgress, PartResult
-from keyss.audit.run import audit
-from keyss.audit.subject import AuditSubject
+from keyss.audits import Audit, audit, parts, read_audit
+from keyss.audits.progress import PartProgress, PartResult
+from keyss.audits.record import LeaksResult
+from keyss.audits.subject import AuditSubject
 from keyss.cli import main
 from keyss.cli.measuring import PartName
 from keyss.core import InputError, OutputError, UsageError, WrongKeyError
-from keyss.fitting.loop import Interrupted
-from keyss.measure.speed import FileSize, SpeedResult
-from keyss.runs.audit_record import Audit, LeaksResult, read_audit
+from keyss.fitting import Interrupted
+from keyss.measure import FileSize, SpeedResult
 from test_api import ANY, write_nerfstudio
 from tiny_scenes import tiny_scene
 
@@ -59,7 +58,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             raise KeyboardInterrupt
         return PartResult(LeaksResult(((),) * len(subject.controls)))
 
-    monkeypatch.setattr("keyss.audit.run.PARTS", {"speed": speed, "leaks": leaks})
+    monkeypatch.setattr("keyss.audits.run.PARTS", {"speed": speed, "leaks": leaks})
     return called
 
 
@@ -73,7 +72,7 @@ def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     found = audit(run, [KEY], controls=2)
     assert calls == ["speed", "leaks"]
     assert read_audit(run) == found
-    assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 2
+    assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 3
     assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "stego.ply"))
     assert found.leaks == LeaksResult(((), ()))
     assert (found.controls.models, len(set(found.controls.seeds))) == (2, 2)
@@ -163,7 +162,7 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     assert "data:image/png" in page
     assert KEY not in page
     (run / "private" / "report.html").unlink()
-    assert main(["report", str(run)]) == 0
+    assert main(["audit", str(run), "--report-only"]) == 0
     assert (run / "private" / "report.html").read_text() == page
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import cheap_keys
 from keyss.cli import commands
-from keyss.fitting.image_metrics import ImageQuality
-from keyss.measure.hiding import BaselineQuality, RenderFidelity
-from keyss.runs.metrics import HideMetrics
+from keyss.fitting import ImageQuality
+from keyss.measure import BaselineQuality, RenderFidelity
+from keyss.runs import HideMetrics
 
 METRICS = HideMetrics(
-    method="learned",
+    method="carry",
     cover=ImageQuality(30.0, 0.5),
     secrets=(ImageQuality(20.0, 0.25),),
     baseline=BaselineQuality(ImageQuality(30.5, 0.6), (None,), (1234, None), (10, 10), (True, False)),
@@ -31,7 +31,7 @@ METRICS = HideMetrics(
     details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
-COMMANDS = [command.__name__.replace("_", "-") for command in commands.ALL]
+COMMANDS = list(commands.MODULES)
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 

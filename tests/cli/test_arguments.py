@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+import keyss as library
 from cli.said import METRICS, Said, assert_refused
-from keyss import api as verbs
-from keyss.methods import registry
-from keyss.methods.learned.options import PRESETS as LEARNED_PRESETS
+from keyss import CarryOptions, KeyssOptions
+from keyss.fitting import PRESETS
 from tiny_scenes import random_gaussians
 
 
@@ -22,11 +22,11 @@ class TestArguments:
     def hidden(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
         calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 
-        def hide(*args: Any, **kwargs: Any) -> verbs.HideResult:
+        def hide(*args: Any, **kwargs: Any) -> library.HideResult:
             calls.append((args, kwargs))
-            return verbs.HideResult(random_gaussians(1), METRICS)
+            return library.HideResult(random_gaussians(1), METRICS)
 
-        monkeypatch.setattr(verbs, "hide", hide)
+        monkeypatch.setattr(library, "hide", hide)
         return calls
 
     def test_secrets_and_keys_pair_up_in_order(
@@ -51,8 +51,8 @@ class TestArguments:
         (cover, secrets), _ = hidden[0]
         assert cover == Path("A")
         assert secrets == [
-            verbs.Secret(Path("B"), "key of b", Path("mb")),
-            verbs.Secret(Path("C"), "key of c", Path("mc")),
+            library.Secret(Path("B"), "key of b", Path("mb")),
+            library.Secret(Path("C"), "key of c", Path("mc")),
         ]
 
     def test_options_override_the_preset(
@@ -61,7 +61,7 @@ class TestArguments:
         monkeypatch.setenv("KEYSS_KEY", "k")
         said = keyss(
             *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
-            *("--max-gaussians", 80, "--seed", 9, "--mask", "xyz,sc", "--start", "points", "--width", 10),
+            *("--max-gaussians", 80, "--seed", 9, "--mask", "xyz,sc", "--method", "keyss", "--width", 10),
             *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
         )
         assert said.status == 0, said.err
@@ -69,9 +69,7 @@ class TestArguments:
         config = options.pop("method")
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
         assert config.mask == ("sc", "xyz")
-        assert config.start == "points"
-        assert (config.iterations, config.max_gaussians) == (7, 80)
-        assert config.fit.evaluate_every == LEARNED_PRESETS["quick"].fit.evaluate_every
+        assert config.fit.evaluate_every == PRESETS["quick"].evaluate_every
         assert options.pop("reporter") is not None
         assert options == {
             "width": 10,
@@ -91,19 +89,20 @@ class TestArguments:
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
-        assert hidden[0][1]["method"] == LEARNED_PRESETS["best"]
-        assert keyss("hide", "--method", "carry", "--cover", "A", "--secret", "B", "-o", "out").status == 0
-        assert hidden[1][1]["method"] == registry.get("carry").presets["best"]
+        assert hidden[0][1]["method"] == CarryOptions()
+        assert keyss("hide", "--method", "keyss", "--cover", "A", "--secret", "B", "-o", "out").status == 0
+        assert hidden[1][1]["method"] == KeyssOptions()
 
     def test_options_of_a_method_reach_it(
         self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
-        assert keyss(*scenes, "--start", "points", "--key-encoder", "clip", "--clip-model", "C").status == 0
-        learned = hidden[0][1]["method"]
-        assert (learned.start, learned.key_encoder, learned.clip_model) == ("points", "clip", "C")
-        assert keyss(*scenes, "--method", "carry", "--thin", "--dither", "--seed", 5).status == 0
+        clip = ("--key-encoder", "clip", "--clip-model", "C")
+        assert keyss(*scenes, "--method", "keyss", "--design", "published", *clip).status == 0
+        joint = hidden[0][1]["method"]
+        assert (joint.design, joint.key_encoder, joint.clip_model) == ("published", "clip", "C")
+        assert keyss(*scenes, "--method", "carry", "--prune-to-fit", "--dither", "--seed", 5).status == 0
         carry = hidden[1][1]["method"]
         assert (carry.prune_to_fit, carry.dither, carry.fit.seed) == (True, True, 5)
 
@@ -114,7 +113,7 @@ class TestArguments:
             (("--max-gaussians", -5), "--max-gaussians: expected"),
             (("--seed", -1), "--seed"),
             (("--seed", 10**30), "--seed"),
-            (("--mask", "op,colour"), "colour"),
+            (("--method", "keyss", "--mask", "op,colour"), "colour"),
             (("--secret-model", "x", "--secret-model", "y"), "--secret-model"),
             (("--secret", "C"), "KEYSS_KEY holds one key"),
         ],
@@ -150,7 +149,7 @@ class TestArguments:
         words: str,
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
-        carry = ("hide", "--method", "carry", "-o", "out", *extra)
+        carry = ("hide", "--refit", "never", "-o", "out", *extra)
         assert_refused(keyss(*carry, "--cover", "a.ply", "--secret", "b.ply"), 2, words)
         models = ("--cover-model", "a.ply", "--secret-model", "b.ply")
         assert_refused(keyss(*carry, "--cover", "A", "--secret", "B", *models), 2, words)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import COMMANDS, Said
-from keyss.fitting.config import PRESETS
+from keyss.fitting import PRESETS
 
 Run = Callable[..., Said]
 
@@ -25,15 +25,15 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("words", "completed"),
     [
         (["keyss", ""], {*COMMANDS, "-h", "--help"}),
-        (["keyss", "re"], {"reveal", "render", "report", "reproduce"}),
+        (["keyss", "re"], {"reveal", "render", "reproduce"}),
         (["keyss", "hide", "--secret"], {"--secret", "--secret-file", "--secret-model"}),
-        (["keyss", "hide", "--start"], {"--start"}),
+        (["keyss", "hide", "--min"], {"--min-psnr"}),
         (["keyss", "fit", "x", "--preset", ""], set(PRESETS)),
     ],
 )
 def test_of_bash(keyss: Run, script: Path, words: list[str], completed: set[str]) -> None:
     if not script.exists():
-        said = keyss("completion", "bash")
+        said = keyss("--completion", "bash")
         assert (said.status, said.err) == (0, "")
         script.write_text(said.out)
     line = (
@@ -45,5 +45,5 @@ def test_of_bash(keyss: Run, script: Path, words: list[str], completed: set[str]
 
 
 def test_of_other_shells(keyss: Run) -> None:
-    assert keyss("completion", "zsh").out.startswith("#compdef keyss")
-    assert keyss("completion", "fish").status == 2
+    assert keyss("--completion", "zsh").out.startswith("#compdef keyss")
+    assert keyss("--completion", "fish").status == 2

@@ -14,7 +14,6 @@ import torch
 import keyss as package
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused
-from keyss import api
 from keyss.files import read_model, write_model
 from tiny_scenes import random_gaussians
 
@@ -45,14 +44,14 @@ def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str
     first, *others = said.out.splitlines()
     assert first.startswith(f"{out}: {COUNT} Gaussians, {out.stat().st_size / 1e3:.1f} kB, ")
     if suffix == "ply":
-        assert first.endswith("pictures as before")
+        assert first.endswith("renders unchanged")
         assert not others
     else:
         if suffix == "glb":  # which has all numbers, in other units
-            assert first.endswith("pictures as before")
+            assert first.endswith("renders unchanged")
         else:
-            assert 25 < float(first.split("pictures at ")[1].split()[0]) < 100
-        assert others == ["what may lie in low bits does not survive this format; with a key, keyss looks"]
+            assert 25 < float(first.split("renders at ")[1].split()[0]) < 100
+        assert others == ["this format destroys low bits; give --key-file to check a secret in them"]
     assert len(read_model(out)) == COUNT
 
 
@@ -72,10 +71,10 @@ def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Pa
     key = ("--key-file", files / "key")
     out = tmp_path / "out.spz"
     refused = keyss("convert", CARRIED, out, *key)
-    assert_refused(refused, 7, "Gaussians would open from")
-    assert "nothing was written; --force writes it all the same" in refused.err
+    assert_refused(refused, 7, "Gaussians would be left in")
+    assert "nothing was written; --force writes it anyway" in refused.err
     assert not out.exists()
-    assert "is lost: 0 Gaussians of it open" in keyss("convert", CARRIED, out, *key, "--dry-run").out
+    assert "is lost: 0 Gaussians are left" in keyss("convert", CARRIED, out, *key, "--dry-run").out
     assert not out.exists()
     assert keyss("convert", CARRIED, out, *key, "--force").status == 0
     assert out.exists()
@@ -86,18 +85,20 @@ def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Pa
     out = tmp_path / "out.ply"
     said = keyss("convert", CARRIED, out, "--key-file", files / "key")
     assert said.status == 0
-    assert "Gaussians, opens as before" in said.out
+    assert "Gaussians, survives" in said.out
     assert keyss("reveal", out, "--key-file", files / "key", "-o", tmp_path / "secret.ply").status == 0
 
 
 def test_a_hidden_file_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
-    stego = api.hide_files(trained_like(2500), [api.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]).stego
+    stego = package.hide(
+        trained_like(2500), [package.Secret(file=b"a letter" * 20, key="q7Rv2LxT9bWm4KzD")]
+    ).stego
     write_model(tmp_path / "stego.ply", stego)
     key = ("--key-file", files / "other")
     refused = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.sog", *key)
-    assert_refused(refused, 7, "0 of its 160 bytes would open from")
+    assert_refused(refused, 7, "0 of its 160 bytes would be left in")
     said = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.ply", *key)
-    assert "160 bytes, opens as before" in said.out
+    assert "160 bytes, survives" in said.out
 
 
 def test_a_key_that_opens_nothing(keyss: Run, files: Path, tmp_path: Path) -> None:
@@ -128,7 +129,7 @@ def test_pipes(files: Path, tmp_path: Path) -> None:
 
 def test_from_python(files: Path, tmp_path: Path) -> None:
     model = package.read_model(files / "plain.ply")
-    found = api.convert(model, tmp_path / "a.sog")
+    found = package.convert(model, tmp_path / "a.sog")
     assert found.bytes_after == (tmp_path / "a.sog").stat().st_size
     assert (found.bytes_before, found.secrets, found.keeps_low_bits) == (None, (), False)
     assert torch.equal(found.gaussians.means, read_model(tmp_path / "a.sog").means)

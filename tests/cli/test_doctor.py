@@ -42,7 +42,7 @@ def test_a_device_that_is_not_there(keyss: Run) -> None:
     said = keyss("doctor", "--device", "cuda", "--json")
     assert said.status == 6
     assert states(said)["test frame"] == "broken"
-    assert "keyss: error: not everything works that is needed: test frame" in said.err
+    assert "keyss: error: required components do not work: test frame" in said.err
 
 
 @pytest.mark.parametrize(("where", "factor"), [("middle", 0.999), ("corner", 0.0)])
@@ -64,12 +64,12 @@ def test_a_picture_that_is_wrong(
 
 
 def test_what_is_missing_and_how_to_get_it(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    gone = {"flip-evaluator", "numba"}
+    gone = {"av", "numba"}
     version = doctor._version
     monkeypatch.setattr(doctor, "_version", lambda name: None if name in gone else version(name))
     said = keyss("doctor", "--device", "cpu")
     assert said.status == 6
-    assert re.search(r"^missing +\[metrics\] .*pip install 'keyss\[metrics\]'$", said.out, re.MULTILINE)
+    assert re.search(r"^missing +\[video\] .*pip install 'keyss\[video\]'$", said.out, re.MULTILINE)
     assert re.search(r"^broken +numba +pip install numba$", said.out, re.MULTILINE)
     assert said.err.count("\n") == 1
 

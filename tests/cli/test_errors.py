@@ -80,8 +80,13 @@ def _empty_key(folder: Path) -> list[object]:
 
 def _without_clip(folder: Path) -> list[object]:
     pytest.importorskip("transformers", reason="needs keyss[clip]")
-    found = _hide(folder, key_encoder="clip", clip_model=folder / "a", start="points", publish="ply")
-    return [each for index, each in enumerate(found) if index not in (1, 2)]  # of points there are low bits
+    return _jointly(folder, key_encoder="clip", clip_model=folder / "a")
+
+
+def _jointly(folder: Path, **changes: object) -> list[object]:
+    """`hide` by a method that publishes low bits only."""
+    command, _, _, *options = _hide(folder, method="keyss", **changes)
+    return [command, *options]
 
 
 def _plain(folder: Path, name: str) -> Path:
@@ -195,7 +200,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
     "info of another file": (4, "key.txt", lambda f: ["info", f / "key.txt"]),
     "clip without a model": (6, "--clip-model", _without_clip),
-    "clip model without clip": (2, "--key-encoder", lambda f: _hide(f, clip_model=f)),
+    "clip model without clip": (2, "--key-encoder", lambda f: _jointly(f, clip_model=f)),
     "width of nothing": (2, "width", lambda f: ["fit", f / "a", "-o", f / "out", "--width", 0]),
     "background out of range": (
         2,
@@ -264,8 +269,8 @@ class TestUnexpectedErrors:
     @pytest.mark.parametrize(
         ("error", "status", "words"),
         [
-            (MemoryError(), 5, "not enough memory"),
-            (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 5, "not enough memory"),
+            (MemoryError(), 5, "out of memory"),
+            (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 5, "out of memory"),
             (OSError(errno.ENOSPC, "No space left on device", "/x/y"), 5, "/x/y: No space left"),
             (KeyboardInterrupt(), 130, "interrupted"),
         ],

@@ -12,7 +12,7 @@ import pytest
 
 from cli.said import Said
 from keyss.cli.flags import as_flags
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core import KeyssWarning, UsageError
 
 SOURCE = Path(__file__).parents[2] / "src" / "keyss"
 OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model", "download"}
@@ -24,7 +24,7 @@ QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
     ("message", "said"),
     [
         ("`overwrite=True` replaces it", "--overwrite replaces it"),
-        ('`method="learned"` can', "--method learned can"),
+        ('`method="keyss"` can', "--method keyss can"),
         ('`method="carry", dither=True` has one', "--method carry --dither has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
@@ -58,7 +58,7 @@ def _strings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 def test_no_message_below_the_command_line_names_a_flag() -> None:
     upper = (SOURCE / "cli", SOURCE / "demo")
     files = [path for path in SOURCE.rglob("*.py") if not any(map(path.is_relative_to, upper))]
-    files.remove(SOURCE / "report" / "figures.py")  # CSS has variables that look like flags
+    files.remove(SOURCE / "audits" / "figures.py")  # CSS has variables that look like flags
     assert len(files) > 50
     found = {
         f"{path.relative_to(SOURCE)}:{line}": text

@@ -60,10 +60,10 @@ def test_another_folder_in_place_of_a_model_is_called_one(keyss: Keyss, world: P
 
 
 @pytest.mark.parametrize("inside", ["publish/stego.ply", "publish", "private", "private/config.json"])
-@pytest.mark.parametrize("command", ["evaluate", "audit", "report"])
+@pytest.mark.parametrize("command", ["evaluate", "audit", "audit --report-only"])
 def test_what_lies_in_a_run_is_told_the_run(keyss: Keyss, world: Path, command: str, inside: str) -> None:
     path = world / "hidden" / inside
-    said = keyss(command, path, *(() if command == "report" else key(world)))
+    said = keyss(*command.split(), path, *key(world))
     kind = "a folder" if path.is_dir() else "a file"
     assert_refused(said, 4, f"{path}: expected the folder of a run")
     assert f"found {kind} in one; give {world / 'hidden'}" in said.err
@@ -291,7 +291,7 @@ def test_a_run_remembers_that_photos_were_missing(keyss: Keyss, world: Path, tmp
     assert_refused(keyss(*hide), 4, "1 of 4 photos are missing: 02.png;")
     said = keyss(*hide, "--skip-missing")
     assert said.status == 0, said.err
-    assert json.loads((run / "private/config.json").read_text())["skip_missing"] is True
+    assert json.loads((run / "private/config.json").read_text())["views"]["skip_missing"] is True
     said = keyss("evaluate", run, *key(world))
     assert said.status == 0, said.err
     assert [line for line in warnings_of(said) if "left out: 02.png" in line]

@@ -8,6 +8,9 @@ from pathlib import Path
 
 from cli.said import Said, assert_refused
 from keyss.cli.keys import key_of_file
+from keyss.keys import MasterKey
+
+MASTER = "q7Rv2LxT9bWm4KzDq7Rv2L"
 
 
 class TestKeygen:
@@ -22,14 +25,28 @@ class TestKeygen:
         assert key.isalnum()
         assert keyss("keygen").out != said.out
 
-    def test_length(self, keyss: Callable[..., Said]) -> None:
-        assert len(keyss("keygen", "--length", 40).out) == 41
-        assert_refused(keyss("keygen", "--length", 0), 2, "1 to 1024")
-
     def test_bits(self, keyss: Callable[..., Said]) -> None:
         assert len(keyss("keygen", "--bits", 128).out) == 22 + 1
-        assert_refused(keyss("keygen", "--bits", 128, "--length", 9), 2, "not both")
         assert_refused(keyss("keygen", "--bits", 0), 2, "--bits")
+        assert_refused(keyss("keygen", "--bits", 10_000), 2, "1 to 1024")
+
+    def test_the_key_of_an_asset_follows_from_the_master_key(
+        self, keyss: Callable[..., Said], tmp_path: Path
+    ) -> None:
+        master = tmp_path / "master.txt"
+        master.touch(mode=0o600)
+        master.write_text(MASTER + "\n")
+        expected = MasterKey(MASTER).key_of("statue-7")
+        asset = ("keygen", "--asset", "statue-7")
+        assert keyss(*asset, "--master-key-file", master).out == f"{expected}\n"
+        out = tmp_path / "statue-7.key"
+        said = keyss(*asset, "--master-key-file", master, "-o", out)
+        assert said.status == 0, said
+        assert out.read_text().strip() == expected
+        assert expected not in said.out
+        assert out.stat().st_mode & 0o777 == 0o600
+        assert_refused(keyss(*asset), 2, "--master-key-file")
+        assert_refused(keyss(*asset, "--master-key-file", master, "--bits", 9), 2, "--bits")
 
     def test_a_key_file_is_its_owners_and_never_replaced(
         self, keyss: Callable[..., Said], tmp_path: Path

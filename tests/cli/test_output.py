@@ -15,7 +15,7 @@ import pytest
 from cli.said import COMMANDS, PROGRAM, Said
 from keyss.cli import main
 from keyss.cli.characters import REPLACING
-from keyss.files.ply import read_ply
+from keyss.files import read_model
 
 NARROW = ["ascii", "cp1252", *(pytest.param(name, marks=pytest.mark.slow) for name in ("latin-1", "cp437"))]
 
@@ -61,7 +61,7 @@ def test_so_is_a_secret(world: Path, tmp_path: Path, redirection: str, status: i
     secret, stego = tmp_path / "secret.ply", world / "hidden" / "publish" / "stego.ply"
     done = shell(redirection, "reveal", stego, "--key-file", world / "key.txt", "-o", secret)
     assert done.returncode == status, done.stderr
-    assert len(read_ply(secret)) > 0
+    assert len(read_model(secret)) > 0
     assert [path.name for path in tmp_path.iterdir()] == ["secret.ply"]
 
 

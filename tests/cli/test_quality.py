@@ -11,7 +11,7 @@ import torch
 
 from channels.low_bits.trained_like import trained_like
 from cli.said import SMALL, Said, assert_refused
-from keyss.files.models import read_model, write_model
+from keyss.files import read_model, write_model
 
 
 def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_training(
@@ -25,7 +25,7 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0
-    assert "refit of the secret: 20 steps, continuing at 20" in said.err
+    assert "plain model of the secret (b): 40 steps, continuing at 40" in said.err
     assert (tmp_path / "run" / "publish" / "stego.ply").exists()
 
 
@@ -54,7 +54,7 @@ def _carry(folder: Path, *more: object) -> list[object]:
 def test_decibels_are_printed_for_models_without_photos(keyss: Callable[..., Said], models: Path) -> None:
     said = keyss(*_carry(models))
     assert said.status == 0, said.err
-    line = next(line for line in said.out.splitlines() if line.startswith("Opened again"))
+    line = next(line for line in said.out.splitlines() if line.startswith("Revealed from"))
     assert "cover" in line
     assert float(line.split("secret ")[1].split()[0]) > 38  # 39.8 was measured, in records of half a cell
 
@@ -63,7 +63,7 @@ def test_a_secret_that_comes_back_empty_is_not_published(
     keyss: Callable[..., Said], models: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Even where empty pictures would be near enough: the limit is far below what they reach."""
-    from keyss.methods.records.encoding import CarriedSecret
+    from keyss.methods import CarriedSecret
 
     reveal = CarriedSecret.reveal
 
@@ -72,7 +72,7 @@ def test_a_secret_that_comes_back_empty_is_not_published(
         return replace(found, opacity_logits=torch.full_like(found.opacity_logits, -20))
 
     monkeypatch.setattr(CarriedSecret, "reveal", empty)
-    assert_refused(keyss(*_carry(models, "--min-psnr", 1)), 7, "empty pictures")
+    assert_refused(keyss(*_carry(models, "--min-psnr", 1)), 7, "empty renders")
     assert not (models / "run").exists()
 
 
@@ -84,7 +84,7 @@ def test_one_outlier_does_no_harm(keyss: Callable[..., Said], models: Path, x: f
     said = keyss(*_carry(models))
     assert said.status == 0, said.err
     assert (
-        float(said.out.split("against the plain models:")[1].split("secret ")[1].split()[0]) > 38
+        float(said.out.split("PSNR to the plain models:")[1].split("secret ")[1].split()[0]) > 38
     )  # as without
 
 
@@ -94,4 +94,4 @@ def test_what_cannot_be_seen_is_not_hidden(
 ) -> None:
     model = read_model(models / which)
     write_model(models / which, replace(model, opacity_logits=torch.full_like(model.opacity_logits, -9)))
-    assert_refused(keyss(*_carry(models)), 2, f"nothing of {who}'s model can be seen")
+    assert_refused(keyss(*_carry(models)), 2, f"{who}'s model is invisible")

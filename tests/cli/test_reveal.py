@@ -15,12 +15,13 @@ import pytest
 
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
-from keyss.channels.low_bits import LOW_BITS, cells, reading
+from keyss.channels import LOW_BITS, opening
+from keyss.channels.low_bits import cells, reading
 from keyss.core import Gaussians
-from keyss.files import read_model
-from keyss.files.ply import read_ply, write_ply
+from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
-from keyss.methods.records.encoding import _COUNT, encode_all
+from keyss.methods import encode_all
+from keyss.methods.records.opening import COUNT
 
 KEY = "q7Rv2LxT9bWm4KzD"
 Run = Callable[..., Said]
@@ -29,8 +30,8 @@ Run = Callable[..., Said]
 def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
     """`cover` with `secret` in it, as if `claimed` Gaussians had been hidden and the others were lost."""
     prepared = LOW_BITS.prepare(cover)
-    (records,) = encode_all(prepared, [secret], "carry")
-    records = replace(records, header=_COUNT.pack(claimed) + records.header[_COUNT.size :])
+    (records,) = encode_all(prepared, [secret])
+    records = replace(records, header=COUNT.pack(claimed) + records.header[COUNT.size :])
     return prepared.embed([(KEY, records)])
 
 
@@ -42,9 +43,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).write_text(key)
         (folder / name).chmod(0o600)
     cover, secret = trained_like(1500), trained_like(500, 1)
-    write_ply(folder / "plain.ply", cover)
+    write_model(folder / "plain.ply", cover)
     for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):
-        write_ply(folder / f"{name}.ply", carried(cover, secret, claimed))
+        write_model(folder / f"{name}.ply", carried(cover, secret, claimed))
     return folder
 
 
@@ -74,7 +75,7 @@ class TestCounts:
         assert listing(tmp_path) == {}
         assert "--force" in reveal("few.ply").err
         said = reveal("few.ply", "--force")
-        assert (said.status, len(read_ply(tmp_path / "s.ply"))) == (0, 500)
+        assert (said.status, len(read_model(tmp_path / "s.ply"))) == (0, 500)
         assert "keyss: warning: 500 of 12,000" in said.err
 
 
@@ -85,7 +86,7 @@ class TestOpensNothing:
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         """Counts derived keys, and blocks of AES."""
         done = {"keys": 0, "blocks": 0}
-        encrypt, derive = cells._encrypt, reading.DerivedKey
+        encrypt, derive = cells.encrypted_blocks, reading.DerivedKey
 
         def counted(key: bytes, data: np.ndarray) -> np.ndarray:
             done["blocks"] += data.size // 16
@@ -95,16 +96,17 @@ class TestOpensNothing:
             done["keys"] += 1
             return derive(*arguments)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(cells, "_encrypt", counted)
-        monkeypatch.setattr(reading, "DerivedKey", derived)
+        monkeypatch.setattr(cells, "encrypted_blocks", counted)
+        for module in (opening, reading):
+            monkeypatch.setattr(module, "DerivedKey", derived)
         return done
 
     def test_in_the_same_words_after_the_same_work(
         self, reveal: Run, files: Path, tmp_path: Path, work: dict[str, int]
     ) -> None:
-        erased = read_ply(files / "whole.ply")
+        erased = read_model(files / "whole.ply")
         rounded = erased.map(lambda values: (values * 2**10).round() / 2**10)
-        write_ply(tmp_path / "rounded.ply", rounded)
+        write_model(tmp_path / "rounded.ply", rounded)
         attempts = [("plain.ply", "key"), ("whole.ply", "other"), (tmp_path / "rounded.ply", "key")]
         said, made = [], []
         for model, key in attempts:
@@ -183,7 +185,7 @@ class TestStreams:
         status, out, err = self.program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
         assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
         (tmp_path / "s.ply").write_bytes(out)
-        assert len(read_ply(tmp_path / "s.ply")) == 500
+        assert len(read_model(tmp_path / "s.ply")) == 500
         status, out, err = self.program("info", "-", "--json", data=out)
         assert (status, json.loads(out)["gaussians"]) == (0, 500)
 
@@ -217,7 +219,7 @@ class TestVerify:
         assert facts[0] == facts[1]
         assert facts[0]["secret"] is None
         assert facts[0]["model"]["gaussians"] == 1500
-        assert "secret                  not looked for" in keyss("verify", files / "whole.ply").out
+        assert "secret                  not checked" in keyss("verify", files / "whole.ply").out
 
     @pytest.mark.parametrize(
         ("change", "words"),
@@ -236,9 +238,9 @@ class TestVerify:
     def test_a_model_that_is_not_sound(
         self, keyss: Run, files: Path, tmp_path: Path, change: Callable[[Gaussians], object], words: str
     ) -> None:
-        model = read_ply(files / "plain.ply")
+        model = read_model(files / "plain.ply")
         change(model)
-        write_ply(tmp_path / "m.ply", model)
+        write_model(tmp_path / "m.ply", model)
         said = keyss("verify", tmp_path / "m.ply")
         assert said.status == 4
         assert words in said.err
@@ -262,7 +264,7 @@ class TestVerify:
 def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:
     hide = ("hide", "--method", "carry", "--width", 24, "--key-file", files / "key", "-o", tmp_path / "run")
     small = tmp_path / "small.ply"
-    write_ply(small, trained_like(100, 3))
+    write_model(small, trained_like(100, 3))
     assert keyss(*hide, "--cover", files / "plain.ply", "--secret", small).status == 0
     before, stego = listing(tmp_path), tmp_path / "run" / "publish" / "stego.ply"
     assert_refused(keyss(*hide, "--overwrite", "--cover", stego, "--secret", small), 2, "is the input")

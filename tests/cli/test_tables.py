@@ -10,9 +10,9 @@ from rich.console import Console
 
 from cli.said import METRICS
 from keyss.cli.tables import print_hiding
-from keyss.fitting.image_metrics import ImageQuality
-from keyss.measure.hiding import BaselineQuality, PsnrRange, WrongKeys
-from keyss.runs.metrics import HideMetrics
+from keyss.fitting import ImageQuality
+from keyss.measure import BaselineQuality, PsnrRange, WrongKeys
+from keyss.runs import HideMetrics
 
 
 class TestNumbers:
@@ -56,23 +56,23 @@ class TestNumbers:
         rows = [row[:2] for row in self.table(two)]
         assert rows[3:10] == [
             ["secret 2", "20.00"],
-            ["7 wrong keys, against the cover", "28.00"],
-            ["the worst of them", "27.00"],
-            ["the one nearest to the secret 1", "9.50"],
-            ["the one nearest to the secret 2", "7.50"],
+            ["7 wrong keys, mean to the cover", "28.00"],
+            ["lowest to the cover", "27.00"],
+            ["highest to the secret 1", "9.50"],
+            ["highest to the secret 2", "7.50"],
             ["chance level of the secret 1", "9.00"],
             ["chance level of the secret 2", "8.00"],
         ]
 
     def test_what_was_written_was_opened_again(self) -> None:
         said = " ".join(cell for row in self.table(METRICS) for cell in row)
-        assert "against the plain models: cover 32.0, secret 31.0 dB" in said
+        assert "PSNR to the plain models: cover 32.0, secret 31.0 dB" in said
 
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)
-        assert ["Test views: photos that were not trained on. PSNR, bound, loss and start in dB."] in rows
+        assert ["Test views: photos held out of training. PSNR, bound, loss and start in dB."] in rows
         assert ["Bound: plain 3DGS of as many Gaussians and as many training steps."] in rows
-        assert any(row[0].startswith("Chance level: the stego model itself") for row in rows)
+        assert any(row[0].startswith("Chance level: PSNR of the stego model itself") for row in rows)
         alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
         assert not any(row[0].startswith(("Bound:", "Start:")) for row in self.table(alone))
 
@@ -81,7 +81,7 @@ class TestNumbers:
         assert not any("photo" in cell for row in rows for cell in row if "there are no photos" not in cell)
         assert any("8-bit renders of the given models" in row[0] for row in rows)
         (line,) = (row[0] for row in self.table(replace(METRICS, photos=(True, False))) if "Test" in row[0])
-        assert "photos that were not trained on; for secret 8-bit renders of the given model" in line
+        assert "photos held out of training; for secret 8-bit renders of the given model" in line
 
     def test_a_baseline_of_another_size_has_its_number_of_gaussians_beside_it(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(152_746, None))

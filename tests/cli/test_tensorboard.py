@@ -11,9 +11,9 @@ import pytest
 
 from cli.said import SMALL, Said, assert_refused
 from files.scene_files import write_nerfstudio
-from keyss.cli.tensorboard import FOLDER, reporter
+from keyss.cli.reporting import FOLDER, tensorboard_reporter
 from keyss.files import read_model
-from keyss.fitting.loop import SeveralReporter
+from keyss.fitting.reporting import SeveralReporter
 
 Run = Callable[..., Said]
 
@@ -48,7 +48,7 @@ def test_losses_come_back(keyss: Run, scene: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_two_trainings_at_the_same_time_have_a_run_each(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    cover = reporter(tmp_path, tensorboard=True)
+    cover = tensorboard_reporter(tmp_path)
     assert isinstance(cover, SeveralReporter)
     secret = cover.beside()
     for title, each in (("cover", cover), ("secret", secret)):

@@ -13,8 +13,8 @@ import pytest
 from channels.low_bits.trained_like import trained_like
 from cli.said import SMALL, Said
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.demo import run as demo_run
-from keyss.files.ply import write_ply
+from keyss.demo import OPTIONS, run_demo
+from keyss.files import write_model
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: None) -> Path:
     write_blender(tmp_path / "a", count=3, channels=3)
     write_nerfstudio(tmp_path / "b", count=4)
     (tmp_path / "own").mkdir()
-    write_ply(tmp_path / "own" / "cover.ply", trained_like(400, 1))
-    write_ply(tmp_path / "own" / "secret.ply", trained_like(100, 2))
+    write_model(tmp_path / "own" / "cover.ply", trained_like(400, 1))
+    write_model(tmp_path / "own" / "secret.ply", trained_like(100, 2))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -48,19 +48,19 @@ def tour(keyss: Callable[..., Said]) -> None:
     small = " ".join(SMALL)
     done("keygen -o key.txt")
     done(f"fit a -o plain {small}")
-    done(f"hide --publish any --cover a --secret b --key-file key.txt --min-psnr=0 -o learned {small}")
+    done(f"hide --publish any --cover a --secret b --key-file key.txt --min-psnr=0 -o hidden {small}")
     models = "--cover own/cover.ply --secret own/secret.ply --width 16 --device cpu"
     done(f"hide --method carry {models} --key-file key.txt -o carried")
-    for run in ("learned", "carried"):
+    for run in ("hidden", "carried"):
         done(f"reveal {run}/publish/stego.ply --key-file key.txt -o {run}.ply")
         done(f"verify {run}/publish/stego.ply --key-file key.txt")
         done(f"evaluate {run} --key-file key.txt")
         done(f"info {run}/publish/stego.ply")
-    done("render learned.ply --cameras b -o images --split all")
+    done("render hidden.ply --cameras b -o images --split all")
     done("steganalyze images --csv scores.csv")
-    done("audit learned --key-file key.txt --only parameters --controls 2 --device cpu")
-    done("report learned")
-    done("info learned --json")
+    done("audit hidden --key-file key.txt --only parameters --controls 2 --device cpu")
+    done("audit hidden --report-only")
+    done("info hidden --json")
 
 
 def readable_by_others(folder: Path) -> set[str]:
@@ -75,7 +75,7 @@ def published(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.glob("**/publish/*")}
 
 
-PUBLISHED = {"learned/publish/stego.ply", "carried/publish/stego.ply"}
+PUBLISHED = {"hidden/publish/stego.ply", "carried/publish/stego.ply"}
 
 
 def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[..., Said], mine: Path) -> None:
@@ -87,17 +87,17 @@ def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[...,
     shutil.rmtree(mine / "own")  # written by keyss's own writer
     assert readable_by_others(mine) == PUBLISHED
     private = {path.parent.name: path for path in mine.glob("**/private")}
-    assert private.keys() == {"plain", "learned", "carried", "images"}
+    assert private.keys() == {"plain", "hidden", "carried", "images"}
     for path in private.values():
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
     for name in ("audit/audit.json", "report.html", "metrics.json", "config.json", "secret-1.ply"):
-        assert (mine / "learned" / "private" / name).is_file()
+        assert (mine / "hidden" / "private" / name).is_file()
     expected = {
         "key.txt",
         "plain",
-        "learned",
+        "hidden",
         "carried",
-        "learned.ply",
+        "hidden.ply",
         "carried.ply",
         "images",
         "scores.csv",
@@ -109,9 +109,8 @@ def test_nor_does_the_demo_show_more(
     keyss: Callable[..., Said], tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A demo of a few steps on small photos."""
-    fit = demo_run.OPTIONS.with_fit(iterations=20, max_gaussians=1500)
-    small = {"options": fit, "views": 8, "width": 32, "height": 24}
-    monkeypatch.setattr(demo_run.run_demo, "__kwdefaults__", demo_run.run_demo.__kwdefaults__ | small)
+    small = {"options": OPTIONS.with_fit(iterations=20, max_gaussians=1500), "width": 32}
+    monkeypatch.setattr(run_demo, "__kwdefaults__", run_demo.__kwdefaults__ | small)
     said = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
     assert said.status == 0, said.err
     assert published(tmp_path) == {"demo/publish/stego.ply"}

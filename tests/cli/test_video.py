@@ -13,14 +13,13 @@ import numpy.typing as npt
 import pytest
 import torch
 
+import keyss as library
 from cli.said import Said, assert_refused
 from files.scene_files import write_nerfstudio
-from keyss import api, load_scene, write_model
-from keyss._verbs.filming import shown, wiped
+from keyss import load_scene, write_model
+from keyss.api.filming import shown, wiped
 from keyss.core import Camera, Gaussians, UsageError
-from keyss.rendering import render
-from keyss.rendering.orbit import look_at, middle_and_radius
-from keyss.rendering.paths import around, circle, through
+from keyss.rendering import around, circle, look_at, middle_and_radius, render, through
 from tiny_scenes import random_gaussians
 
 Run = Callable[..., Said]
@@ -210,7 +209,7 @@ def test_an_interrupted_film_leaves_nothing(
     def interrupted(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("keyss._verbs.filming.render", interrupted)
+    monkeypatch.setattr("keyss.api.filming.render", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        api.render_video(files / "a.ply", tmp_path / "a.mp4", width=32)
+        library.render(files / "a.ply", video=tmp_path / "a.mp4", width=32)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""`keyss view` and `keyss export-html`: what they refuse, and what they say."""
+"""`keyss view`, with `-o` too: what they refuse, and what they say."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from cli.said import Said, assert_refused
-from keyss.core.gaussians import Gaussians
-from keyss.files.models import read_model, write_model
-from keyss.files.ply import write_ply
+from keyss.core import Gaussians
+from keyss.files import read_model, write_model
 from tiny_scenes import random_gaussians
 
 
 def test_what_is_no_model_is_refused(keyss: Callable[..., Said], tmp_path: Path) -> None:
     (tmp_path / "model.txt").write_text("not a model")
     (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n")
-    for command in (["view"], ["export-html", "-o", str(tmp_path / "page.html")]):
+    for command in (["view"], ["view", "-o", str(tmp_path / "page.html")]):
         assert_refused(keyss(*command, str(tmp_path / "model.txt")), 4, "expected a 3DGS model")
         assert_refused(keyss(*command, str(tmp_path / "text.ply")), 4, "not a 3DGS model")
         assert_refused(keyss(*command, str(tmp_path / "nowhere.ply")), 4, "no such file")
@@ -33,14 +32,14 @@ def test_what_the_page_does_not_read_is_converted_and_said(
     folder = write_sog_folder(tmp_path / "scene", random_gaussians(5))
     for model, name in ((text, "text.ply"), (folder, "scene.sog")):
         out = tmp_path / f"{name}-page"
-        said = keyss("export-html", model, "-o", out)
+        said = keyss("view", model, "-o", out)
         assert said.status == 0, said.err
         assert f"the page does not read {'a .ply in text' if model == text else 'a SOG'}" in said.err
         assert read_model(out / name).digest() == read_model(model).digest()
 
 
 def write_in_text(path: Path, model: Gaussians) -> Path:
-    write_ply(path, model)
+    write_model(path, model)
     header, _, rows = path.read_bytes().partition(b"end_header\n")
     values = np.frombuffer(rows, "<f4").reshape(len(model), -1)
     lines = "\n".join(" ".join(f"{each:.9g}" for each in row) for row in values)
@@ -56,9 +55,9 @@ def write_sog_folder(folder: Path, model: Gaussians) -> Path:
 
 
 def test_a_page_is_written_and_not_over_another(keyss: Callable[..., Said], tmp_path: Path) -> None:
-    write_ply(tmp_path / "model.ply", random_gaussians(5))
+    write_model(tmp_path / "model.ply", random_gaussians(5))
     out = tmp_path / "page.html"
-    said = keyss("export-html", tmp_path / "model.ply", "-o", out)
+    said = keyss("view", tmp_path / "model.ply", "-o", out)
     assert said.status == 0, said.err
     assert said.out == f"{out}: {out.stat().st_size / 1e6:.1f} MB; opens in any browser\n"
-    assert_refused(keyss("export-html", tmp_path / "model.ply", "-o", out), 5, "--overwrite")
+    assert_refused(keyss("view", tmp_path / "model.ply", "-o", out), 5, "--overwrite")

@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from keyss.core import Camera
-from keyss.core.alignment import align, focus_point, up_direction
-from keyss.core.scene import camera_positions
-from keyss.core.similarity import Similarity
+from keyss.core import Camera, Similarity, align, camera_positions, focus_point, up_direction
 
 
 def looking_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> Camera:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from keyss.core.pruning_compensation import compensate_pruning
+from keyss.core import compensate_pruning
 from tiny_scenes import random_gaussians
 
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from keyss.core import Camera, Gaussians
-from keyss.core.similarity import Similarity
+from keyss.core import Camera, Gaussians, Similarity
 
 
 def random_similarity(seed: int) -> Similarity:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from keyss import api as verbs
+import keyss
+from keyss import CarryOptions, demo
 from keyss.core import OutputError
-from keyss.demo import run as demo
-from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import Interrupted
-from keyss.methods.learned.options import LearnedOptions
-from keyss.runs.metrics import HideMetrics
-from keyss.runs.records import read_record
+from keyss.files import load_scene
+from keyss.fitting import FitConfig, Interrupted
+from keyss.runs import HideMetrics, read_record
 
 SMALL: dict[str, Any] = {
     # So small a model has no room for what its key opens.
-    "options": LearnedOptions(fit=FitConfig(iterations=30, max_gaussians=300), publish="any"),
-    "views": 16,
+    "options": CarryOptions(fit=FitConfig(iterations=30, max_gaussians=300), publish="any"),
     "width": 32,
-    "height": 24,
     "device": "cpu",
 }
 
@@ -51,13 +46,13 @@ def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResu
 
 def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
     out, _ = run
-    verbs.reveal(out / "publish" / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
+    keyss.reveal(out / "publish" / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
     assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
 
 
 def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
-    found = verbs.reveal(run[0] / "web.spz", "demo-key-3")
-    assert len(found) == len(verbs.reveal(run[0] / "publish" / "stego.ply", "demo-key-3"))
+    found = keyss.reveal(run[0] / "web.spz", "demo-key-3").gaussians
+    assert len(found) == len(keyss.reveal(run[0] / "publish" / "stego.ply", "demo-key-3").gaussians)
 
 
 def test_one_seed_gives_the_same_bytes_in_another_place(
@@ -69,7 +64,7 @@ def test_one_seed_gives_the_same_bytes_in_another_place(
 
 
 def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
-    run: tuple[Path, demo.DemoResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "stego.ply").write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
@@ -80,11 +75,7 @@ def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
     def interrupted(*args: object, **kwargs: object) -> None:
         raise Interrupted(tmp_path / "checkpoint", 5)
 
-    def photos(folder: Path, which: str, **options: object) -> None:
-        shutil.copytree(run[0] / "scenes" / which, folder)
-
-    monkeypatch.setattr(verbs, "hide", interrupted)
-    monkeypatch.setattr(demo, "write_demo_scene", photos)
+    monkeypatch.setattr(keyss, "hide", interrupted)
     with pytest.raises(KeyboardInterrupt) as caught:
         demo.run_demo(tmp_path, overwrite=True, **SMALL)
     assert not isinstance(caught.value, Interrupted)
@@ -92,6 +83,15 @@ def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
     with pytest.raises(KeyboardInterrupt):
         demo.run_demo(tmp_path / "new", **SMALL)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("which", [demo.COVER, demo.SECRET])
+def test_the_scenes_that_come_with_the_package(which: str) -> None:
+    scene = load_scene(demo.FOLDER / which)
+    assert (len(scene.train), len(scene.test)) == (42, 6)
+    assert {tuple(view.image.shape) for view in scene.views} == {(120, 160, 3)}
+    assert scene.points is not None
+    assert scene.points.shape == (3000, 3)
 
 
 def test_contact_sheet() -> None:

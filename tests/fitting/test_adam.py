@@ -12,9 +12,7 @@ from gsplat.strategy.ops import duplicate, remove, split
 from torch import Tensor
 
 from keyss.core import BackendError
-from keyss.fitting.adam import RowAdam
-from keyss.fitting.config import FitConfig
-from keyss.fitting.parameters import Parameters, make_optimizers, to_parameters
+from keyss.fitting import FitConfig, Parameters, RowAdam, make_optimizers, to_parameters
 from keyss.rendering import resolve_device
 from tiny_scenes import random_gaussians
 

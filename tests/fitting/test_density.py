@@ -6,9 +6,7 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 
-from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy
-from keyss.fitting.parameters import Optimizers, Parameters, make_optimizers, to_parameters
+from keyss.fitting import CappedStrategy, FitConfig, Optimizers, Parameters, make_optimizers, to_parameters
 from tiny_scenes import random_gaussians
 
 COUNT = 100

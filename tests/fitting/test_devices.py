@@ -10,9 +10,8 @@ import torch
 
 from fitting.test_plain import InterruptAt
 from fitting.training_together import FIT, RUNS, trained
-from keyss.core.errors import Interrupted
-from keyss.fitting.checkpoint import load_checkpoint
-from keyss.fitting.plain import PlainRun, fit_scene
+from keyss.core import Interrupted
+from keyss.fitting import PlainRun, fit_scene, load_checkpoint
 from tiny_scenes import tiny_scene
 
 

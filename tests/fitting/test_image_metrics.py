@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from keyss.core import View
-from keyss.fitting.image_metrics import psnr, quality, subsample_views
+from keyss.fitting import psnr, quality, subsample_views
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
 

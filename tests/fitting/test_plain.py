@@ -9,11 +9,17 @@ import pytest
 import torch
 
 from keyss.core import Gaussians, InputError, UsageError
-from keyss.fitting.checkpoint import load_checkpoint, save_checkpoint, steps_done
-from keyss.fitting.config import FitConfig
-from keyss.fitting.image_metrics import mean_psnr
-from keyss.fitting.loop import Interrupted, SilentReporter
-from keyss.fitting.plain import PlainRun, fit_scene
+from keyss.fitting import (
+    FitConfig,
+    Interrupted,
+    PlainRun,
+    SilentReporter,
+    fit_scene,
+    load_checkpoint,
+    mean_psnr,
+    save_checkpoint,
+    steps_done,
+)
 from tiny_scenes import tiny_scene
 
 CONFIG = FitConfig(
@@ -27,13 +33,17 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
 
 
 class InterruptAt(SilentReporter):
-    """Presses Ctrl-C at one iteration."""
+    """Presses Ctrl-C at one iteration, of the training whose title begins with `stage`."""
 
-    def __init__(self, iteration: int) -> None:
-        self.iteration = iteration
+    def __init__(self, iteration: int, stage: str = "") -> None:
+        self.iteration, self.stage = iteration, stage
+        self.title = ""
+
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        self.title = title
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
-        if iteration == self.iteration:
+        if iteration == self.iteration and self.title.startswith(self.stage):
             os.kill(os.getpid(), signal.SIGINT)
 
 

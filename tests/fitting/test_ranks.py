@@ -15,12 +15,8 @@ import torch
 
 from fitting import training_together
 from fitting.training_together import FIT, RUNS, trained
-from keyss.core import UsageError
-from keyss.core.errors import OtherProcessError
-from keyss.fitting import ranks
-from keyss.fitting.checkpoint import State, load_checkpoint
-from keyss.fitting.config import FitConfig
-from keyss.fitting.ranks import Ranks, here, joined
+from keyss.core import OtherProcessError, UsageError
+from keyss.fitting import FitConfig, Ranks, State, here, joined, load_checkpoint, ranks
 
 pytestmark = pytest.mark.counted
 

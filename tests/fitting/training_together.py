@@ -11,17 +11,11 @@ from typing import Any
 import torch
 
 import keyss  # noqa: F401  before anything imports torch
-from keyss.core.similarity import Similarity
-from keyss.fitting.checkpoint import save_checkpoint
-from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import TrainingRun, train
-from keyss.fitting.plain import PlainRun
-from keyss.fitting.ranks import here, joined
+from keyss.core import Similarity
+from keyss.fitting import FitConfig, PlainRun, TrainingRun, here, joined, save_checkpoint, train
 from keyss.keys import random_embeddings
-from keyss.methods.learned.joint import JointRun
-from keyss.methods.learned.options import LearnedOptions
-from keyss.methods.peers.watergs import WaterGsOptions, WaterGsRun
-from keyss.methods.poses import PlacedScene
+from keyss.methods import KeyssOptions, KeyssTraining, PlacedScene
+from keyss.methods.peers.watergs import WaterGsOptions, WaterGsTraining
 from tiny_scenes import random_gaussians, tiny_scene
 
 SEED = 3
@@ -35,23 +29,24 @@ def plain(fit: FitConfig, device: torch.device) -> PlainRun:
     return PlainRun(tiny_scene(), fit, device)
 
 
-def joint(fit: FitConfig, device: torch.device) -> JointRun:
+def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
     """With wrong keys, poses of both scenes, and all attributes decoded."""
-    options = LearnedOptions(
+    options = KeyssOptions(
         fit=fit,
-        start="points",
         mask=("op", "ro", "sc", "xyz", "sh"),
         conditioning="bias",
         common_poses=0.5,
         hidden=(16, 16),
         branch=8,
     )
-    return JointRun(_placed(), list(random_embeddings(1, torch.Generator().manual_seed(0))), options, device)
+    return KeyssTraining(
+        _placed(), list(random_embeddings(1, torch.Generator().manual_seed(0))), options, device
+    )
 
 
-def watergs(fit: FitConfig, device: torch.device) -> WaterGsRun:
+def watergs(fit: FitConfig, device: torch.device) -> WaterGsTraining:
     """A peer with a network, and with parameters that have no gradients at the end."""
-    return WaterGsRun(_placed(), WaterGsOptions(fit=fit, common_poses=0.5), device)
+    return WaterGsTraining(_placed(), WaterGsOptions(fit=fit, common_poses=0.5), device)
 
 
 RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {

@@ -9,8 +9,7 @@ from dataclasses import replace
 import torch
 import torch.nn.functional as F
 
-from keyss.core import Gaussians
-from keyss.core.gaussians import SH_C0
+from keyss.core import SH_C0, Gaussians
 
 
 def lifelike(count: int, seed: int = 0) -> Gaussians:

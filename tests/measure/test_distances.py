@@ -11,8 +11,7 @@ import pytest
 import torch
 from scipy.stats import wasserstein_distance
 
-from keyss.core import Gaussians
-from keyss.core.errors import UsageError
+from keyss.core import Gaussians, UsageError
 from keyss.measure import against_controls, attribute_distances, distances
 from keyss.measure.distances import features
 from measure.lifelike import (
@@ -113,7 +112,7 @@ def test_what_is_constant_or_not_finite_gives_finite_numbers() -> None:
 
 def test_large_models_are_thinned_by_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     exact = attribute_distances(MODEL, doubled_scales(MODEL))
-    monkeypatch.setattr(distances, "MOST", 1000)
+    monkeypatch.setattr(distances, "MAX_GAUSSIANS", 1000)
     runs = [attribute_distances(MODEL, doubled_scales(MODEL), seed=seed) for seed in (4, 4, 5)]
     assert runs[0] == runs[1] != runs[2]
     assert runs[0]["scale"] == pytest.approx(exact["scale"], rel=0.1)

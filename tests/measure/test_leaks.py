@@ -12,20 +12,13 @@ import torch
 from torch import Tensor
 
 import keyss
-from keyss.core import Gaussians, UsageError
-from keyss.core.similarity import Similarity
+from keyss.core import Gaussians, Similarity, UsageError
 from keyss.keys import random_embeddings
-from keyss.measure.leaks.attacks import (
-    THRESHOLDS,
-    Attack,
-    decoder_attack,
-    file_attacks,
-    with_the_key,
-)
-from keyss.measure.leaks.looking import AttackResult, look_for_secret
+from keyss.measure import AttackResult, decoder_attack, file_attacks, look_for_secret
+from keyss.measure.leaks.attacks import THRESHOLDS, Attack, with_the_key
 from keyss.measure.leaks.scores import scores
-from keyss.methods.learned.decoder import RESIDUAL_UNITS, Decoder, DecoderShape
-from keyss.methods.learned.payload import HiddenSecret
+from keyss.methods import Decoder, DecoderShape, HiddenSecret
+from keyss.methods.keyss.decoder import RESIDUAL_UNITS
 from keyss.rendering import render
 from tiny_scenes import random_gaussians, tiny_scene
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from keyss.fitting.image_metrics import psnr, quality
+from keyss.fitting import psnr, quality
 from keyss.measure.leaks.scores import coarse, fit_colours, gradient_correlation, scores
 from tiny_scenes import random_gaussians, tiny_scene
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from keyss.core import Gaussians
-from keyss.measure.leaks.attacks import file_attacks
+from keyss.measure import file_attacks
 from keyss.measure.leaks.views import (
     OPAQUE,
     Attribute,

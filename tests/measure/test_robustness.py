@@ -11,36 +11,31 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss.channels.low_bits import LOW_BITS
-from keyss.core import Gaussians, Scene, UsageError, WrongKeyError
-from keyss.core.errors import KeyssWarning
-from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import mean_psnr, quality
-from keyss.measure.robustness.changes import (
-    NOISY,
-    half_floats,
-    noise,
-    purification,
-    random_pruning,
-)
-from keyss.measure.robustness.survival import (
+from keyss import CarryOptions
+from keyss.channels import LOW_BITS
+from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
+from keyss.fitting import mean_psnr, quality
+from keyss.measure import (
     BreakdownPoint,
     ChangedQuality,
     ChangeResult,
-    First,
     Reopened,
     Reopener,
     StrengthLosses,
     breakdown_points,
-    default_changes,
+    half_floats,
     mean_over_draws,
-    robustness,
+    measure_robustness,
+    noise,
+    purification,
+    random_pruning,
 )
-from keyss.methods.records.encoding import record_request
-from keyss.methods.registry import open_model
+from keyss.measure.robustness.changes import NOISY
+from keyss.measure.robustness.survival import First, default_changes
+from keyss.methods import open_model, record_request
 from methods.carry.carried import embed
-from methods.learned.hiding import hide_scenes
-from methods.learned.test_joint import CONFIG, _moved, _scenes
+from methods.carry.test_refit import TINY
+from methods.hiding import hide_scenes, moved, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "the right key"
@@ -56,7 +51,7 @@ def test_losses_are_differences_of_quality(scene: Scene) -> None:
     model = random_gaussians(seed=0)
     changes = [random_pruning(0.5, seed) for seed in (0, 1)]
     steps: list[tuple[int, int, str]] = []
-    rows = robustness(
+    rows = measure_robustness(
         model, [Reopened], scene, [scene], changes=changes, progress=lambda *step: steps.append(step)
     )
     assert [row.attack for row in rows] == ["none", "random pruning", "random pruning"]
@@ -69,12 +64,12 @@ def test_losses_are_differences_of_quality(scene: Scene) -> None:
         assert row.secrets == (row.cover,)
         assert row.gaussians == 100
     assert [step[:2] for step in steps] == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert robustness(model, [Reopened], scene, [scene], changes=changes) == rows
+    assert measure_robustness(model, [Reopened], scene, [scene], changes=changes) == rows
 
 
 def test_views_are_bounded() -> None:
     scene, model = tiny_scene(0, views=16), random_gaussians(150, seed=0)
-    (row,) = robustness(model, [], scene, [], changes=[], views=1)
+    (row,) = measure_robustness(model, [], scene, [], changes=[], views=1)
     assert row.cover is not None
     assert row.cover.psnr == mean_psnr(model, scene.test[:1], scene.background)
 
@@ -83,23 +78,23 @@ def test_what_is_lost_looks_like_the_cover_from_where_the_secret_is(scene: Scene
     """The secret's cameras are the cover's in another frame, so that chance level is the cover's quality."""
     model = random_gaussians(seed=0)
     frame = Similarity(2.0, translation=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
-    elsewhere = _moved(scene, frame.inverse())
+    elsewhere = moved(scene, frame.inverse())
 
     def reopen(changed: Gaussians) -> Reopened:
         if len(changed) < len(model):
             raise WrongKeyError("this key opens nothing here")
         return Reopened(frame.inverse().apply_gaussians(changed), frame)
 
-    rows = robustness(model, [reopen], scene, [elsewhere], changes=[random_pruning(0.2)])
+    rows = measure_robustness(model, [reopen], scene, [elsewhere], changes=[random_pruning(0.2)])
     (secret,) = rows[1].secrets
     assert not secret.opens
     assert secret.error == "this key opens nothing here"
     assert rows[1].cover is not None
     assert secret.psnr == pytest.approx(rows[1].cover.psnr, abs=0.01)
     with pytest.raises(UsageError, match="each of 1 secret"):
-        robustness(model, [], scene, [scene], changes=[])
+        measure_robustness(model, [], scene, [scene], changes=[])
     with pytest.raises(WrongKeyError):
-        robustness(model[:5], [reopen], scene, [elsewhere], changes=[])
+        measure_robustness(model[:5], [reopen], scene, [elsewhere], changes=[])
 
 
 def row(attack: str, strength: float, cover: float, *secrets: tuple[float, bool]) -> ChangeResult:
@@ -183,29 +178,33 @@ def same(a: Gaussians, b: Gaussians) -> bool:
 
 @pytest.fixture(scope="module")
 def pair() -> tuple[list[Scene], list[Gaussians]]:
-    scenes, _ = _scenes()
+    scenes, _ = three_scenes()
     return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
 
 
 @pytest.mark.parametrize("publish", ["ply", "any"])
-def test_a_learned_secret_without_low_bits(
+def test_a_refitted_secret_without_low_bits(
     publish: Literal["ply", "any"], pair: tuple[list[Scene], list[Gaussians]]
 ) -> None:
     scenes, models = pair
-    config = replace(CONFIG, publish=publish, fit=replace(CONFIG.fit, iterations=5, max_gaussians=2000))
+    config = CarryOptions(
+        fit=replace(TINY, iterations=5, max_gaussians=2000), publish=publish, refit="always"
+    )
     hidden = hide_scenes(scenes, [KEY], config, plains=models)
     reopen = Reopener(KEY, open_model)
     assert KEY not in repr(reopen)
-    revealed = keyss.reveal(hidden.stego, KEY)
+    revealed = keyss.reveal(hidden.stego, KEY).gaussians
     assert same(reopen(hidden.stego).gaussians, revealed)
 
     changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
-    _, pruned, rounded, purified = robustness(hidden.stego, [reopen], scenes[0], scenes[1:], changes=changes)
+    _, pruned, rounded, purified = measure_robustness(
+        hidden.stego, [reopen], scenes[0], scenes[1:], changes=changes
+    )
     if publish == "any":
         again = revealed  # all of it, or nothing
     else:
         with pytest.warns(KeyssWarning, match="of 200 Gaussians"):
-            again = keyss.reveal(changes[0](hidden.stego), KEY)
+            again = keyss.reveal(changes[0](hidden.stego), KEY).gaussians
     assert pruned.secrets[0].opens
     assert pruned.secrets[0].psnr == mean_psnr(again, scenes[1].test, scenes[1].background)
     assert rounded.secrets[0].opens == (publish == "any")

@@ -11,8 +11,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from keyss.core import Gaussians
-from keyss.core.errors import UsageError
+from keyss.core import Gaussians, UsageError
 from keyss.measure import composite_score, sinkhorn_3d
 from measure.lifelike import (
     doubled_scales,

@@ -14,13 +14,13 @@ import torch
 from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
-from keyss.files.models import write_model
+from keyss.files import write_model
 from keyss.files.ply import write_ply
+from keyss.measure import FileSize, ReaderResult, Reopened, Reopener, measure_speed, readers, render_time
 from keyss.measure import speed as module
-from keyss.measure.robustness.survival import Reopened, Reopener
-from keyss.measure.speed import FileSize, ReaderResult, readers, render_time, reveal_seconds, speed
+from keyss.measure.speed import reveal_seconds
+from keyss.methods import open_model
 from keyss.methods.base import Opened
-from keyss.methods.registry import open_model
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -163,7 +163,7 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         time.sleep(0.05)
         return open_model(model, key)
 
-    found = speed(
+    found = measure_speed(
         tmp_path / "stego.ply",
         [Reopener(KEY, slowly)],
         scenes,

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from keyss.cli import main
-from keyss.core.errors import InputError, UsageError
-from keyss.measure.stegexpose import csv_bytes, score_file, steganalyze
+from keyss.core import InputError, UsageError
+from keyss.measure import csv_bytes, score_file, steganalyze
 from measure.test_stegexpose import smooth, with_payload
 
 Run = Callable[..., tuple[int, str, str]]

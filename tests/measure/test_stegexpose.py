@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.stats import chi2
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core import InputError, UsageError
 from keyss.files import images
+from keyss.measure import score_file, score_image
 from keyss.measure.lsb_detectors import _rate
-from keyss.measure.stegexpose import DETECTORS, Scores, read_pixels, score_file, score_image
+from keyss.measure.stegexpose import DETECTORS, Scores, read_pixels
 from measure import stegexpose_literal as literal
 
 Pixels = npt.NDArray[np.uint8]

@@ -10,11 +10,9 @@ import pytest
 import torch
 from sklearn.metrics import roc_auc_score
 
-from keyss.core import Gaussians
-from keyss.core.errors import UsageError
-from keyss.measure import two_sample_against_controls, two_sample_auc
-from keyss.measure.roc import delong
-from keyss.measure.two_sample import AucInterval
+from keyss.core import Gaussians, UsageError
+from keyss.measure import Auc, two_sample_against_controls, two_sample_auc
+from keyss.measure.auc import delong
 from measure.lifelike import (
     doubled_scales,
     lifelike,
@@ -30,7 +28,7 @@ OTHER = lifelike(800, seed=1).with_sh_degree(1)
 
 
 def test_a_model_cannot_be_told_from_itself() -> None:
-    assert two_sample_auc(MODEL, MODEL) == AucInterval(0.5, 0.5, 0.5)
+    assert two_sample_auc(MODEL, MODEL) == Auc(0.5, 0.5, 0.5)
 
 
 def test_nor_from_itself_shuffled_and_hardly_changed() -> None:

@@ -9,21 +9,19 @@ import pytest
 from torch import Tensor
 
 from keyss.core import Gaussians
-from keyss.measure.leaks.attacks import search_embeddings
-from keyss.methods.learned.options import PRESETS
-from keyss.methods.learned.payload import HiddenSecret
-from methods.learned.hiding import Hidden, hide_scenes
-from methods.learned.test_joint import KEYS, PAPER, _psnr, _scenes
+from keyss.measure import search_embeddings
+from keyss.methods import HiddenSecret
+from methods.hiding import Hidden, hide_scenes, psnr_in, three_scenes
+from methods.keyss.hiding import KEYS, PUBLISHED
 
 RESTARTS = 4
 
 
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
-    scenes, models = _scenes()
-    large = {"hidden": PRESETS["paper"].hidden, "branch": PRESETS["paper"].branch}
-    config = replace(PAPER, **large).with_fit(iterations=300)  # type: ignore[arg-type]
-    return hide_scenes(scenes, KEYS, config, plains=models)
+    scenes, models = three_scenes()
+    options = replace(PUBLISHED, hidden=None, branch=None).with_fit(iterations=300)
+    return hide_scenes(scenes, KEYS, options, plains=models)
 
 
 def _decoder(secret: HiddenSecret) -> Callable[[Gaussians, Tensor], Gaussians]:
@@ -33,16 +31,16 @@ def _decoder(secret: HiddenSecret) -> Callable[[Gaussians, Tensor], Gaussians]:
 @pytest.fixture(scope="module")
 def found(hidden: Hidden) -> list[Tensor]:
     """What the search finds on each secret's decoder."""
-    return [search_embeddings(_decoder(secret), hidden.stego, restarts=RESTARTS) for secret in hidden.secrets]
+    return [search_embeddings(_decoder(secret), hidden.stego, restarts=RESTARTS) for secret in hidden.opened]
 
 
 def _gain(hidden: Hidden, found: list[Tensor], decoder_of: int, shown: int) -> list[float]:
     """By how many dB the embeddings found on one decoder show a secret better, best score first."""
-    scenes, _ = _scenes()
-    owner, target = hidden.secrets[decoder_of], hidden.secrets[shown]
+    scenes, _ = three_scenes()
+    owner, target = hidden.opened[decoder_of], hidden.opened[shown]
 
     def psnr(model: Gaussians) -> float:
-        return _psnr(target.frame.inverse().apply_gaussians(model), scenes[shown + 1])
+        return psnr_in(target.frame.inverse().apply_gaussians(model), scenes[shown + 1])
 
     return [
         psnr(owner.decode(hidden.stego, embedding)) - psnr(hidden.stego) for embedding in found[decoder_of]

@@ -8,8 +8,7 @@ import torch
 
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.core import Gaussians
-from keyss.methods.decoy import Decoy
-from keyss.methods.registry import open_model
+from keyss.methods import Decoy, open_model
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits")
 

@@ -10,10 +10,10 @@ import torch
 
 from channels.low_bits.trained_like import keys, trained_like
 from files.test_ply import assert_same_bits
-from keyss.channels.low_bits import LOW_BITS, LowBitsReader
+from keyss.channels import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians, InputError
 from keyss.methods.dither import dither
-from keyss.rendering.difference import cost
+from keyss.rendering import psnr_between
 from methods.carry.carried import embed_derived, extract_derived
 
 ENTROPY = bytes(32)
@@ -80,9 +80,9 @@ def test_the_cost_is_what_pictures_show(model: Gaussians) -> None:
         model.opacity_logits[:500],
         model.sh[:500],
     )
-    assert cost(small, small) == pytest.approx(120)
+    assert psnr_between(small, small) == pytest.approx(120)
     steps = small.map(_steps)
-    assert 30 < cost(steps, dither(steps, ENTROPY)) < 80
+    assert 30 < psnr_between(steps, dither(steps, ENTROPY)) < 80
 
 
 def test_other_entropy_gives_other_bits(model: Gaussians) -> None:

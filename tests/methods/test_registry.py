@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pytest
@@ -16,24 +16,22 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, Secret
-from keyss.channels.base import Content, Payload
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels import LOW_BITS, Content, Payload
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
-from keyss.methods import registry
-from keyss.methods.base import (
+from keyss.methods import (
     Capabilities,
     CommandLineOption,
     Context,
     Frame,
-    KeyedSource,
     MethodOptions,
     Remains,
-    SceneInput,
     Source,
     Stego,
+    encode_all,
+    registry,
 )
-from methods.learned.hiding import some_secret
+from methods.keyss.hiding import some_secret
 from tiny_scenes import random_gaussians
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -43,9 +41,9 @@ KEY = "a key of many characters: 93hXmQ2"
 class WholeOptions(MethodOptions):
     """Of the method below."""
 
-    most: Annotated[int, CommandLineOption("Gaussians of a secret at most.", metavar="N", alias="limit")] = (
-        100
-    )
+    method: ClassVar[str] = "whole"
+
+    most: Annotated[int, CommandLineOption("Gaussians of a secret at most.", metavar="N")] = 100
 
 
 @dataclass(frozen=True)
@@ -71,39 +69,41 @@ class WholeMethod:
 
     name = "whole"
     summary = "embed the floats themselves"
-    trains = False
     most_secrets = 1
     capabilities = Capabilities()
     options = WholeOptions
-    presets: Mapping[str, WholeOptions] = {"small": WholeOptions(), "large": WholeOptions(most=1000)}
 
-    def prepare(self, inputs: Sequence[SceneInput], options: WholeOptions) -> WholeOptions:
-        model = inputs[1].model
+    def prepare(self, sources: Sequence[Source], options: WholeOptions) -> WholeOptions:
+        model = sources[1].given
         if model is not None and len(model) > options.most:
             raise UsageError(f"expected at most {options.most} Gaussians, got {len(model)}")
         return options
 
     def hide(
-        self, cover: Source, secrets: Sequence[KeyedSource], options: WholeOptions, context: Context
+        self, cover: Source, secrets: Sequence[Source], options: WholeOptions, context: Context
     ) -> Stego:
         (secret,) = secrets
-        model = secret.source.model
+        model = secret.model
         columns = [getattr(model, each.name) for each in fields(Gaussians)]
         rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
         payload = Payload("whole", rows.numpy().tobytes())
         stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])
-        return Stego(stego, (self.unpack(payload),), 0.0, details={"floats": rows.numel()})
+        return Stego(stego, (unpack(payload),), 0.0, details={"floats": rows.numel()})
 
-    def unpack(self, content: Content) -> OpenedWhole:
-        assert isinstance(content, Payload)
-        rows = torch.from_numpy(np.frombuffer(content.data, np.float32).reshape(-1, 14).copy())
-        means, quats, scales, logits, sh = rows.split((3, 4, 3, 1, 3), dim=1)
-        return OpenedWhole(Gaussians(means, quats, scales, logits[:, 0], sh[:, None]))
+
+def unpack(content: Content) -> OpenedWhole:
+    assert isinstance(content, Payload)
+    rows = torch.from_numpy(np.frombuffer(content.data, np.float32).reshape(-1, 14).copy())
+    means, quats, scales, logits, sh = rows.split((3, 4, 3, 1, 3), dim=1)
+    return OpenedWhole(Gaussians(means, quats, scales, logits[:, 0], sh[:, None]))
+
+
+METHOD = WholeMethod()
 
 
 @pytest.fixture(autouse=True)
 def entered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registry.METHODS, "whole", WholeMethod())
+    monkeypatch.setitem(registry.METHODS, "whole", registry.Modules(__name__, __name__))
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
     assert secret_quality.psnr == pytest.approx(plain.psnr, abs=1e-3)
     assert result.metrics.details == {"floats": 60 * 14}
     assert keyss.evaluate(tmp_path / "run", [KEY]) == result.metrics
-    revealed = keyss.reveal(tmp_path / "run" / "publish" / "stego.ply", KEY)
+    revealed = keyss.reveal(tmp_path / "run" / "publish" / "stego.ply", KEY).gaussians
     assert torch.equal(revealed.means, random_gaussians(60, sh_degree=0).means)
     with pytest.raises(WrongKeyError):
         keyss.reveal(result.stego, "wrong")
@@ -141,19 +141,17 @@ def test_from_the_command_line(
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     monkeypatch.setenv("KEYSS_KEY", KEY)
-    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("COLUMNS", "120")
     with pytest.raises(SystemExit):
         main(["hide", "--method", "whole", "--help"])
     said = capsys.readouterr().out
-    assert "--limit N" in said
     assert "--most N" in said
-    assert "{small,large}" in said
     assert "whole: embed the floats themselves" in " ".join(said.split())
     hide = ["hide", "--method", "whole", "--cover", str(models[0]), "--secret", str(models[1])]
     run = str(tmp_path / "run")
-    assert main([*hide, "--width", "24", "--limit", "59", "-o", run]) == 2
+    assert main([*hide, "--width", "24", "--most", "59", "-o", run]) == 2
     assert "expected at most 59" in capsys.readouterr().err
-    assert main([*hide, "--width", "24", "--limit", "60", "-o", run]) == 0
+    assert main([*hide, "--width", "24", "--most", "60", "-o", run]) == 0
     assert "floats: 840" in capsys.readouterr().out
     config = json.loads((tmp_path / "run" / "private" / "config.json").read_text())
     assert (config["method"], config["options"]["most"]) == ("whole", 60)
@@ -173,31 +171,21 @@ def test_a_method_that_this_program_does_not_have_is_named(
         keyss.reveal(stego, KEY)
     with pytest.raises(InputError, match="'whole'"):
         keyss.evaluate(tmp_path / "run", [KEY])
-    with pytest.raises(UsageError, match="learned or carry"):
+    with pytest.raises(UsageError, match="carry or keyss"):
         keyss.hide(cover, [Secret(secret, KEY)], method="whole")
     with pytest.raises(UsageError, match="WholeOptions"):
         keyss.hide(cover, [Secret(secret, KEY)], method=WholeOptions())
 
 
-@pytest.mark.parametrize(
-    ("method", "kind", "expected"),
-    [
-        ("learned", "payload", "HiddenSecret"),
-        ("learned", "records", "CarriedSecret"),
-        ("carry", "records", "CarriedSecret"),
-    ],
-)
-def test_what_lies_in_a_model_tells_its_method(method: str, kind: str, expected: str) -> None:
+@pytest.mark.parametrize(("method", "expected"), [("keyss", "HiddenSecret"), ("carry", "CarriedSecret")])
+def test_what_lies_in_a_model_tells_its_method(method: str, expected: str) -> None:
     """One reading of the low bits serves all methods."""
-    from keyss.methods.learned.payload import pack_secret
-    from keyss.methods.records.encoding import encode_all
-
     prepared = LOW_BITS.prepare(trained_like(2500))
     content: dict[str, Callable[[], Any]] = {
-        "payload": lambda: Payload(method, pack_secret(some_secret(prepared.cover))),
-        "records": lambda: encode_all(prepared, [trained_like(100, 1)], method)[0],
+        "keyss": lambda: some_secret(prepared.cover).payload(),
+        "carry": lambda: encode_all(prepared, [trained_like(100, 1)])[0],
     }
-    stego = prepared.embed([(KEY, content[kind]())])
+    stego = prepared.embed([(KEY, content[method]())])
     opened = registry.open_model(stego, KEY)
     assert type(opened).__name__ == expected
     assert 0 < len(opened.reveal(stego)) <= 2500
@@ -206,17 +194,17 @@ def test_what_lies_in_a_model_tells_its_method(method: str, kind: str, expected:
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("learned", {"incorrect_every": 0}),
-        *((name, {"secret_weight": 0.0}) for name in ("learned", "3dgs-sh", "gs-hider")),
-        *((name, {"cover_weight": float("nan")}) for name in ("learned", "3dgs-decoder")),
+        ("keyss", {"incorrect_every": 0}),
+        *((name, {"secret_weight": 0.0}) for name in ("keyss", "3dgs-sh", "gs-hider")),
+        *((name, {"cover_weight": float("nan")}) for name in ("keyss", "3dgs-decoder")),
     ],
 )
 def test_what_would_be_divided_by_nothing_is_refused(name: str, changes: dict[str, float]) -> None:
-    options = next(iter(registry.METHODS[name].presets.values()))
+    options = registry.get(name).options()
     with pytest.raises(UsageError, match=next(iter(changes))):
         replace(options, **changes)
 
 
 def test_opacities_that_would_never_be_mapped_are_refused() -> None:
     with pytest.raises(UsageError, match="before growth stops"):
-        registry.METHODS["watergs"].presets["best"].with_fit(iterations=1)
+        registry.get("watergs").options.preset("default").with_fit(iterations=1)

@@ -24,7 +24,7 @@ assert images.max() > 0.9
 
 LIST_COMPILED = """
 import sys
-import keyss.rendering
+import keyss.rendering.cpu.rasterization
 from numba.core.dispatcher import Dispatcher
 kernels = {
     f"{name}.{function}": kernel

@@ -9,13 +9,10 @@ import msgspec
 import pytest
 
 import keyss
-from keyss import CarryOptions, FitConfig, LearnedOptions, Secret
-from keyss.fitting import plain
-from keyss.fitting.plain import PlainRun
-from keyss.methods import peers, registry
-from keyss.methods.base import MethodOptions, Training
-from keyss.methods.plain_models import Bound
-from keyss.runs.metrics import HideMetrics
+from keyss import CarryOptions, FitConfig, Secret
+from keyss.fitting import PRESETS, PlainRun, plain
+from keyss.methods import Bound, Training, registry
+from keyss.runs import HideMetrics
 from test_api import write_nerfstudio
 from tiny_scenes import tiny_scene
 
@@ -53,7 +50,7 @@ def test_the_bound_is_drawn_as_often_as_the_scene_was(
 ) -> None:
     """Counted where training happens, not where it is written down."""
     counts = drawn(monkeypatch)
-    options = replace(LearnedOptions(fit=FIT, publish="any"), iterations=30)
+    options = CarryOptions(fit=FIT, publish="any", refit="always", iterations=30)
     result = keyss.hide(
         folders[0], [Secret(folders[1], KEY)], method=options, bound=True, min_psnr=0, out=tmp_path / "run"
     )
@@ -75,7 +72,7 @@ def test_without_one_the_start_is_not_called_a_bound(
     counts = drawn(monkeypatch)
     fitted = keyss.fit(folders[1], config=replace(FIT, iterations=25), out=tmp_path / "plain")
     secret = Secret(folders[1], KEY, tmp_path / "plain" / "model.ply")
-    options = LearnedOptions(fit=FIT, publish="any")
+    options = CarryOptions(fit=FIT, publish="any", refit="always")
     metrics = keyss.hide(folders[0], [secret], method=options, min_psnr=0).metrics
     assert list(counts.values()) == [25, 40, 40]
     assert metrics.steps == (40, 65)  # a model of `keyss fit` says how long it was trained
@@ -93,24 +90,23 @@ def test_without_one_the_start_is_not_called_a_bound(
 
 @pytest.mark.parametrize("name", registry.METHODS)
 def test_what_methods_say_of_their_training(name: str) -> None:
-    method = registry.METHODS[name]
-    for options in method.presets.values():
+    for options in map(registry.get(name).options.preset, PRESETS):
         trainings = options.training(2)
         assert len(trainings) == 2
-        assert any(each.steps for each in trainings) == method.trains
+        assert any(each.steps for each in trainings) == options.trains
         for each in trainings:
             bound = Bound.of(each, options.fit.iterations)
             assert bound.steps is not None
-            plain_steps = options.fit.iterations if each.goes_on else 0
+            plain_steps = options.fit.iterations if each.continues else 0
             assert bound.steps == plain_steps + each.steps
             assert bound.config(options.fit).iterations == bound.steps
 
 
 def test_peers_train_both_scenes_at_every_step() -> None:
-    for method in peers.PEERS:
-        options: MethodOptions = next(iter(method.presets.values()))
-        if method.trains:
-            assert options.training(2) == (Training(options.fit.iterations, goes_on=False),) * 2
+    for name in ("3dgs-sh", "3dgs-decoder", "gs-hider", "watergs"):
+        options = registry.get(name).options()
+        if options.trains:
+            assert options.training(2) == (Training(options.fit.iterations, continues=False),) * 2
             assert Bound.of(options.training(2)[0], options.fit.iterations).equal
 
 

@@ -14,7 +14,8 @@ import pytest
 from keyss.core import OutputError, UsageError
 from keyss.files.atomic import write_bytes
 from keyss.files.lock import lock
-from keyss.runs.folder import MANIFEST, Manifest, RunFolder, clear, read_manifest, write_again
+from keyss.runs import MANIFEST, Manifest, RunFolder, read_manifest
+from keyss.runs.folder import clear, write_again
 
 
 def tree(folder: Path) -> dict[str, bytes]:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import shutil
 import time
 from collections import namedtuple
+from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import pytest
+import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss import CarryOptions, FitConfig, LearnedOptions, Secret, api
-from keyss.core.errors import OutputError
+from keyss import CarryOptions, FitConfig, KeyssOptions, Secret
+from keyss.core import OutputError
 from keyss.files.ply import write_ply
+from keyss.methods import Decoder, DesignName, registry
+from keyss.methods.peers.networks import Convolutions, weights_of
 from tiny_scenes import tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -24,17 +29,17 @@ Usage = namedtuple("Usage", "total used free")
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
-    options = LearnedOptions(fit=FIT, iterations=90, start="points", hidden=(8, 8), branch=8)
-    plan = api.plan(tiny_scene(0), secrets, method=options, out=tmp_path / "run")
+    options = KeyssOptions(fit=FIT, hidden=(8, 8), branch=8)
+    plan = keyss.hide(tiny_scene(0), secrets, method=options, out=tmp_path / "run", dry_run=True).plan
     fits = [stage for stage in plan.stages if stage.name.startswith("plain model")]
     assert [stage.name.removeprefix("plain model of the ") for stage in fits] == [
         "cover",
         "secret 1",
         "secret 2",
     ]
-    assert [stage.steps for stage in plan.stages if stage.steps] == [60, 60, 60, 90]
-    assert (plan.outlook.gaussians, plan.outlook.sh_degree) == (400, 3)
-    assert plan.outlook.capacity < plan.outlook.asked == 800
+    assert [stage.steps for stage in plan.stages if stage.steps] == [60, 60, 60, 60]
+    assert (plan.gaussians, plan.sh_degree) == (400, 3)
+    assert plan.capacity < plan.asked == 800
     assert plan.free_bytes is not None
     assert list(tmp_path.iterdir()) == []
 
@@ -42,8 +47,8 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
 def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
     secret = Secret(tiny_scene(1), KEY)
     for bound, steps in ((False, []), (True, [150])):
-        options = LearnedOptions(fit=FIT, iterations=90, publish="any")
-        plan = api.plan(tiny_scene(0), [secret], method=options, bound=bound)
+        options = CarryOptions(fit=FIT, iterations=90, publish="any", refit="always")
+        plan = keyss.hide(tiny_scene(0), [secret], method=options, bound=bound, dry_run=True).plan
         stages = [stage for stage in plan.stages if stage.name.startswith("bound")]
         assert [stage.steps for stage in stages] == steps
         assert {stage.name for stage in stages} <= {"bound of the secret"}  # the cover's is its plain model
@@ -56,18 +61,17 @@ def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> Non
     """Wide bounds: others use the machine, too."""
     if given:
         cover, secret = trained_like(20_000), Secret(trained_like(9000, 1), KEY)
-        method: CarryOptions | LearnedOptions = CarryOptions()
+        method = CarryOptions()
     else:
         cover, secret = tiny_scene(0), Secret(tiny_scene(1), KEY)  # type: ignore[assignment]
-        method = LearnedOptions(fit=FIT.__class__(iterations=300, max_gaussians=400, seed=0), publish="any")
-    api.plan(cover, [secret], method=method)  # compiles kernels
-    plan = api.plan(cover, [secret], method=method)
+        method = CarryOptions(fit=FIT.__class__(iterations=300, max_gaussians=400, seed=0), publish="any")
+    plan = keyss.hide(cover, [secret], method=method, dry_run=True).plan
     start = time.perf_counter()
     result = keyss.hide(cover, [secret], method=method, out=tmp_path / "run", min_psnr=0)
     seconds = time.perf_counter() - start
     assert seconds / 6 < plan.seconds < 6 * seconds
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
-    assert len(result.stego) <= plan.outlook.gaussians
+    assert len(result.stego) <= plan.gaussians
     assert (tmp_path / "run/publish/stego.ply").stat().st_size <= plan.file_bytes
     assert sum(path.stat().st_size for path in files) <= plan.disk_bytes
     assert 1e8 < plan.memory_bytes < 2e10
@@ -75,11 +79,13 @@ def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> Non
 
 def test_capacity_is_what_fits(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
-    plan = api.plan(cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24)
+    plan = keyss.hide(
+        cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, dry_run=True
+    ).plan
     result = keyss.hide(
         cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, min_psnr=0
     )
-    assert (plan.outlook.asked, plan.outlook.capacity) == (6000, *result.metrics.secret_gaussians)
+    assert (plan.asked, plan.capacity) == (6000, *result.metrics.secret_gaussians)
     assert [stage.steps for stage in plan.stages] == [0] * len(plan.stages)
 
 
@@ -95,8 +101,30 @@ def test_a_disk_without_room_is_refused_before_anything_is_done(
     monkeypatch.setattr(shutil, "disk_usage", usage)
     write_ply(tmp_path / "cover.ply", trained_like(2500))
     secrets = [Secret(trained_like(900, 1), KEY)]
-    for verb in (api.hide, api.plan):
+    for verb in (keyss.hide, partial(keyss.hide, dry_run=True)):
         with pytest.raises(OutputError, match=r"free space.*found 4 MB"):
             verb(tmp_path / "cover.ply", secrets, method="carry", out=tmp_path / "a" / "run")
     assert set(asked) == {tmp_path.resolve()}
     assert [path.name for path in tmp_path.iterdir()] == ["cover.ply"]
+
+
+def test_only_methods_with_networks_take_longer() -> None:
+    seconds, small = {}, FitConfig(iterations=10, max_gaussians=200, seed=0)
+    for name in ("3dgs-sh", "3dgs-decoder", "gs-hider"):
+        options = registry.get(name).options(fit=small)
+        plan = keyss.hide(tiny_scene(0), [Secret(tiny_scene(1), "")], method=options, dry_run=True).plan
+        seconds[name] = next(stage.seconds for stage in plan.stages if stage.name == "hiding")
+    assert seconds["3dgs-sh"] < seconds["3dgs-decoder"] < seconds["gs-hider"]
+
+
+def test_networks_of_plans_are_as_large_as_those_that_are_trained() -> None:
+    for channels in (3, 16):
+        assert weights_of(channels) == _weights(Convolutions(channels))
+    for design in get_args(DesignName):
+        shape = KeyssOptions(design=design).decoder_shape
+        key = 64 * shape.hidden[0] if shape.conditioning == "bias" else 0
+        assert shape.weights == _weights(Decoder(shape)) - key
+
+
+def _weights(network: torch.nn.Module) -> int:
+    return sum(each.numel() for name, each in network.named_parameters() if name.endswith("weight"))

@@ -15,20 +15,18 @@ import pytest
 import keyss
 from channels.low_bits.trained_like import trained_like
 from fitting.test_plain import InterruptAt
-from keyss import CarryOptions, FitConfig, Gaussians, LearnedOptions, Secret
-from keyss.core.errors import Interrupted
-from keyss.methods.base import MethodOptions
-from keyss.methods.learned.options import PRESETS
-from keyss.methods.records.encoding import CarriedSecret
+from keyss import CarryOptions, FitConfig, Gaussians, KeyssOptions, Secret
+from keyss.core import Interrupted
+from keyss.methods import CarriedSecret, MethodOptions
 from keyss.runs.config import secret_ids
 
 KEY = "a key of many characters: 93hXmQ2"
 FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)
 METHODS = {
-    "learned": LearnedOptions(fit=FIT, iterations=4),
-    "learned for any format": LearnedOptions(fit=FIT, iterations=4, publish="any"),
-    "paper": replace(
-        PRESETS["paper"], fit=replace(FIT, iterations=16, seed=2_718_281_828), hidden=(8, 8), branch=8
+    "refitted": CarryOptions(fit=FIT, iterations=4, refit="always"),
+    "carried for any format": CarryOptions(fit=FIT, publish="any"),
+    "keyss": KeyssOptions(
+        fit=replace(FIT, iterations=16, seed=2_718_281_828), design="published", hidden=(8, 8), branch=8
     ),
     "carry": CarryOptions(fit=FIT),
 }
@@ -92,7 +90,7 @@ def test_only_what_is_needed_is_published_and_it_tells_of_no_secret(tmp_path: Pa
 
 def test_checkpoints_are_private_while_a_run_is_interrupted(tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
-        _hide(tmp_path, METHODS["learned"], reporter=InterruptAt(2))
+        _hide(tmp_path, METHODS["refitted"], reporter=InterruptAt(2))
     run = tmp_path / "run"
     modes = _modes(run / "private")
     assert any("checkpoint" in name and name.endswith(".safetensors") for name in modes)

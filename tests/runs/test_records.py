@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from keyss.core.errors import InputError
-from keyss.runs.records import read_record, record_bytes, write_record
+from keyss.core import InputError
+from keyss.runs import read_record, record_bytes, write_record
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import lzma
-import struct
 import sys
 import unicodedata
-from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -36,38 +33,41 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from channels.codes import published as codes_examples  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
 from files.formats.examples import (  # noqa: E402
-    ksplat_of,
     model_of,
     random_compressed,
     random_sog,
     random_spz,
 )
-from keyss.channels.base import Payload  # noqa: E402
-from keyss.channels.codes import published  # noqa: E402
+from keyss.channels import (  # noqa: E402
+    LOW_BITS,
+    SUFFIXES,
+    CodesChannel,
+    Payload,
+    open_content,
+)
 from keyss.channels.codes.channel import _last_bits  # noqa: E402
 from keyss.channels.codes.fields import _log2  # noqa: E402
 from keyss.channels.codes.order import Counted  # noqa: E402
-from keyss.channels.low_bits import LOW_BITS  # noqa: E402
-from keyss.channels.opening import open_content  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
-from keyss.files.formats import compressed_ply, glb, sog, splat, spz  # noqa: E402
+from keyss.files.formats import compressed_ply, sog, splat, spz  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
 from keyss.files.ply import write_ply  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
-from keyss.methods.hidden_file import HiddenFile  # noqa: E402
-from keyss.methods.learned.decoder import ATTRIBUTES, Decoder, DecoderShape  # noqa: E402
-from keyss.methods.learned.payload import (  # noqa: E402
+from keyss.methods import (  # noqa: E402  # noqa: E402
+    ATTRIBUTES,
+    Decoder,
+    DecoderShape,
+    HiddenFile,
     HiddenSecret,
     choose_anchors,
-    pack_secret,
-    unpack_secret,
 )
 from keyss.methods.records import whole  # noqa: E402
-from keyss.methods.records.embedding import OPENED_BY, unpack_records  # noqa: E402
+from keyss.methods.records.encoding import METHOD  # noqa: E402
+from keyss.methods.records.opening import unpack  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
-from methods.learned.hiding import some_secret  # noqa: E402
+from methods.keyss.hiding import some_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
@@ -115,9 +115,9 @@ def revealed(name: str, key: str) -> dict[str, Any]:
     stego = read_model(FOLDER / name)
     content = open_content(stego, key)
     found: dict[str, Any] = {"file": name, "key": key, "method": content.method}
-    if isinstance(content, Payload) and content.method != OPENED_BY:
+    if isinstance(content, Payload) and content.method != METHOD:
         return found | {"payload": hashlib.sha256(content.data).hexdigest()}
-    secret = unpack_records(content)
+    secret = unpack(content)
     model = secret.reveal(stego)
     found |= {"count": len(model), "hidden": secret.count, "sha256": digests(model)}
     if len(model) < secret.count:  # by single precision, in which processors differ in the last bit
@@ -153,16 +153,15 @@ def main() -> None:
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
     write_ply(FOLDER / "carried.ply", stego)
     cover = trained_like(1600)
-    learned = Payload("learned", pack_secret(some_secret(cover)))
-    stego = LOW_BITS.prepare(cover).embed([(key, learned)], entropy=bytes(32))
-    write_ply(FOLDER / "learned.ply", stego)
-    write_ply(FOLDER / "learned-secret.ply", some_secret(cover).reveal(cover))
+    joint = some_secret(cover).payload()
+    stego = LOW_BITS.prepare(cover).embed([(key, joint)], entropy=bytes(32))
+    write_ply(FOLDER / "keyss.ply", stego)
     write_revealed(key)
     write_published()
     write_extremes()
     write_counted()
     write_whole()
-    write_learned()
+    write_keyss()
 
 
 def write_published() -> None:
@@ -175,10 +174,7 @@ def write_published() -> None:
         "published.compressed.ply": compressed_ply.write_compressed_ply(model),
         "published.sog": sog.write_sog(model),
         "published.splat": splat.write_splat(model),
-        "published.glb": glb.write_glb(model[:100]),
-        "published-moved.glb": placed_elsewhere(model[:40]),
     }
-    files |= {f"published-{level}.ksplat": ksplat_of(model_of(150, 2, seed=8), level) for level in range(3)}
     read = {}
     for name, data in files.items():
         (FOLDER / name).write_bytes(data)
@@ -190,13 +186,13 @@ def write_coded(suffix: str) -> None:
     """A model whose codes hold two secrets: a model, and another one or a file."""
     cover = codes_examples.model_of(2300, 11, 0)
     other = {
-        ".spz": Payload(OPENED_BY, whole.encode(trained_like(25, 12, 2))),
-        ".sog": Payload(OPENED_BY, whole.encode(trained_like(60, 13, 0))),
+        ".spz": Payload(METHOD, whole.encode(trained_like(25, 12, 2))),
+        ".sog": Payload(METHOD, whole.encode(trained_like(60, 13, 0))),
         ".compressed.ply": HiddenFile("a note.txt", b"Written at noon, read at night.\n").payload(),
     }[suffix]
-    secrets = [(TWO_KEYS[0], Payload(OPENED_BY, whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
-    name = next(each for each, end in published.SUFFIXES.items() if end == suffix)
-    coded = published.coded(published.prepare(cover, name).embed(secrets, entropy=bytes(32)))
+    secrets = [(TWO_KEYS[0], Payload(METHOD, whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
+    name = next(each for each, end in SUFFIXES.items() if end == suffix)
+    coded = CodesChannel(name).prepare(cover).embed(secrets, entropy=bytes(32))
     write_model(FOLDER / f"coded{suffix}", coded)
 
 
@@ -236,7 +232,7 @@ def counted(model: CodedGaussians) -> dict[str, Any]:
 
 
 def write_whole() -> None:
-    """Models as one string of bytes, and streams of the compression in it that have every kind of chunk."""
+    """Models as one string of bytes, and streams of the compression in it."""
     far = trained_like(40, 8, 0)
     far.means[3, 1] = -1e5  # an outlier
     seen = trained_like(40, 9, 3)
@@ -245,40 +241,21 @@ def write_whole() -> None:
     models = [seen, far, trained_like(10, 10, 1)[:1]]
     encoded = [whole.encode(each) for each in models]
     found = {
-        "models": [{"data": data.hex(), "sha256": digests(whole.decode(data).gaussians)} for data in encoded],
+        "models": [{"data": data.hex(), "sha256": digests(whole.decode(data))} for data in encoded],
         "streams": [
             {
                 "data": stream.hex(),
                 "size": len(plain),
                 "sha256": hashlib.sha256(plain).hexdigest(),
-                "flipped": flipped(stream, len(plain)),
             }
-            for stream, plain in lzma_streams()
+            for stream, plain in zstd_streams()
         ],
     }
     (FOLDER / "whole.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
-def flipped(stream: bytes, size: int) -> dict[int, str | None]:
-    """By numbers of bits: what a stream with this one flipped becomes, None where it is damaged."""
-    found: dict[int, str | None] = {}
-    for at in sorted(
-        {*range(0, len(stream), 7 if size < 1 << 20 else 41), *range(max(0, len(stream) - 9), len(stream))}
-    ):
-        bit = 8 * at + at % 8
-        changed = bytearray(stream)
-        changed[at] ^= 1 << at % 8
-        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=whole._FILTERS)
-        found[bit] = None
-        with suppress(lzma.LZMAError):
-            plain = unpacker.decompress(bytes(changed), size + 1)
-            if len(plain) == size and unpacker.eof and not unpacker.unused_data:
-                found[bit] = hashlib.sha256(plain).hexdigest()
-    return found
-
-
-def write_learned() -> None:
-    """Some rows of what decoders of every kind make of `carried.ply`, and that in `learned.ply` of this."""
+def write_keyss() -> None:
+    """Some rows of what decoders of every kind make of `carried.ply`, and that in `keyss.ply` of this."""
     shapes = [
         DecoderShape(mask=ATTRIBUTES, hidden=(6, 5), branch=4, frequencies=2, sh_degree=1),
         DecoderShape(
@@ -287,19 +264,19 @@ def write_learned() -> None:
             hidden=(4, 4),
             branch=3,
             frequencies=0,
-            design="published",
+            inputs="normalised",
             residuals="one-sided",
         ),
     ]
     stego = read_model(FOLDER / "carried.ply")
-    payloads = [("carried.ply", pack_secret(decoder_of(shape, stego))) for shape in shapes]
+    payloads = [("carried.ply", decoder_of(shape, stego).payload().data) for shape in shapes]
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    payloads.append(("learned.ply", LOW_BITS.extract(read_model(FOLDER / "learned.ply"), key).data))
+    payloads.append(("keyss.ply", open_content(read_model(FOLDER / "keyss.ply"), key).data))
     found = [
         {"file": name, "payload": payload.hex()} | decoded(payload, read_model(FOLDER / name))
         for name, payload in payloads
     ]
-    (FOLDER / "learned.json").write_text(json.dumps(found, indent=1) + "\n")
+    (FOLDER / "keyss.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
 def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:
@@ -316,40 +293,19 @@ def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:
 
 def decoded(payload: bytes, stego: Gaussians) -> dict[str, Any]:
     """How many Gaussians a payload reveals, and every 99th of them."""
-    model = unpack_secret(payload).reveal(stego)
+    model = HiddenSecret.of(Payload("keyss", payload)).reveal(stego)
     rows = {each.name: getattr(model[::99], each.name).flatten().tolist() for each in fields(Gaussians)}
     return {"count": len(model), "rows": {name: [round(v, 7) for v in each] for name, each in rows.items()}}
 
 
-def lzma_streams() -> list[tuple[bytes, bytes]]:
-    """Raw LZMA2 streams of this program's parameters and of others, with what they become."""
+def zstd_streams() -> list[tuple[bytes, bytes]]:
+    """Streams as `whole` writes them, with what they become: text, one byte, noise, and all of them."""
     random = np.random.default_rng(1)
     words = [bytes(random.integers(97, 110, size).tolist()) for size in random.integers(2, 9, 60)]
     text = b" ".join(words[i] for i in random.integers(0, len(words), 400))
-    plains = (b"", text, bytes((2 << 20) + 999), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
-    others = {"lc": 3, "lp": 1, "pb": 2}
-    packed = [
-        lzma.compress(each, lzma.FORMAT_RAW, filters=[{**whole._FILTERS[0], **changed}])
-        for each, changed in zip(plains, ({}, {}, {}, others, others), strict=True)
-    ]
-    # Chunks of all of them in one stream: each begins as the first does.
-    joined = b"".join(each[:-1] for each in packed) + b"\0"
-    return [*zip(packed, plains, strict=True), (joined, b"".join(plains))]
-
-
-def placed_elsewhere(model: Gaussians) -> bytes:
-    """A .glb whose nodes move, turn and scale the Gaussians, which are shown twice."""
-    data = glb.write_glb(model)
-    (size,) = struct.unpack_from("<I", data, 12)
-    document = json.loads(data[20 : 20 + size])
-    turned = {"rotation": [0.1, -0.7, 0.3, 0.64], "scale": [1.5, 1.5, 1.5], "children": [1, 2]}
-    document["nodes"] = [turned, {"mesh": 0}, {"mesh": 0, "translation": [1, -2, 0.5]}]
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    start = struct.pack(
-        "<4sIIII", b"glTF", 2, 12 + 8 + len(text) + len(data) - 20 - size, len(text), 0x4E4F534A
-    )
-    return start + text + data[20 + size :]
+    plains = (text, bytes((2 << 20) + 999), random.bytes(200), text[::-1] + bytes(60_000) + text[:700])
+    streams = [(whole._compress([each]), each) for each in plains]
+    return [*streams, (whole._compress(plains), b"".join(plains))]
 
 
 def digests(model: Gaussians) -> dict[str, str]:
@@ -360,7 +316,7 @@ def digests(model: Gaussians) -> dict[str, str]:
 
 def write_revealed(key: str) -> None:
     write_ply(FOLDER / "pruned.ply", pruned())
-    opened = [revealed(name, key) for name in ("carried.ply", "learned.ply")]
+    opened = [revealed(name, key) for name in ("carried.ply", "keyss.ply")]
     opened += [revealed("pruned.ply", each) for each in TWO_KEYS]
     for suffix in codes_examples.FORMATS:
         write_coded(suffix)

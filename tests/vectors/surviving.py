@@ -11,16 +11,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from channels.low_bits.trained_like import trained_like
-from keyss.channels import appended, robust
-from keyss.channels.base import Payload
-from keyss.channels.packing import pack_payload
+from keyss.channels import APPENDED, Colours, Payload
 from keyss.core.errors import KeyssWarning
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files import write_model
-from keyss.methods.hidden_file import HiddenFile
+from keyss.methods import HiddenFile
 from keyss.methods.records import whole
-from keyss.methods.records.embedding import OPENED_BY
+from keyss.methods.records.encoding import METHOD
 from measure.lifelike import lifelike
 
 NAMES = ("appended.ply", "appended-moved.spz", "colours.spz", "colours-moved.splat")
@@ -37,15 +35,11 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
     rows = torch.randperm(len(model), generator=torch.Generator().manual_seed(21))
     write_model(spz, elsewhere(model[rows[: 9 * len(rows) // 10]]))
     cover = lifelike(4000, 22).with_sh_degree(0)
-    notes = [
-        (keys[0], pack_payload(NOTE.payload())),
-        (keys[1], pack_payload(Payload("file", b"\0" + b"?" * 9))),
-    ]
-    write_model(one, robust.embed(cover, notes, entropy=bytes(32)))
-    secret = pack_payload(Payload(OPENED_BY, whole.encode(trained_like(12, 25, 0))))
-    write_model(
-        moved, elsewhere(robust.embed(cover[:2300], [(keys[0], secret)], strength=40, entropy=bytes(32)))
-    )
+    notes = [(keys[0], NOTE.payload()), (keys[1], Payload("file", b"\0" + b"?" * 9))]
+    write_model(one, Colours().prepare(cover).embed(notes, entropy=bytes(32)))
+    secret = Payload(METHOD, whole.encode(trained_like(12, 25, 0)))
+    small = Colours(strength=40).prepare(cover[:2300])
+    write_model(moved, elsewhere(small.embed([(keys[0], secret)], entropy=bytes(32))))
 
 
 def with_appended(keys: tuple[str, str]) -> Gaussians:
@@ -53,10 +47,10 @@ def with_appended(keys: tuple[str, str]) -> Gaussians:
     cover = trained_like(120, 23, 0)
     cover = replace(cover, opacity_logits=torch.where(torch.arange(120) % 2 == 0, -5.5, 2.0))
     secrets = [
-        (keys[0], Payload(OPENED_BY, whole.encode(trained_like(40, 24, 1)))),
+        (keys[0], Payload(METHOD, whole.encode(trained_like(40, 24, 1)))),
         (keys[1], NOTE.payload()),
     ]
-    return appended.embed(cover, secrets, entropy=bytes(32))
+    return APPENDED.prepare(cover).embed(secrets, entropy=bytes(32))
 
 
 def elsewhere(model: Gaussians) -> Gaussians:

@@ -113,7 +113,7 @@ class Visit:
                         observer.disconnect();
                         resolve(performance.now() - start);
                     }).observe(main, { attributeFilter: ['aria-busy'] });
-                    document.getElementById('key-form').requestSubmit();
+                    document.getElementById('form').requestSubmit();
                 })"""
             )
         )

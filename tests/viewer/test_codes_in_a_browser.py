@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from keyss.channels.codes.published import SUFFIXES
-from keyss.channels.rooms import room_in
+from keyss.channels import SUFFIXES, channel_for
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
-from keyss.methods.records.embedding import embed_whole
-from keyss.rendering.difference import Viewpoints
+from keyss.methods import embed_whole
+from keyss.rendering import Viewpoints
 from keyss.viewer import export_html
 from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
 
@@ -30,7 +29,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> PUBLISHED:
     """By format a page with a model of 4,000 Gaussians, and what its two keys open."""
     folder, found = tmp_path_factory.mktemp("published"), {}
     for publish, suffix in SUFFIXES.items():
-        room = room_in(made(4000, 0), publish, "appended")  # type: ignore[arg-type]
+        room = channel_for(publish).prepare(made(4000, 0))  # type: ignore[arg-type]
         secrets = [made(100, seed).with_sh_degree(1) for seed in (1, 2)]
         views = [Viewpoints.around(each) for each in secrets]
         hidden = embed_whole(room, KEYS, secrets, views, prune=False, entropy=bytes(32))

@@ -20,7 +20,7 @@ from cli.said import SMALL
 from files.scene_files import write_nerfstudio
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import model_of_bytes
-from keyss.fitting.loop import ModelReporter, Reporter, SilentReporter, of_secret
+from keyss.fitting.reporting import ModelReporter, Reporter, SilentReporter, of_secret
 from keyss.viewer.live import EVERY, LiveTraining
 from tiny_scenes import random_gaussians
 from viewer.browser import PATIENCE, PROGRAM, SWITCHES, visit
@@ -178,7 +178,7 @@ def test_a_fit_is_seen_while_it_goes_on(tmp_path: Path) -> None:
             tab.goto(found[1])
             status = "document.getElementById('status').textContent"
             tab.page.wait_for_function(f"() => /^fit scene: step [0-9,]+ of 100,000, /.test({status})")
-            assert tab.page.locator("#key-form").is_hidden()
+            assert tab.page.locator("#form").is_hidden()
             first = tab.page.evaluate(status)
             tab.page.wait_for_function(f"before => {status} !== before", arg=first)
             models = [url for url in tab.requests if url.endswith(".ply")]

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from keyss.channels.rooms import room_in
+from keyss.channels import channel_for
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
-from keyss.methods.hidden_file import HiddenFile
-from keyss.methods.records.embedding import embed_whole
-from keyss.rendering.difference import Viewpoints
+from keyss.methods import HiddenFile, embed_whole
+from keyss.rendering import Viewpoints
 from keyss.viewer import export_html
 from measure.lifelike import lifelike
 from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
@@ -35,7 +34,7 @@ def secret() -> Gaussians:
 def published(tmp_path_factory: pytest.TempPathFactory, secret: Gaussians) -> tuple[Path, Gaussians]:
     """A folder with a model as it was published and as others converted it, and what its key opens."""
     folder = tmp_path_factory.mktemp("published")
-    room = room_in(made(4000, 0), "any", "appended")
+    room = channel_for("any", "appended").prepare(made(4000, 0))
     hidden = embed_whole(room, [KEY], [secret], [Viewpoints.around(secret)], prune=False, entropy=bytes(32))
     write_model(folder / "stego.ply", hidden.stego)
     for suffix in SUFFIXES[1:]:
@@ -70,7 +69,7 @@ def test_the_key_opens_the_scene_and_a_wrong_one_nothing(
 
 def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path: Path) -> None:
     note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
-    room = room_in(lifelike(6000, 0).with_sh_degree(0), "any", "colours")
+    room = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
     write_model(tmp_path / "stego.spz", room.embed([(KEY, note.payload())], entropy=bytes(32)))
     tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
     tab.try_key(KEY)

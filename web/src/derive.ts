@@ -1,4 +1,6 @@
 /** Argon2id in workers of its own, beside the one that looks through the channels. */
-import { answering } from './keys/pool.ts';
+import { here } from './keys/pool.ts';
 
-self.onmessage = ({ ports: [port] }: MessageEvent) => answering(port);
+self.onmessage = ({ data }: MessageEvent<{ key: string; salt: Uint8Array }>) => {
+  void here(data.key, data.salt).then((found) => self.postMessage(found), () => self.postMessage(null));
+};

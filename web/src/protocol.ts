@@ -1,10 +1,9 @@
 /** What the page and its worker tell each other. */
 import type { Gaussians } from './core/gaussians.ts';
 
-/** Ports of the workers that derive keys; bytes of a file to be read; or a key to be tried on the one before. */
+/** Bytes of a file to be read, or a key to be tried on the one before. */
 export interface Question {
   readonly id: number;
-  readonly ports?: readonly MessagePort[];
   readonly bytes?: Uint8Array;
   readonly name?: string; // of the file; some formats are known by it only
   readonly keyless?: boolean; // no key will be tried on these bytes

@@ -1,15 +1,18 @@
 /** What takes time: files into models, and what keys open in them. Nothing of it outlives the page. */
+import { InputError } from './core/errors.ts';
+import DERIVE from 'source:./derive.ts';
 import type { Content, Reader } from './channels/content.ts';
 import { preparedFor } from './channels/opening.ts';
-import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel, type ReadModel } from './files/models.ts';
 import type { Derive } from './keys/derivation.ts';
-import { derivedBy, here, inTurn } from './keys/pool.ts';
+import { derivedBy, inTurn, started } from './keys/pool.ts';
 import { secretOf } from './records/secret.ts';
 import type { Answer, Question } from './protocol.ts';
 
-let derive: Derive = here;
+// Keys are derived side by side: each takes 64 MiB, and most of the time of an attempt.
+const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
+const derive = inTurn(Array.from({ length: DERIVERS }, () => derivedBy(started(DERIVE))));
 let stego: Gaussians | null = null;
 let prepared: Promise<((colours: boolean) => Reader) | null> = Promise.resolve(null);
 
@@ -62,10 +65,6 @@ function fileOf(content: Content): { name: string; data: Uint8Array } | undefine
 }
 
 self.onmessage = async ({ data }: MessageEvent<Question>) => {
-  if (data.ports) {
-    derive = inTurn(data.ports.map(derivedBy));
-    return;
-  }
   try {
     if (data.bytes) await load(data, data.bytes);
     else await unlock(data.id, data.key ?? '', data.colours ?? false);

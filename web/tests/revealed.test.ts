@@ -1,6 +1,6 @@
 import { expect, test } from 'vitest';
 import type { Content } from '../src/channels/content.ts';
-import { readersOf } from '../src/channels/opening.ts';
+import { preparedFor } from '../src/channels/opening.ts';
 import type { ReadModel } from '../src/files/models.ts';
 import { secretOf } from '../src/records/secret.ts';
 import { columns, digest, jsonVector, modelOf } from './vectors.ts';
@@ -20,7 +20,7 @@ const REVEALED = jsonVector<Revealed[]>('revealed.json');
 
 /** In the first channel in which it opens something: to look into all of them would take ten times as long. */
 async function opened(stego: ReadModel, key: string): Promise<Content | null> {
-  for (const reader of readersOf(stego)) {
+  for (const reader of preparedFor(stego)(true).readers) {
     const content = await reader.open(key);
     if (content !== null) return content;
   }

@@ -1,9 +1,16 @@
-"""A hash of 64-bit numbers that anybody can compute: it scatters and hides nothing."""
+"""Public hashes, which scatter and hide nothing, and random numbers and orders that follow from a secret."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.modes import ECB
+
+from keyss.keys.derivation import stream
 
 Words = npt.NDArray[np.uint64]
 
@@ -15,3 +22,37 @@ def mixed(words: Words) -> Words:
     state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
     result: Words = state ^ state >> np.uint64(31)
     return result
+
+
+def row_hashes(rows: npt.NDArray[Any]) -> Words:
+    """[N] a hash of each row of integers [N, C]: equal for equal rows, and for others hardly ever."""
+    found = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        found = (found ^ column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        found ^= found >> np.uint64(29)
+    return found
+
+
+def encrypted_blocks(key: bytes, blocks: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """[..., 16] every block through AES-256: a pseudo-random permutation, not a mode of operation."""
+    plain = np.ascontiguousarray(blocks)
+    encrypted = np.empty(plain.size + 15, np.uint8)  # the library wants room for one more block
+    Cipher(AES(key), ECB()).encryptor().update_into(plain.reshape(-1).data, encrypted.data)
+    return encrypted[: plain.size].reshape(blocks.shape)
+
+
+def random_words(secret: bytes, label: str, count: int) -> Words:
+    """[count] uniform integers that follow from a secret."""
+    return np.frombuffer(stream(secret, label, 8 * count), "<u8")
+
+
+def random_order(secret: bytes, label: str, count: int) -> npt.NDArray[np.int64]:
+    """[count] the numbers from 0 on in an order that follows from a secret."""
+    return random_words(secret, label, count).argsort(kind="stable")
+
+
+def random_fractions(secret: bytes, label: str, count: int) -> npt.NDArray[np.float64]:
+    """[count] uniform numbers between 0 and 1, without the ends."""
+    words = random_words(secret, label, count) >> np.uint64(12)
+    found: npt.NDArray[np.float64] = (words.astype(np.float64) + 0.5) / 2.0**52
+    return found

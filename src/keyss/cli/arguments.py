@@ -1,89 +1,106 @@
-"""Arguments that several commands take, and how one that may be left out is described."""
+"""Options that several commands take."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
-    from keyss.fitting.config import FitConfig
-
-
-def optional(metavar: str, help: str, otherwise: str, aliases: list[str] | None = None) -> Any:
-    """An argument that may be left out; `otherwise` says what happens then."""
-    hint = f"(default: {otherwise})"
+def optional(metavar: str, help: str, default: str = "", aliases: list[str] | None = None) -> Any:
+    """An option whose default is None or empty. `default`: what to show as such, if anything."""
+    hint = f"(default: {default})" if default else ""
     return arg(metavar=metavar, help=help, help_behavior_hint=hint, aliases=aliases)
 
 
-Device = Annotated[
-    Literal["auto", "cpu", "cuda"], arg(help="Where to compute; auto takes a CUDA GPU where there is one.")
-]
-Seed = Annotated[
-    int | None, optional("N", "Seed of everything random, to repeat a run.", "drawn by the system")
-]
+def switch(help: str, name: str | None = None) -> Any:
+    """An option without a value."""
+    return arg(name=name, help=help, help_behavior_hint="")
+
+
+Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Device; auto uses a CUDA GPU if there is one.")]
+Seed = Annotated[int | None, optional("N", "Seed of all random numbers, to repeat a run.", "random")]
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
-    optional("FILE", "File with the key, once for each secret.", "KEYSS_KEY, or a hidden prompt"),
+    optional("FILE", "Key file, one for each secret.", "KEYSS_KEY or a prompt"),
 ]
-Width = Annotated[
-    int | None, optional("PIXELS", "Photos wider than this are downscaled to it.", "as they are")
-]
-Background = Annotated[
-    tuple[float, float, float] | None,
-    optional(
-        "R G B",
-        "Colour behind everything, 0 to 1 each; transparent photos get it.",
-        "white if there are any, else black",
+Preset = Annotated[
+    Literal["quick", "default", "full"],
+    arg(
+        help="Training steps and maximum number of Gaussians of each model: quick 1,000 and 10,000; default "
+        "3,000 and 30,000; full 30,000 and 500,000."
     ),
 ]
-SkipMissing = Annotated[bool, arg(help="Leave out photos that a scene names but that are not there.")]
-Iterations = Annotated[int | None, optional("N", "Steps of training.", "the preset's")]
-ViewsPerStep = Annotated[
-    int | None, optional("N", "Photos of a step, in all processes together.", "one in each")
-]
-MaxGaussians = Annotated[int | None, optional("N", "Cap on the size of a model.", "the preset's")]
-Overwrite = Annotated[bool, arg(help="Replace results that are already there.")]
-Resume = Annotated[bool, arg(help="Continue an interrupted run in the same folder.")]
-TensorBoard = Annotated[bool, arg(help="Write losses to private/tensorboard in the results as it trains.")]
-Live = Annotated[bool, arg(help="Show the model as it trains, on a page of this machine.")]
-MasterKeyFile = Annotated[
-    Path | None,
-    optional("FILE", "File with a key from which each gets its own (`keyss key-of`).", "none"),
-]
+Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
+Iterations = Annotated[int | None, optional("N", "Training steps.", "the preset's")]
+MaxGaussians = Annotated[int | None, optional("N", "Maximum number of Gaussians of a model.", "the preset's")]
 Jobs = Annotated[
-    int | None,
-    optional("N", "How many at once; the cores are divided among them.", "as cores and memory allow"),
+    int | None, optional("N", "Parallel jobs, which share the cores.", "as cores and memory allow")
 ]
-Ray = Annotated[
-    str | None,
-    optional("ADDRESS", "Run on the Ray cluster at this address, or on a `local` one.", "processes here"),
-]
+Ray = Annotated[str | None, optional("ADDRESS", "Ray cluster to run on, or `local`.", "local processes")]
+Overwrite = Annotated[bool, switch("Replace existing results.")]
+Resume = Annotated[bool, switch("Continue an interrupted run in the same folder.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
 
 
-def preset_sizes(presets: Mapping[str, FitConfig]) -> str:
-    """What each preset comes to, as a sentence."""
-    sizes = [f"{name} {fit.iterations:,} and {fit.max_gaussians:,}" for name, fit in presets.items()]
-    return f"Steps of each training, and Gaussians of each model at most: {'; '.join(sizes)}."
+@dataclass(frozen=True, kw_only=True)
+class Photos:
+    """How photos are read."""
+
+    width: Width = None
+    background: Annotated[
+        tuple[float, float, float] | None,
+        optional(
+            "R G B",
+            "Background colour, 0 to 1 each; transparent photos are composited over it.",
+            "white for transparent photos, else black",
+        ),
+    ] = None
+    skip_missing: Annotated[bool, switch("Skip photos that a scene names but that do not exist.")] = False
 
 
-def schedule(
-    iterations: int | None, max_gaussians: int | None, seed: int | None, views_per_step: int | None
-) -> dict[str, int]:
-    """What was asked for on the command line of the fields of `FitConfig`."""
-    asked = {"iterations": iterations, "max_gaussians": max_gaussians}
-    asked |= {"seed": seed, "views_per_step": views_per_step}
-    return {name: value for name, value in asked.items() if value is not None}
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """How models are trained."""
+
+    iterations: Iterations = None
+    max_gaussians: MaxGaussians = None
+    seed: Seed = None
+    tensorboard: Annotated[bool, switch("Write losses to private/tensorboard in the results.")] = False
+    live: Annotated[bool, switch("Show the model on a local page while it trains.")] = False
+
+    def schedule(self) -> dict[str, int]:
+        """The fields of `FitConfig` that are given."""
+        asked = {"iterations": self.iterations, "max_gaussians": self.max_gaussians, "seed": self.seed}
+        return {name: value for name, value in asked.items() if value is not None}
 
 
-def checked_seed(seed: int, most: int = 2**32 - 1) -> int:
-    """The seed, if every generator takes it. Raises UsageError."""
+PHOTOS, TRAINING = Photos(), Training()
+
+
+def given(options: Any) -> list[str]:
+    """The flags of the options, those of groups included, that differ from their defaults."""
+    flags = []
+    for each in fields(options):
+        value = getattr(options, each.name)
+        if is_dataclass(value):
+            flags += given(value)
+        elif value != each.default:
+            flags.append(flag(each.name))
+    return flags
+
+
+def flag(name: str) -> str:
+    """`--max-gaussians` for `max_gaussians`."""
+    return f"--{name.replace('_', '-')}"
+
+
+def checked_seed(seed: int, highest: int = 2**32 - 1) -> int:
+    """`seed`, if every generator takes it. Raises UsageError."""
     from keyss.core.errors import UsageError
 
-    if not 0 <= seed <= most:
-        raise UsageError(f"--seed: expected 0 to {most}, got {seed}")
+    if not 0 <= seed <= highest:
+        raise UsageError(f"--seed: expected 0 to {highest}, got {seed}")
     return seed

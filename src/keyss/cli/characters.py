@@ -1,4 +1,4 @@
-"""Characters that an output cannot show, such as one in ASCII or in Windows' old code pages."""
+"""Replacements for characters that an output cannot encode, such as one in ASCII or an old code page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PLAIN = {
 
 
 def _replace(error: UnicodeError) -> tuple[str | bytes, int]:
-    """As the characters that stand nearest to them, else as `?`; bytes of a file's name as they are."""
+    """A similar character or `?`; undecodable bytes of a file name stay as they are."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     first = error.object[error.start]

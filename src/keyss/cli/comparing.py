@@ -1,6 +1,6 @@
-"""The command that lays methods side by side.
+"""The command that compares methods.
 
-Everything heavy is imported inside the command, so that `keyss --help` answers at once.
+Heavy modules are imported inside the function: `keyss --help` needs none of them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from keyss.cli.arguments import Device, Iterations, MaxGaussians, OutFolder, Resume, Seed, Width, optional
+from keyss.cli.arguments import Device, Iterations, MaxGaussians, OutFolder, Width, optional
 
 QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
 
@@ -24,7 +24,7 @@ def compare(
         optional(
             "NAMES",
             "Methods, or METHOD:PRESET, with commas between them. all: each one's first preset, and "
-            "learned:paper, KeySS as published.",
+            "keyss:published, KeySS as the paper has it.",
             "all",
         ),
     ] = "all",
@@ -38,43 +38,37 @@ def compare(
     dry_run: Annotated[
         bool, arg(help="Print what would run and estimates of the time; write nothing.")
     ] = False,
-    resume: Resume = False,
     device: Device = "auto",
-    seed: Seed = None,
+    seed: Annotated[int, arg(metavar="N", help="Seed of everything random.")] = 0,
 ) -> None:
-    """Hide one scene in another by every method there is, with the same budget: a table and a picture.
+    """Hide a scene by each method with the same budget, and tabulate the results.
 
-    The budget is steps for each scene, in all, and Gaussians. The method 3dgs is the bound: plain 3DGS of as
-    many Gaussians and as many training steps.
-
-    A key is made for those methods that have keys. What is done is not done again with --resume.
+    The budget is steps for each scene in total, and Gaussians. The method 3dgs is the bound: plain 3DGS of as
+    many Gaussians and as many training steps. The same command resumes after any interruption.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
-    from keyss import api
-    from keyss.cli.tables import print_comparison, print_files, print_planned_runs
+    import keyss
+    from keyss.cli.tables import print_comparison, print_files, print_forecast
+    from keyss.many import Forecast
     from keyss.progress import reporter
 
     asked = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     budget = {name: QUICK[name] if value is None and quick else value for name, value in asked.items()}
-    chosen = () if methods.strip() == "all" else [name.strip() for name in methods.split(",")]
-    if dry_run:
-        print_planned_runs(
-            api.plan_comparison(cover, secret, methods=chosen, device=device, out=out, **budget)
-        )
-        print("What is measured beside these times takes up to a minute for each method.")
-        return
-    found = api.compare(
+    found = keyss.compare(
         cover,
         secret,
-        methods=chosen,
+        methods=() if methods.strip() == "all" else [name.strip() for name in methods.split(",")],
         seed=seed,
         device=device,
         out=out,
-        resume=resume,
+        dry_run=dry_run,
         reporter=reporter(),
         **budget,
     )
+    if isinstance(found, Forecast):
+        print_forecast(found, 1)
+        return
     print_comparison(found)
     print_files(
         out,

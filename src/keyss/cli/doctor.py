@@ -1,7 +1,4 @@
-"""The command that looks whether everything is there that the others need.
-
-Everything heavy is imported inside the command, so that `keyss --help` answers at once.
-"""
+"""The command `doctor`."""
 
 from __future__ import annotations
 
@@ -14,21 +11,19 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import arg
-
-from keyss.cli.arguments import Device
+from keyss.cli.arguments import Device, switch
 
 if TYPE_CHECKING:
     import torch
 
 # What each extra of pyproject.toml installs, and what that is for.
 EXTRAS = {
+    "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
-    "metrics": ("flip-evaluator", "FLIP in audits"),
-    "sweep": ("ray", "sweeps on a cluster"),
-    "tensorboard": ("tensorboard", "losses of a training, as it runs"),
-    "video": ("av", "films by keyss render --video"),
-    "steganalysis": ("sealwatch", "detectors in audits"),
+    "reproduce": ("pooch", "downloading the paper's scenes"),
+    "sweep": ("ray", "sweeps and batches on a cluster"),
+    "tensorboard": ("tensorboard", "losses during training"),
+    "video": ("av", "keyss render --video"),
 }
 _LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
 _TOLERANCE = 1e-4  # of a pixel's value from 0 to 1
@@ -36,7 +31,7 @@ _TOLERANCE = 1e-4  # of a pixel's value from 0 to 1
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was looked at. "missing" is what can be done without, "broken" what cannot."""
+    """The state of one component: "missing" if it is optional, "broken" if it is required."""
 
     name: str
     state: Literal["ok", "missing", "broken"]
@@ -45,13 +40,13 @@ class Finding:
 
 def doctor(
     *,
-    json_: Annotated[bool, arg(name="json", help="Print JSON.")] = False,
+    json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
     device: Device = "auto",
 ) -> None:
-    """Check the installation: versions, cores, GPU, optional parts, cache; draw a picture, derive a key.
+    """Check the installation: versions, GPU, extras, a test render, a key derivation.
 
-    Exit status 0 says that all is there that is needed, 6 that something is not. The first call compiles the
-    CPU rasterizer, 10 to 20 s; on a machine with a GPU gsplat may compile for minutes.
+    Exit status: 0 everything required works, 6 something does not. The first call compiles the rasterizer,
+    10 to 20 s; on a machine with a GPU, gsplat may compile for minutes.
 
     example: keyss doctor
     """
@@ -59,20 +54,19 @@ def doctor(
 
     found = list(findings(device))
     if json_:
-        from keyss.runs.records import record_bytes
+        from keyss.cli.tables import print_json
 
-        facts = {each.name: {"state": each.state, "says": each.says} for each in found}
-        print(record_bytes(facts).decode(), end="")
+        print_json({each.name: {"state": each.state, "says": each.says} for each in found})
     else:
         width = max(len(each.name) for each in found)
         for each in found:
             print(f"{each.state:<7}  {each.name:<{width}}  {each.says}")
     if broken := [each.name for each in found if each.state == "broken"]:
-        raise BackendError(f"not everything works that is needed: {', '.join(broken)} (see above)")
+        raise BackendError(f"required components do not work: {', '.join(broken)} (see above)")
 
 
 def findings(device: Literal["auto", "cpu", "cuda"]) -> Iterator[Finding]:
-    """All that `keyss doctor` prints, in its order."""
+    """What `keyss doctor` prints, in order."""
     from keyss import __version__
 
     python, system = platform.python_version(), platform.platform()
@@ -91,7 +85,7 @@ def findings(device: Literal["auto", "cpu", "cuda"]) -> Iterator[Finding]:
 
 
 def _checks(*checks: tuple[str, Callable[[], tuple[bool, str]]]) -> Iterator[Finding]:
-    """Of each whether it is there, and what to say of it; one that fails is broken, with its error."""
+    """Run checks, each of which returns whether its component is there, and a description."""
     for name, check in checks:
         try:
             there, says = check()
@@ -123,7 +117,7 @@ def _gpu() -> tuple[bool, str]:
     import torch
 
     if not torch.cuda.is_available():
-        return False, "torch sees no CUDA GPU; the CPU does it all"
+        return False, "torch finds no CUDA GPU; the CPU is used"
     properties = torch.cuda.get_device_properties(0)
     return True, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB, CUDA {torch.version.cuda}"
 
@@ -133,7 +127,7 @@ def _cache() -> tuple[bool, str]:
 
     folder = cache_folder()
     if folder is None:
-        return False, "no folder can be written: kernels are compiled anew by every command, 10 to 20 s"
+        return False, "no writable folder: every command compiles the kernels again, 10 to 20 s"
     return True, str(folder)
 
 
@@ -147,7 +141,7 @@ def _derivation() -> tuple[bool, str]:
 
 
 def _frame(device: Literal["auto", "cpu", "cuda"]) -> tuple[bool, str]:
-    """One Gaussian in the middle of a picture, whose pixels there and in a corner are known."""
+    """Render one Gaussian, and check a pixel in its middle and one in a corner."""
     import torch
 
     from keyss.core import BackendError, Camera, Gaussians
@@ -168,15 +162,15 @@ def _frame(device: Literal["auto", "cpu", "cuda"]) -> tuple[bool, str]:
     camera = Camera(torch.eye(4), K, size, size, "doctor.png")
     moved = model.to(chosen)
     with torch.no_grad():
-        render(moved, camera)  # compiles, where nothing is compiled yet
+        render(moved, camera)  # compiles the kernels, unless they are cached
         start = time.perf_counter()
         image = render(moved, camera).cpu()
         seconds = time.perf_counter() - start
     meant = color * torch.sigmoid(torch.tensor(logit))
     if not _near(image[size // 2, size // 2], meant) or not _near(image[0, 0], torch.zeros(3)):
-        raise BackendError(f"the picture that {chosen} drew is wrong")
-    who = "gsplat" if chosen.type == "cuda" else "our rasterizer"
-    return True, f"drawn by {who} on {chosen} in {1e3 * seconds:.1f} ms"
+        raise BackendError(f"the render on {chosen} is wrong")
+    who = "gsplat" if chosen.type == "cuda" else "the CPU rasterizer"
+    return True, f"rendered by {who} on {chosen} in {1e3 * seconds:.1f} ms"
 
 
 def _near(found: torch.Tensor, meant: torch.Tensor) -> bool:
@@ -184,7 +178,7 @@ def _near(found: torch.Tensor, meant: torch.Tensor) -> bool:
 
 
 def _program() -> tuple[bool, str]:
-    """The converter of other people's, which audits try when it is there."""
+    """The third-party converter that audits use."""
     from keyss.core.errors import BackendError
     from keyss.measure.robustness.conversions import find_splat_transform
 

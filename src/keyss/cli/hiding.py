@@ -1,133 +1,137 @@
-"""The command that hides, which has the options of the method that is chosen.
-
-Everything heavy is imported inside the commands, so that `keyss --help` answers at once.
-"""
+"""The command `hide`: scenes, files, or a batch of either."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 
 from keyss.cli.arguments import (
-    Background,
+    PHOTOS,
+    TRAINING,
     Device,
-    Iterations,
     Jobs,
     KeyFiles,
-    Live,
-    MasterKeyFile,
-    MaxGaussians,
     OutFolder,
     Overwrite,
+    Photos,
+    Preset,
     Ray,
     Resume,
-    Seed,
-    SkipMissing,
-    TensorBoard,
-    ViewsPerStep,
-    Width,
+    Training,
+    given,
     optional,
-    schedule,
+    switch,
 )
-from keyss.cli.hiding_options import DEFAULT_METHOD, own_options
-from keyss.cli.sweeping import hide_assets
 
 if TYPE_CHECKING:
-    from keyss.channels.rooms import AnyChannel, Publish
+    from keyss.methods.base import Method, MethodOptions
 
-_MIN_PSNR = 20.0  # as `keyss.api.hide` has it; its module would take a second to load
-_HOW = ("byte for byte as it is", "as it is, or converted")  # to publish
+_HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this file; it may be converted"}
 
 
-def hide(
-    *,
-    cover: Annotated[
-        Path | None,
-        optional("SCENE", "Scene that everybody may see, or a model (.ply, .spz, ...).", "those of --batch"),
-    ] = None,
-    secret: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional("SCENE", "Scene or model to hide in it, once for each secret.", "files are hidden"),
-    ] = (),
-    secret_file: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Any file to hide, in a cover that is a model; once for each.", "scenes are hidden"),
-    ] = (),
-    publish: Annotated[
-        Literal["ply", "spz", "sog", "compressed-ply", "any"],
-        arg(
-            help="Where the model will be published. spz, sog, compressed-ply: such a file, passed on as it "
-            "is, has room for small secrets only. any: a .ply that may be converted."
-        ),
-    ] = "ply",
+@dataclass(frozen=True, kw_only=True)
+class Publication:
+    """How secrets survive conversion, with --publish any."""
+
     channel: Annotated[
         Literal["appended", "colours"] | None,
         optional(
             "{appended,colours}",
-            "With --publish any, what survives: appended Gaussians hold everything, and everybody can see "
-            "that they are there; colours hold little and show less.",
-            "scenes are appended, and files lie in colours",
+            "appended Gaussians have room for everything, but are visible in the file; colours have little "
+            "room and show less.",
+            "appended for scenes, colours for files",
         ),
-    ] = None,
-    repair: Annotated[
-        bool, arg(help="With --channel colours: a short fit afterwards, so that views look more as before.")
-    ] = False,
-    method: str = DEFAULT_METHOD,
-    key_file: KeyFiles = (),
-    batch: Annotated[
-        Path | None,
-        optional(
-            "CSV",
-            "Table of assets, each hidden by itself: columns cover, secret or secret_file, out (a folder in "
-            "that of -o) and key_file.",
-            "one hiding",
-        ),
-    ] = None,
-    master_key_file: MasterKeyFile = None,
-    jobs: Jobs = None,
-    ray: Ray = None,
-    out: OutFolder,
-    preset: str = "best",
-    iterations: Iterations = None,
-    max_gaussians: MaxGaussians = None,
-    views_per_step: ViewsPerStep = None,
-    width: Width = None,
-    background: Background = None,
-    skip_missing: SkipMissing = False,
-    cover_model: Annotated[
-        Path | None, optional("FILE", "Plain model of the cover: 3DGS with nothing hidden.", "one is fitted")
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models:
+    """Plain 3DGS models of scenes of photos, which are fitted if they are not given."""
+
+    cover_model: Annotated[Path | None, optional("FILE", "Model of the cover.")] = None
     secret_model: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Plain model of a secret, once for each secret.", "they are fitted"),
-    ] = (),
+        UseAppendAction[tuple[Path, ...]], optional("FILE", "Model of a secret, one for each secret.")
+    ] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """How the result is judged."""
+
+    min_psnr: Annotated[
+        float, arg(metavar="DB", help="Fail if cover or secret is further from its plain model than this.")
+    ] = 20.0
     bound: Annotated[
         bool,
         arg(
-            help="Fit plain 3DGS of as many Gaussians and as many training steps to compare each scene with, "
-            "where its plain model had fewer; takes as long again."
+            help="Compare with plain 3DGS of as many Gaussians and training steps, fitted for that; takes "
+            "twice as long."
         ),
-    ] = False,
-    min_psnr: Annotated[
-        float, arg(metavar="DB", help="Fail if cover or secret comes out worse, against its plain model.")
-    ] = _MIN_PSNR,
-    dry_run: Annotated[
-        bool, arg(help="Print plan, room, and estimates of time, memory and disk; write nothing.")
-    ] = False,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    tensorboard: TensorBoard = False,
-    live: Live = False,
-    device: Device = "auto",
-    seed: Seed = None,
-    **own: Any,
-) -> None:
-    """Hide secret scenes in a cover scene, each under its own key.
+    ] = False
 
-    Every method has options of its own: see `keyss hide --method METHOD --help`.
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Many hidings at once."""
+
+    batch: Annotated[
+        Path | None,
+        optional("CSV", "Table with the columns cover, secret or secret_file, out (below -o), key_file."),
+    ] = None
+    master_key_file: Annotated[
+        Path | None, optional("FILE", "Key file to derive each asset's key from (`keyss keygen --asset`).")
+    ] = None
+    jobs: Jobs = None
+    ray: Ray = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class HideArguments:
+    """The options of `keyss hide`; `keyss.cli.hiding_options` adds those of the method."""
+
+    cover: Annotated[
+        Path | None, optional("SCENE", "Public scene: folder of posed photos, or model (.ply, .spz, ...).")
+    ] = None
+    secret: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("SCENE", "Scene or model to hide in it; repeat for more."),
+    ] = ()
+    secret_file: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Any file to hide, in a cover that is a model; repeat for more."),
+    ] = ()
+    key_file: KeyFiles = ()
+    publish: Annotated[
+        Literal["ply", "spz", "sog", "compressed-ply", "any"],
+        arg(
+            help="Published file: any is a .ply that may be converted later; the others must stay unchanged, "
+            "and all but ply have room for small secrets only."
+        ),
+    ] = "ply"
+    out: OutFolder
+    method: str
+    preset: Preset = "default"
+    dry_run: Annotated[bool, switch("Print the plan and estimates of time, memory and disk.")] = False
+    resume: Resume = False
+    overwrite: Overwrite = False
+    device: Device = "auto"
+    publication: OmitArgPrefixes[Publication] = Publication()
+    photos: OmitArgPrefixes[Photos] = PHOTOS
+    models: OmitArgPrefixes[Models] = Models()
+    training: OmitArgPrefixes[Training] = TRAINING
+    quality: OmitArgPrefixes[Quality] = Quality()
+    batch: OmitArgPrefixes[Batch] = Batch()
+    own: Any  # options of the method alone
+
+
+def hide(asked: HideArguments) -> None:
+    """Hide secrets in a cover, each under its own key.
+
+    Each method has options of its own: see `keyss hide --method METHOD --help`.
 
     example: keyss hide --cover SCENE_A --secret SCENE_B --key-file key.txt -o runs/hidden
 
@@ -137,191 +141,206 @@ def hide(
 
     example: keyss hide --batch assets.csv --method carry --master-key-file master.txt -o runs/assets
     """
-    from keyss import api
-    from keyss.cli.keys import keys, warn_of_doubtful_keys
-    from keyss.cli.live import watched
-    from keyss.cli.ranks import answers, check_command
-    from keyss.cli.tables import print_files, print_hiding, print_plan
-    from keyss.cli.tensorboard import reporter
+    if asked.batch.batch is not None:
+        _hide_batch(asked, asked.batch.batch)
+        return
     from keyss.core.errors import UsageError
+
+    if asked.cover is None:
+        raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
+    if only_for_many := given(asked.batch):
+        raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
+    if asked.secret_file:
+        _hide_files(asked, asked.cover)
+    elif asked.secret:
+        _hide_scenes(asked, asked.cover)
+    else:
+        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
+
+
+def _hide_scenes(asked: HideArguments, cover: Path) -> None:
+    import keyss
+    from keyss.cli.ranks import answers
+    from keyss.cli.reporting import reporting
+    from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.methods import registry
-    from keyss.rendering.orbit import is_model
     from keyss.runs.files import HANDED, STEGOS
 
-    if cover is None and batch is None:
-        raise UsageError("nothing to hide in: give --cover SCENE, or --batch CSV for many")
-    for flag, value in (("--master-key-file", master_key_file), ("--jobs", jobs), ("--ray", ray)):
-        if batch is None and value is not None:
-            raise UsageError(f"{flag} is for many hidings: give --batch CSV, or leave it out")
-    check_command("hide --batch" if batch else "hide --secret-file", trains=not (batch or secret_file))
-    if secret_file and cover is not None and batch is None:
-        unused: dict[str, object] = {
-            "--secret": secret,
-            "--secret-model": secret_model,
-            "--cover-model": cover_model,
-        }
-        unused |= {"--dry-run": dry_run, "--resume": resume, "--iterations": iterations}
-        unused |= {"--tensorboard": tensorboard, "--live": live, "--bound": bound, "--width": width}
-        unused |= {"--max-gaussians": max_gaussians, "--views-per-step": views_per_step}
-        unused |= {"--seed": seed is not None, "--min-psnr": min_psnr != _MIN_PSNR}
-        unused |= {f"--{name.replace('_', '-')}": value for name, value in own.items()}
-        if given_too := [flag for flag, value in unused.items() if value]:
-            raise UsageError(f"--secret-file: files are hidden by themselves; leave out {given_too[0]}")
-        _hide_files(cover, secret_file, publish, channel or "colours", repair, key_file, out, overwrite)
-        return
-    if not secret and batch is None:
-        raise UsageError("nothing to hide: give --secret SCENE or --secret-file FILE, once for each secret")
-    if secret_model and len(secret_model) != len(secret):
-        raise UsageError(
-            f"expected no --secret-model or one for each of {len(secret)} secret(s), got {len(secret_model)}"
-        )
-    chosen = registry.get(method)
-    known = own_options(chosen)
-    changes = {
-        name: parse(value) if (parse := known[name][1].parse) else value
-        for name, value in own.items()
-        if value is not None and value is not False
+    method = registry.get(asked.method)
+    options, secrets = _method_options(asked, method), _secrets(asked, method)
+    _check_trains(asked, cover, options)
+    described: dict[str, Any] = vars(asked.photos) | {
+        "method": options,
+        "cover_model": asked.models.cover_model,
+        "bound": asked.quality.bound,
+        "device": asked.device,
+        "out": asked.out,
     }
-    changes["publish"] = publish
-    if channel:
-        changes["channel"] = channel
-    if repair:
-        changes["repair"] = True
-    options = chosen.presets[preset].adapted(**changes)
-    options = options.with_fit(**schedule(iterations, max_gaussians, seed, views_per_step))
-    if batch is not None:
-        one: dict[str, object] = {"--cover": cover, "--secret": secret, "--secret-file": secret_file}
-        one |= {"--key-file": key_file, "--cover-model": cover_model, "--secret-model": secret_model}
-        one |= {"--dry-run": dry_run, "--tensorboard": tensorboard, "--live": live, "--resume": resume}
-        one |= {"--bound": bound}
-        if given_too := [flag for flag, value in one.items() if value]:
-            raise UsageError(
-                f"--batch: {given_too[0]} is for a single hiding; a batch that was interrupted goes on "
-                "with the same command"
-            )
-        hide_assets(
-            batch,
-            out,
-            method=options,
-            master_key_file=master_key_file,
-            width=width,
-            background=background,
-            skip_missing=skip_missing,
-            min_psnr=min_psnr,
-            device=device,
-            jobs=jobs,
-            ray=ray,
-            overwrite=overwrite,
-        )
-        return
-    assert cover is not None
-    given = [cover_model or cover, *(secret_model or secret)]
-    if not chosen.trains and all(map(is_model, given)):
-        training = {
-            "--preset": preset != next(iter(chosen.presets)),
-            "--iterations": iterations is not None,
-            "--max-gaussians": max_gaussians is not None,
-            "--views-per-step": views_per_step is not None,
-            "--live": live,
-        }
-        if idle := [flag for flag, is_given in training.items() if is_given]:
-            raise UsageError(
-                f"{' and '.join(idle)}: nothing is trained when --method {method} gets models of all scenes; "
-                f"leave {'it' if len(idle) == 1 else 'them'} out"
-            )
-    models = secret_model or (None,) * len(secret)
-    if chosen.capabilities.keys or key_file:
-        opening = keys(key_file, len(secret), confirm=True)
-        warn_of_doubtful_keys(opening)
-    else:
-        opening = [""] * len(secret)
-    secrets = [
-        api.Secret(scene, key, model) for scene, key, model in zip(secret, opening, models, strict=True)
-    ]
-    if dry_run:
-        planned = api.plan(
-            cover,
-            secrets,
-            method=options,
-            width=width,
-            background=background,
-            skip_missing=skip_missing,
-            cover_model=cover_model,
-            bound=bound,
-            device=device,
-            out=out,
-        )
+    if asked.dry_run:
+        planned = keyss.hide(cover, secrets, dry_run=True, **described).plan
+        assert planned is not None
         print_plan(planned)
         return
-    with watched(reporter(out, tensorboard=tensorboard), cover, live=live) as told:
-        result = api.hide(
+    with reporting(asked.out, cover, asked.training) as reporter:
+        result = keyss.hide(
             cover,
             secrets,
-            method=options,
-            width=width,
-            background=background,
-            skip_missing=skip_missing,
-            cover_model=cover_model,
-            bound=bound,
-            min_psnr=min_psnr,
-            device=device,
-            out=out,
-            overwrite=overwrite,
-            resume=resume,
-            reporter=told,
+            min_psnr=asked.quality.min_psnr,
+            overwrite=asked.overwrite,
+            resume=asked.resume,
+            reporter=reporter,
+            **described,
         )
     if not answers():
         return
+    assert result.metrics is not None
     print_hiding(result.metrics)
-    how = _HOW[publish == "any"]
-    what = "the cover, with the secret in it" if chosen.trains or chosen.capabilities.keys else "the cover"
+    what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
+    how = _HOW_TO_PUBLISH[options.place.survives]
     print_files(
-        out,
+        asked.out,
         {
-            **dict.fromkeys(STEGOS, f"publish this, {how}: {what}"),
-            HANDED: "hand this over to who may see the secret: `keyss reveal --handed`",
-            "private": "keep this to yourself, or delete it: plain models of all scenes, numbers, what ran",
+            **dict.fromkeys(STEGOS, f"{how}: {what}"),
+            HANDED: "hand this over to whoever may see the secret: `keyss reveal --handed`",
+            "private": "keep this private, or delete it: plain models, measurements, configuration",
         },
     )
-    if not chosen.capabilities.keys:
-        print(f"The method {method} has no keys: whoever has both files sees the secret.")
+    if not method.capabilities.keys:
+        print(f"The method {method.name} has no keys: whoever has both files can see the secret.")
         return
-    files = "both files" if chosen.capabilities.hands_over else "file"
+    files = "both files" if method.capabilities.hands_over else "the file"
     print(
-        "The key: send it over another channel than the file, and keep a copy: without it nothing is opened. "
-        f"Whoever has {files} and key runs `keyss reveal`."
+        "Send the key over another channel than the file, and keep a copy: without it the secret is lost. "
+        f"Whoever has {files} and the key runs `keyss reveal`."
     )
 
 
-def _hide_files(
-    cover: Path,
-    files: Sequence[Path],
-    publish: Publish,
-    channel: AnyChannel,
-    repair: bool,
-    key_file: Sequence[Path],
-    out: Path,
-    overwrite: bool,
-) -> None:
-    """`keyss hide --secret-file`."""
-    from keyss import api
+def _secrets(asked: HideArguments, method: Method) -> list[Any]:
+    """The scenes to hide, with their keys and models."""
+    import keyss
+    from keyss.core.errors import UsageError
+
+    count, models = len(asked.secret), asked.models.secret_model
+    if models and len(models) != count:
+        raise UsageError(
+            f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
+        )
+    keys = _keys(asked, count) if method.capabilities.keys or asked.key_file else [""] * count
+    with_models = zip(asked.secret, keys, models or (None,) * count, strict=True)
+    return [keyss.Secret(scene, key, model) for scene, key, model in with_models]
+
+
+def _keys(asked: HideArguments, count: int) -> list[str]:
     from keyss.cli.keys import keys, warn_of_doubtful_keys
+
+    found = keys(asked.key_file, count, confirm=True)
+    warn_of_doubtful_keys(found)
+    return found
+
+
+def _check_trains(asked: HideArguments, cover: Path, options: MethodOptions) -> None:
+    """Raise UsageError for options of training where nothing is trained."""
+    from keyss.core.errors import UsageError
+    from keyss.rendering.orbit import is_model
+
+    sources = [asked.models.cover_model or cover, *(asked.models.secret_model or asked.secret)]
+    if options.may_train or not all(map(is_model, sources)):
+        return
+    idle = ["--preset"] if asked.preset != "default" else []
+    idle += [flag for flag in given(asked.training) if flag in ("--iterations", "--max-gaussians", "--live")]
+    if idle:
+        raise UsageError(
+            f"{' and '.join(idle)}: nothing is trained when --method {options.method} gets models of all "
+            f"scenes; leave {'it' if len(idle) == 1 else 'them'} out"
+        )
+
+
+def _method_options(asked: HideArguments, method: Method) -> MethodOptions:
+    """The preset, with the options of the command line instead of its own."""
+    from keyss.cli.hiding_options import own_options
+
+    known = own_options(method)
+    changes = {
+        name: parse(value) if (parse := known[name][1].parse) else value
+        for name, value in vars(asked.own).items()
+        if value is not None and value is not False
+    }
+    changes |= {"publish": asked.publish}
+    changes |= {"channel": asked.publication.channel} if asked.publication.channel else {}
+    options = replace(method.options.preset(asked.preset), **changes)
+    return options.with_fit(**asked.training.schedule())
+
+
+def _hide_files(asked: HideArguments, cover: Path) -> None:
+    import keyss
+    from keyss.channels import channel_for
+    from keyss.cli.ranks import check_command
     from keyss.cli.tables import print_files
     from keyss.core.errors import UsageError
     from keyss.rendering.orbit import is_model
     from keyss.runs.files import STEGOS
 
+    check_command("hide --secret-file", trains=False)
+    _refuse(asked, "--secret-file", "cover secret_file key_file publish out overwrite device channel")
     if not is_model(cover):
         raise UsageError(
-            f"--secret-file needs a model as the cover, and {cover} is none; `keyss fit` makes one of photos"
+            f"--secret-file needs a model as the cover, and {cover} is none; `keyss fit` makes one from "
+            "photos"
         )
-    opening = keys(key_file, len(files), confirm=True)
-    warn_of_doubtful_keys(opening)
-    secrets = [api.SecretFile(file, key) for file, key in zip(files, opening, strict=True)]
-    result = api.hide_files(
-        cover, secrets, publish=publish, channel=channel, repair=repair, out=out, overwrite=overwrite
+    files, keys = asked.secret_file, _keys(asked, len(asked.secret_file))
+    channel = asked.publication.channel or "colours"
+    result = keyss.hide(
+        cover,
+        [keyss.Secret(file=file, key=key) for file, key in zip(files, keys, strict=True)],
+        publish=asked.publish,
+        channel=channel,
+        out=asked.out,
+        overwrite=asked.overwrite,
     )
-    for file, size in zip(files, result.sizes, strict=True):
-        print(f"{file.name}: {size:,} bytes, opened again from what was written")
-    print(f"The cover's views changed by {result.psnr:.0f} dB PSNR")
-    print_files(out, dict.fromkeys(STEGOS, f"publish this, {_HOW[publish == 'any']}"))
+    for file in files:
+        print(f"{file.name}: {file.stat().st_size:,} bytes, revealed again from the published file")
+    print(f"PSNR of the cover's views to those before: {result.psnr:.0f} dB")
+    print_files(
+        asked.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(asked.publish, channel).survives])
+    )
+
+
+def _hide_batch(asked: HideArguments, table: Path) -> None:
+    import keyss
+    from keyss.cli.keys import key_of_file, warn_of_doubtful_keys
+    from keyss.cli.ranks import check_command
+    from keyss.cli.tables import print_files, print_outcome
+    from keyss.methods import registry
+
+    check_command("hide --batch", trains=False)
+    method, batch = registry.get(asked.method), asked.batch
+    used = "batch master_key_file jobs ray out publish channel preset overwrite device min_psnr"
+    used += " width background skip_missing iterations max_gaussians seed"
+    _refuse(asked, "--batch", used, vars(asked.own))
+    if batch.master_key_file is not None:
+        warn_of_doubtful_keys([key_of_file(batch.master_key_file)])
+    result = keyss.hide_batch(
+        table,
+        asked.out,
+        method=_method_options(asked, method),
+        master_key_file=batch.master_key_file,
+        **vars(asked.photos),
+        min_psnr=asked.quality.min_psnr,
+        device=asked.device,
+        jobs=batch.jobs,
+        ray=batch.ray,
+        overwrite=asked.overwrite,
+    )
+    if skipped := sum(each.skipped for each in result.outcomes):
+        print(f"{skipped} of {len(result.outcomes)} assets were done before")
+    print_files(asked.out, {"private/batch.csv": "the outcome of each asset"})
+    print_outcome(result, "assets")
+
+
+def _refuse(asked: HideArguments, mode: str, used: str, own: Sequence[str] = ()) -> None:
+    """Raise UsageError for a given option that `mode` does not use."""
+    from keyss.core.errors import UsageError
+
+    names = {flag.removeprefix("--").replace("-", "_"): flag for flag in given(asked)}
+    if unused := [flag for name, flag in names.items() if name not in (*used.split(), *own)]:
+        raise UsageError(f"{mode} does not use {unused[0]}: leave out {unused[0]}")

@@ -1,4 +1,4 @@
-"""Where keys come from: files, the environment, a hidden prompt; never arguments, which others see."""
+"""Where keys come from: files, the environment or a prompt, but never arguments, which others can see."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ VARIABLE = "KEYSS_KEY"
 
 
 def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[str]:
-    """`count` keys: those of `files` if there are any, else of the environment, else asked for.
+    """`count` keys, from `files`, else from the environment, else from a prompt.
 
-    `confirm` asks twice, for keys that lock rather than open. Raises UsageError when the numbers do not
-    fit or there is nowhere to ask, InputError for a file that holds no key.
+    `confirm`: ask twice, for keys to hide with. Raises UsageError if the numbers differ or there is no
+    terminal for a prompt, InputError for a file without a key.
     """
     if files:
         if len(files) != count:
@@ -36,12 +36,12 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
             )
         return [_checked(os.environ[VARIABLE], VARIABLE)]
     if not sys.stdin.isatty() or processes() > 1:
-        raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal and be asked")
+        raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
     return [_ask(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 
 
 def keys_of_run(run: Path, files: Sequence[Path]) -> list[str]:
-    """The keys of a run's secrets: as many as there are files, or one; none where its method has none."""
+    """The keys of a run's secrets: as many as files, else one; none if its method has no keys."""
     from keyss.methods import registry
     from keyss.runs.config import read_config
     from keyss.runs.files import CONFIG, is_run
@@ -52,10 +52,7 @@ def keys_of_run(run: Path, files: Sequence[Path]) -> list[str]:
 
 
 def warn_of_doubtful_keys(chosen: Sequence[str]) -> None:
-    """Say on the standard error stream which of the keys can be guessed or were hardly meant like that.
-
-    What they are is not said.
-    """
+    """Warn of keys that are easy to guess or have white space at an end, without showing them."""
     from keyss.keys import weakness
 
     for number, key in enumerate(chosen, start=1):
@@ -66,7 +63,7 @@ def warn_of_doubtful_keys(chosen: Sequence[str]) -> None:
 
 @contextmanager
 def hinting_at_white_space(chosen: Sequence[str]) -> Iterator[None]:
-    """Adds to the error of keys that open nothing what may be wrong with them."""
+    """Adds a hint to WrongKeyError if a key has white space at an end."""
     try:
         yield
     except WrongKeyError as error:
@@ -75,7 +72,6 @@ def hinting_at_white_space(chosen: Sequence[str]) -> Iterator[None]:
 
 
 def _white_space(key: str) -> str | None:
-    """What to say of a key with white space at an end, which nobody sees."""
     if key == key.strip():
         return None
     end = "begins" if key != key.lstrip() else "ends"
@@ -85,14 +81,14 @@ def _white_space(key: str) -> str | None:
 
 
 def key_of_file(path: Path) -> str:
-    """The text of a key file without one newline at its end; warns of one that others may read.
+    """The text of a key file without one newline at its end; warns if others can read it.
 
-    Raises InputError for a file that holds no key.
+    Raises InputError for a file without a key.
     """
     key, mode = read_key_file(path)
     if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
         print(
-            f"keyss: warning: {path}: others can read this key file; `chmod 600` keeps it to you",
+            f"keyss: warning: {path}: others can read this key file; protect it with `chmod 600`",
             file=sys.stderr,
         )
     return key
@@ -109,7 +105,7 @@ def _ask(prompt: str, confirm: bool) -> str:
 
 
 def _checked(key: str, where: str) -> str:
-    """`key`, if it is text that can be encoded. Raises UsageError."""
+    """`key`, if it is not empty and valid UTF-8. Raises UsageError."""
     if not key:
         raise UsageError(f"{where} is empty")
     try:

@@ -1,9 +1,8 @@
-"""The process around the command line: signals, standard streams, and how it ends.
+"""The process of the command line: signals, standard streams, exit.
 
-Python turns Ctrl-C into an exception wherever it happens to be. In the middle of an import that is a
-traceback, or worse: native libraries such as torch's do not survive being loaded half, and crash when they
-are loaded again or when the interpreter shuts down. So this module, which imports next to nothing, is ready
-for signals before anything else is loaded, and ends the process itself.
+Python turns Ctrl-C into an exception at any point. In the middle of an import that prints a traceback, or
+worse: native libraries such as torch's crash when half of them is loaded, also at the interpreter's shutdown.
+This module imports little, installs signal handlers before anything else is imported, and exits by itself.
 """
 
 from __future__ import annotations
@@ -16,26 +15,26 @@ import sys
 from types import FrameType
 from typing import Any, NoReturn
 
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is not everywhere
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _IMPORTING = "<frozen importlib._bootstrap>"
-_CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which a progress line hides
+_CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which progress lines hide
 
 
 def main() -> NoReturn:
-    """Run the command line as a process of its own, to its end."""
+    """Run the command line, and exit."""
     _Process().run()
 
 
 class _Process:
     def __init__(self) -> None:
         self.received: int | None = None  # the first signal
-        self.running = False  # inside a command, which cleans up when it is interrupted
-        self.status: int | None = None  # of a command that is done
+        self.running = False  # inside a command, which cleans up on an interrupt
+        self.status: int | None = None  # of the command, once it is done
 
     def run(self) -> NoReturn:
         for name in _SIGNALS:
             signum = getattr(signal, name, None)
-            # What is ignored stays so: `nohup`, and commands that a script runs in the background.
+            # Ignored signals stay ignored: `nohup`, and background commands of scripts.
             if signum is not None and signal.getsignal(signum) is not signal.SIG_IGN:
                 signal.signal(signum, self.on_signal)
         sys.unraisablehook = self.on_unraisable
@@ -50,7 +49,7 @@ class _Process:
         except KeyboardInterrupt as interrupt:
             self.received = self.received or (interrupt.args[0] if interrupt.args else signal.SIGINT)
         if self.received is not None:
-            # Not through the interpreter's shutdown, which does not stand up to what was interrupted.
+            # The interpreter's shutdown could crash after an interrupt.
             if self.status in (None, 0):
                 self.end(self.received)
             os._exit(128 + self.received)
@@ -59,20 +58,20 @@ class _Process:
 
     def on_signal(self, signum: int, frame: FrameType | None) -> None:
         if self.status is not None:
-            os._exit(self.status)  # all is done, only Python is still closing
+            os._exit(self.status)  # the command is done, the interpreter is shutting down
         first, self.received = self.received is None, self.received or signum
         if not (first and self.running) or _is_importing(frame):
             self.end(self.received)
         raise KeyboardInterrupt(signum)
 
     def on_unraisable(self, unraisable: Any) -> None:
-        """Python drops an exception that comes up where none can, such as a callback of native code."""
+        """Python drops exceptions in some places, such as callbacks of native code."""
         if self.received is not None and isinstance(unraisable.exc_value, KeyboardInterrupt):
             self.end(self.received)
         sys.__unraisablehook__(unraisable)
 
     def end(self, signum: int) -> NoReturn:
-        """At once, with one line and nothing else: whatever runs may be half done."""
+        """Exit at once with one line, since anything may be half done."""
         line = f"keyss: {'interrupted' if signum == signal.SIGINT else 'terminated'}\n".encode()
         try:
             os.write(2, _CLEAR_LINE * os.isatty(2) + line)
@@ -89,7 +88,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 class _Unfailing(io.FileIO):
-    """A stream for messages: where they cannot be written, work goes on without them."""
+    """A stream for messages, which are dropped if they cannot be written."""
 
     def write(self, data: Any) -> int:
         try:
@@ -99,10 +98,10 @@ class _Unfailing(io.FileIO):
 
 
 def prepare_streams() -> None:
-    """Make the standard streams ones that are there and take every character.
+    """Make sure that the standard streams are open and accept every character.
 
-    A stream that is closed becomes one that is empty: the next file that is opened must not get its number,
-    or what is printed ends up in a result.
+    A closed stream is opened on the null device, or else the next file that is opened would get its number,
+    and messages would end up in a result.
     """
     for number in range(3):
         try:

@@ -1,4 +1,4 @@
-"""Several processes of torchrun at one command: the first one speaks for all."""
+"""Commands in several processes, as torchrun starts them: the first process prints for all."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ COMMANDS = ("fit", "hide")  # that train
 
 
 def answers() -> bool:
-    """Whether this process answers for the command."""
+    """Whether this is the first process, or the only one."""
     return rank() == 0
 
 
 @contextmanager
-def one_speaks() -> Iterator[None]:
-    """Only the first process writes to the standard streams while the block runs."""
+def only_first_prints() -> Iterator[None]:
+    """Silences the standard streams of all processes but the first."""
     if answers():
         yield
         return
@@ -27,21 +27,18 @@ def one_speaks() -> Iterator[None]:
         yield
 
 
-def has_to_say(error: BaseException) -> bool:
-    """Whether `error` is to be told by this process: others tell what only they can know.
-
-    What is wrong with arguments all find, signals come to all, and who has ended tells why by itself.
-    """
+def prints(error: BaseException) -> bool:
+    """Whether this process prints `error`: processes other than the first skip what all of them raise."""
     return answers() or not isinstance(error, UsageError | OtherProcessError | KeyboardInterrupt)
 
 
-def name() -> str:
-    """Of a process that is not the first, before what it says."""
+def prefix() -> str:
+    """The name of this process in messages, if it is not the first."""
     return "" if answers() else f"process {rank() + 1} of {processes()}: "
 
 
 def check_command(command: str, *, trains: bool | None = None) -> None:
-    """Raise UsageError for a command that several processes would only do several times."""
+    """Raise UsageError for a command that does not train, in several processes."""
     trains = command.startswith("-") or command in COMMANDS if trains is None else trains
     if processes() > 1 and not trains:
         raise UsageError(f"torchrun is for `keyss fit` and `keyss hide`: start `keyss {command}` without it")

@@ -1,6 +1,6 @@
-"""The command that makes the paper's tables again.
+"""The command that reproduces the paper's tables.
 
-Everything heavy is imported inside the command, so that `keyss --help` answers at once.
+Heavy modules are imported inside the function: `keyss --help` needs none of them.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from keyss.cli.arguments import Device, OutFolder, Seed, optional
+from keyss.cli.arguments import Device, OutFolder, optional
 
 if TYPE_CHECKING:
-    from keyss.reproduction.record import Reproduction
+    from keyss.many import Reproduction
 
 Name = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
-_SCALE = "the scale's"
+_SCALE = "see --data"
 
 
 def reproduce(
@@ -30,29 +30,27 @@ def reproduce(
         ),
     ] = (),
     *,
-    scale: Annotated[
-        Literal["small", "full"],
-        arg(help="small: 1,000 steps, 9,000 Gaussians, 120 pixels of width. full: the paper's sizes."),
-    ] = "small",
     data: Annotated[
-        Path | None, optional("FOLDER", "Mip-NeRF 360, and playroom, for --scale full.", "scenes are given")
+        Path | None,
+        optional(
+            "FOLDER",
+            "Mip-NeRF 360, and playroom: the paper's scenes, at its sizes of 30,000 steps and 500,000 "
+            "Gaussians.",
+            "scenes are given; 1,000 steps, 9,000 Gaussians, 120 pixels",
+        ),
     ] = None,
     pairs: Annotated[
         UseAppendAction[tuple[str, ...]],
         optional(
             "COVER,SECRET",
-            "Which scene hides which, by their names; of multi COVER,SECRET,SECRET. Once for each.",
-            "each hides the next; at full scale as published",
+            "Which scene hides which, by their names; for multi COVER,SECRET,SECRET. Once for each.",
+            "each hides the next; with --data as published",
         ),
     ] = (),
     most: Annotated[int | None, optional("N", "Only the first N of these pairs.", "all")] = None,
     out: OutFolder,
     download: Annotated[
-        bool,
-        arg(
-            help="First fetch the scenes that --data lacks of those needed, from where their authors have "
-            "them: up to 12.5 GB for most, at full scale."
-        ),
+        bool, arg(help="First download the scenes that --data lacks from their authors, up to 12.5 GB.")
     ] = False,
     dry_run: Annotated[
         bool, arg(help="Print what would run and estimates of the time; write nothing.")
@@ -63,49 +61,51 @@ def reproduce(
         int | None, optional("PIXELS", "Photos wider than this are downscaled to it.", _SCALE)
     ] = None,
     device: Device = "auto",
-    seed: Seed = None,
+    seed: Annotated[int, arg(metavar="N", help="Seed of everything random.")] = 0,
 ) -> None:
-    """Lay a table of the KeySS paper beside what is measured here, and say which of its claims hold.
+    """Reproduce a table of the KeySS paper, and check its claims.
 
-    The same command goes on after whatever ended it, and tables in one folder share their runs. A claim
-    holds where all comparisons of means that it is made of do, and in part where half of them do.
+    The same command resumes after any interruption, and tables in one folder share their runs. A claim holds
+    if all of its comparisons of means hold, and in part if half of them do.
 
     example: keyss reproduce single SCENE_A SCENE_B -o runs/paper
 
-    example: keyss reproduce multi --scale full --data 360_v2 --download -o runs/paper-full
+    example: keyss reproduce multi --data 360_v2 --download -o runs/paper-full
     """
-    from keyss import api
-    from keyss.cli.tables import print_files, print_planned_runs
+    import keyss
+    from keyss.cli.tables import print_files, print_forecast
     from keyss.core.errors import InputError, UsageError
+    from keyss.many import Forecast
     from keyss.progress import reporter
 
-    asked = api.PaperTable(
+    if download and (dry_run or data is None):
+        raise UsageError("--download: needs --data, and no --dry-run")
+    found = keyss.reproduce(
         table,
         scenes,
-        scale=scale,
         data=data,
+        download=download,
         pairs=pairs,
         most=most,
         iterations=iterations,
         max_gaussians=max_gaussians,
         width=width,
+        seed=seed,
         device=device,
+        out=out,
+        dry_run=dry_run,
+        reporter=reporter(),
     )
-    if download and dry_run:
-        raise UsageError("--dry-run writes nothing: leave out --download, or download first")
-    if download:
-        api.download_scenes(asked, reporter=reporter())
-    if dry_run:
-        print_planned_runs(api.plan_reproduction(asked, out=out))
+    if isinstance(found, Forecast):
+        print_forecast(found, 1)
         return
-    found = api.reproduce(asked, seed=seed, out=out, reporter=reporter())
     _print_table(found)
     print_files(
         out,
         {
-            f"{table}.md": "the table and what the claims come to, in Markdown",
+            f"{table}.md": "the table and the verdicts, in Markdown",
             f"{table}.json": "the same, for programs",
-            "runs": "what was run: further tables use it",
+            "cells": "the runs, which other tables share",
         },
     )
     if found.failures:
@@ -113,21 +113,15 @@ def reproduce(
 
 
 def _print_table(found: Reproduction) -> None:
-    from keyss.cli.tables import Console, new_table
-    from keyss.reproduction.record import cells
+    from keyss.cli.tables import print_in_parts
+    from keyss.many.paper.layout import cells
 
-    heads, *rows = cells(found)
-    width = 5  # columns side by side, as wide as terminals are
-    for start in range(1, len(heads), width):
-        part = new_table(heads[0], *heads[start : start + width], texts=1)
-        for row in rows:
-            part.add_row(row[0], *row[start : start + width])
-        Console().print(part)
+    print_in_parts(cells(found))
     for claim in found.claims:
         print(f"{claim.verdict} ({claim.holding} of {claim.parts}): {claim.text}")
     for name, why in found.failures.items():
         print(f"failed: {name}: {why}")
     print(
-        "Published figures, and those measured here on photos that were not trained on: means over "
+        "Published figures, and those measured here on photos that were not trained on; means over "
         f"{len(found.pairs)} pair(s)."
     )

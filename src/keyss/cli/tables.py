@@ -1,33 +1,38 @@
-"""What is printed when a command is done."""
+"""What commands print when they are done."""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console as RichConsole
 from rich.table import Table
+from rich.text import Text
 
+from keyss.core.errors import InputError
 from keyss.progress import about
+from keyss.runs.records import record_bytes
 
 if TYPE_CHECKING:
-    from keyss._verbs.converting import Conversion
-    from keyss.comparison.record import Comparison
+    from keyss.api.converting import Conversion
     from keyss.fitting.image_metrics import ImageQuality
+    from keyss.many import Comparison, Forecast, ManyResult
     from keyss.measure.stegexpose import Steganalysis
+    from keyss.methods.plan import Plan
     from keyss.runs.metrics import FitMetrics, HideMetrics
-    from keyss.runs.planning import Plan, PlannedRun
 
 
 _GAP = 2  # characters between columns
 
 
 class Console(RichConsole):
-    """Leaves it to the entry point what to do when whoever reads has left."""
+    """Leaves broken pipes to the entry point."""
 
     def on_broken_pipe(self) -> None:
-        raise  # what is being handled
+        raise  # the BrokenPipeError that is being handled
 
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
@@ -38,7 +43,7 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     plain = [metrics.baseline.cover, *metrics.baseline.secrets]
     sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
     differ = any(other not in (own, None) for own, other in sizes)
-    equal = metrics.baseline.equal or (False,) * len(names)  # of runs before it was known
+    equal = metrics.baseline.equal or (False,) * len(names)
     shorter = [not same and other is not None for same, other in zip(equal, plain, strict=True)]
     trained = metrics.steps or (None,) * len(names)
     before = metrics.baseline.steps or (None,) * len(names)
@@ -50,10 +55,10 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     ]
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
-        psnrs += [(f"{wrong.keys} wrong keys, against the cover", wrong.vs_cover.mean)]
-        psnrs += [("  the worst of them", wrong.vs_cover.min)]
+        psnrs += [(f"{wrong.keys} wrong keys, mean to the cover", wrong.vs_cover.mean)]
+        psnrs += [("  lowest to the cover", wrong.vs_cover.min)]
         psnrs += [
-            (f"  the one nearest to the secret{number}", found.max)
+            (f"  highest to the secret{number}", found.max)
             for number, found in zip(numbers, wrong.vs_secrets, strict=True)
         ]
     psnrs += [
@@ -82,35 +87,34 @@ def print_plan(plan: Plan) -> None:
         table.add_row(stage.name, steps, f"{stage.gaussians:,}", about(stage.seconds))
     table.add_row("all", "", "", about(plan.seconds))
     Console().print(table)
-    outlook = plan.outlook
     free = "" if plan.free_bytes is None else f", {plan.free_bytes / 1e6:,.0f} MB free"
     _print_columns(
         [
             ("method", plan.method),
-            ("room", f"{outlook.capacity:,} of the secrets' {outlook.asked:,} Gaussians"),
+            ("room", f"{plan.capacity:,} of the secrets' {plan.asked:,} Gaussians"),
             (
                 "published",
-                f"up to {outlook.gaussians:,} Gaussians of SH degree {outlook.sh_degree}, "
+                f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, "
                 f"{plan.file_bytes / 1e6:,.1f} MB",
             ),
             ("memory", f"about {plan.memory_bytes / 1e9:.1f} GB"),
             ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included{free}"),
-            *(("note", note) for note in outlook.notes),
+            *(("note", note) for note in plan.notes),
         ]
     )
-    print("Nothing was written. Times are extrapolated from a few steps, and rough.")
+    print("Dry run: nothing was written. Times are rough.")
 
 
 def _explanations(
     metrics: HideMetrics, names: Sequence[str], sizes_differ: bool, shorter: Sequence[bool]
 ) -> list[str]:
-    """A line for each term of the table."""
+    """A line for each term of the table of a hiding."""
     rendered = [name for name, photos in zip(names, metrics.photos, strict=True) if not photos]
-    views = "photos that were not trained on"
+    views = "photos held out of training"
     if len(rendered) == len(names):
-        views = "8-bit renders of the given models, as there are no photos"
+        views = "8-bit renders of the given models"
     elif rendered:
-        views += f"; for {', '.join(rendered)} 8-bit renders of the given model, as there are none"
+        views += f"; for {', '.join(rendered)} 8-bit renders of the given model"
     lines = [f"Test views: {views}. PSNR, bound, loss and start in dB."]
     sizes = zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True)
     near = all(other is None or abs(other - own) <= 0.02 * own for own, other in sizes)
@@ -121,15 +125,15 @@ def _explanations(
         lines.append(f"Bound: plain 3DGS of {size} and as many training steps.")
     if any(shorter):
         lines.append(
-            f"Start: a plain model of {size} that was not trained as long, which is no bound; `keyss hide "
-            "--bound` fits plain 3DGS of as many Gaussians and as many training steps to compare with."
+            f"Start: a plain model of {size} and fewer training steps, which is no bound; `keyss hide "
+            "--bound` fits one."
         )
     if metrics.chance_level:
         lines.append(
-            "Chance level: the stego model itself against the secret. No wrong key should get above."
+            "Chance level: PSNR of the stego model itself to the secret; no wrong key should exceed it."
         )
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
-    lines.append(f"Opened again from what was written, against the plain models: {', '.join(reached)} dB.")
+    lines.append(f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB.")
     return lines
 
 
@@ -142,7 +146,7 @@ def print_fit(metrics: FitMetrics) -> None:
 
 
 def print_steganalysis(found: Steganalysis) -> None:
-    """How many images there are and how many of them are taken for stego images."""
+    """The number of images, and of those flagged as stego images."""
     table = new_table("images", "flagged", "mean fusion")
     mean = found.mean_fusion
     flagged = sum(row.flagged for row in found.rows)
@@ -152,21 +156,26 @@ def print_steganalysis(found: Steganalysis) -> None:
 
 def print_comparison(found: Comparison) -> None:
     """The tables of `comparison.md`, in parts as wide as the terminal."""
-    from keyss.comparison.tables import LEGEND, impossible, not_measured, tables
+    from keyss.many.comparison import LEGEND, comparison_tables, impossible, not_measured
 
-    console = Console()
-    for table in tables(found):
-        for columns in parts_within(console.width, [table.heads, *table.rows]):
-            part = new_table(*(table.heads[index] for index in columns), texts=1)
-            for row in table.rows:
-                part.add_row(*(row[index] for index in columns))
-            console.print(part)
+    for rows in comparison_tables(found).values():
+        print_in_parts(rows)
     for line in (*impossible(found), *not_measured(found), *LEGEND):
         print(line)
 
 
+def print_in_parts(rows: Sequence[Sequence[str]]) -> None:
+    """A table, the heads first, in parts as wide as the terminal."""
+    console = Console()
+    for columns in parts_within(console.width, rows):
+        part = new_table(*(rows[0][index] for index in columns), texts=1)
+        for row in rows[1:]:
+            part.add_row(*(row[index] for index in columns))
+        console.print(part)
+
+
 def parts_within(width: int, rows: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Columns that go side by side in so many characters: the first one in each part, all in order."""
+    """Groups of columns that fit in `width` characters, each with the first column, in order."""
     widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
     parts: list[list[int]] = [[0]]
     for index, own in enumerate(widths[1:], start=1):
@@ -178,13 +187,12 @@ def parts_within(width: int, rows: Sequence[Sequence[str]]) -> list[list[int]]:
 
 
 def print_verdicts(run: Path) -> None:
-    """What an audit comes to: a line for each measure, beside its baseline or control."""
-    from keyss.report.verdicts import headline, verdicts
-    from keyss.runs.audit_record import read_audit
+    """The verdicts of an audit: a line for each measure, with its baseline or control."""
+    from keyss.audits import headline, read_audit, verdicts
 
     lines = verdicts(read_audit(run))
     table = new_table("measure", "measured", "baseline or control", "limit", "verdict", texts=5)
-    for column in (table.columns[0], table.columns[-1]):  # what is judged, and how; the rest may be long
+    for column in (table.columns[0], table.columns[-1]):
         column.no_wrap = True
     for line in lines:
         table.add_row(line.measure, line.value, line.beside, line.limit, line.word)
@@ -198,50 +206,74 @@ def print_facts(facts: Mapping[str, Any]) -> None:
 
 
 def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO) -> None:
-    """What a conversion costs: bytes, pictures, and what keys open."""
+    """The cost of a conversion: size, PSNR of renders, and what is left of the secrets."""
     was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
-    pictures = (
-        "pictures as before" if found.psnr >= 120 else f"pictures at {found.psnr:.1f} dB PSNR from before"
-    )
-    print(
-        f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {pictures}", file=file
-    )
+    renders = "renders unchanged" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
+    print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
     for number, secret in enumerate(found.secrets, 1):
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
-        state = "opens as before" if secret.kept else f"is lost: {secret.after:,} {secret.unit} of it open"
+        state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
         print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
     if not found.secrets and not found.keeps_low_bits:
-        print("what may lie in low bits does not survive this format; with a key, keyss looks", file=file)
+        print("this format destroys low bits; give --key-file to check a secret in them", file=file)
     if dry_run:
-        print("nothing was written, as asked", file=file)
+        print("dry run: nothing was written", file=file)
+
+
+def print_outcome(result: ManyResult, what: str) -> None:
+    """How many cells are done, and why others failed. Raises InputError if any failed."""
+    failed, count = result.failed, len(result.outcomes)
+    print(f"{count - len(failed)} of {count} {what} are done")
+    for each in failed:
+        print(f"failed: {each.name}: {each.error}")
+    if failed:
+        raise InputError(f"{len(failed)} of {count} {what} failed")
+
+
+def print_json(facts: object) -> None:
+    """A record as JSON, in ASCII where the standard output cannot encode its text."""
+    text = record_bytes(facts).decode()
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        text = json.dumps(json.loads(text), indent=2) + "\n"
+    print(text, end="")
 
 
 def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:,.1f} kB"
 
 
-def print_planned_runs(planned: Sequence[PlannedRun]) -> None:
-    """What of several runs is done, and about how long the others take."""
-    table = new_table("run", "time, about", texts=1)
-    for each in planned:
-        time = "not possible" if each.error else "done" if each.done else about(each.seconds)
-        table.add_row(each.name, time)
-    due = [each for each in planned if not each.done and not each.error]
+def print_forecast(found: Forecast, jobs: int | None = None) -> None:
+    """Which of several cells are done, and roughly what the others take."""
+    from keyss.many.processes import Resources
+
+    table = new_table("cell", "name", "time, about", "memory", texts=2)
+    for each in found.cells:
+        time, memory = "done" if each.done else "cannot work", ""
+        if each.plan is not None:
+            time, memory = about(each.plan.seconds), f"{each.plan.memory_bytes / 1e9:.1f} GB"
+        table.add_row(each.id[:12], Text(each.name), time, memory)
     Console().print(table)
-    for each in planned:
-        if each.error:
-            print(f"{each.name}: {each.error}")
-    print(f"{len(due)} to do: about {about(sum(each.seconds for each in due))}")
-    print("Nothing was written. Times are extrapolated from a few steps, and rough.")
+    for each in found.cells:
+        if each.refused:
+            print(f"{each.name}: {each.refused}")
+    resources = Resources.divided(jobs, max((each.memory_bytes for each in found.plans), default=1))
+    print(
+        f"{len(found.cells)} cell{'s' * (len(found.cells) != 1)}, {len(found.plans)} to do: about "
+        f"{about(sum(each.seconds for each in found.plans))} on this machine if all its cores are at work; "
+        f"{resources.jobs} at once with {resources.threads} thread(s) each"
+    )
+    print("Dry run: nothing was written. Times are rough.")
 
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:
-    """Where the results are and what each is, those that exist."""
+    """The paths of the results that exist, and what each is."""
     _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
 
 
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
-    """Two columns of plain text: paths must come out whole and as they are, however narrow the terminal."""
+    """Two columns of plain text: paths must not be wrapped, however narrow the terminal."""
     width = max((len(name) for name, _ in rows), default=0)
     for name, text in rows:
         print(f"{name:<{width}}  {text}")
@@ -251,7 +283,7 @@ def _scene_row(
     name: str,
     found: ImageQuality,
     plain: ImageQuality | None,
-    shorter: bool,  # was the plain model trained
+    shorter: bool,  # whether the plain model had fewer training steps
     gaussians: int,
     others: int | None,  # Gaussians of the plain model
     steps: int | None,
@@ -277,7 +309,7 @@ def _scene_row(
 
 
 def new_table(*names: str, texts: int = 0) -> Table:
-    """An empty table with these columns, of which the first ones hold texts and the others numbers."""
+    """An empty table with these columns: the first `texts` are left-aligned, the others hold numbers."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for index, name in enumerate(names):
         table.add_column(name, justify="left" if index < texts else "right")

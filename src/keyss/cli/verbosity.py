@@ -1,4 +1,4 @@
-"""-q and -v, which every command takes: how much is said on the standard error stream."""
+"""-q and -v, which every command takes: how much is printed on the standard error stream."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 
 
 @contextmanager
-def spoken(arguments: Sequence[str]) -> Iterator[list[str]]:
-    """`arguments` without -q and -v; at the end of a command that went well, -v tells time and memory."""
+def verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
+    """`arguments` without -q and -v. With -v, prints time and memory unless the context ends by an error."""
     asked = [_LEVELS[word] for word in arguments if word in _LEVELS]
-    if not asked:  # without loading what shows progress
+    if not asked:  # without importing what shows progress
         yield list(arguments)
         return
 
@@ -31,7 +31,7 @@ def spoken(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 
 def _memory() -> str:
-    """The most that this process has had, where the system tells."""
+    """The peak memory of this process and of the largest one that it started, if the system knows."""
     try:
         import resource
     except ImportError:
@@ -41,6 +41,5 @@ def _memory() -> str:
         f"{resource.getrusage(whose).ru_maxrss * unit / 1e6:,.0f} MB"
         for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     )
-    # Of processes that it started, such as those that fit models side by side, the system tells the largest.
     besides = f", and {others} in another process" if others != "0 MB" else ""
     return f", with at most {own} of memory{besides}"

@@ -1,46 +1,65 @@
-"""Plain data: Gaussians, cameras, scenes, similarity transforms, errors.
+"""Plain data: Gaussians, cameras, scenes, similarity transforms, errors."""
 
-All but errors is loaded at first use (PEP 562): an error must be there without torch, which takes seconds.
-"""
+from typing import TYPE_CHECKING
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
-from keyss.core.errors import (
-    BackendError,
-    InputError,
-    KeyssError,
-    KeyssWarning,
-    OutputError,
-    QualityError,
-    UsageError,
-    WrongKeyError,
-)
+from keyss._lazy import lazily
 
 if TYPE_CHECKING:
-    from keyss.core.gaussians import Gaussians
-    from keyss.core.scene import Camera, Scene, View
-
-__all__ = [
-    "BackendError",
-    "Camera",
-    "Gaussians",
-    "InputError",
-    "KeyssError",
-    "KeyssWarning",
-    "OutputError",
-    "QualityError",
-    "Scene",
-    "UsageError",
-    "View",
-    "WrongKeyError",
-]
-
-_HOMES = {"Gaussians": "gaussians", "Camera": "scene", "Scene": "scene", "View": "scene"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'keyss.core' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(f"keyss.core.{_HOMES[name]}"), name)
-    return value
+    from keyss.core.alignment import align as align, up_direction as up_direction
+    from keyss.core.decoded import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
+    from keyss.core.errors import (
+        BackendError as BackendError,
+        InputError as InputError,
+        Interrupted as Interrupted,
+        KeyssError as KeyssError,
+        KeyssWarning as KeyssWarning,
+        OtherProcessError as OtherProcessError,
+        OutputError as OutputError,
+        QualityError as QualityError,
+        UsageError as UsageError,
+        WrongKeyError as WrongKeyError,
+        signal_of as signal_of,
+    )
+    from keyss.core.extras import import_extra as import_extra
+    from keyss.core.gaussians import (
+        DRAWN_OPACITY as DRAWN_OPACITY,
+        Gaussians as Gaussians,
+        SH_C0 as SH_C0,
+        same_bits as same_bits,
+    )
+    from keyss.core.pruning_compensation import compensate_pruning as compensate_pruning
+    from keyss.core.scene import (
+        Camera as Camera,
+        Scene as Scene,
+        View as View,
+        ViewOptions as ViewOptions,
+        camera_positions as camera_positions,
+        focus_point as focus_point,
+    )
+    from keyss.core.similarity import Similarity as Similarity
+else:
+    __getattr__, __dir__, __all__ = lazily(
+        __name__,
+        {
+            "keyss.core.alignment": ["align", "up_direction"],
+            "keyss.core.decoded": ["DecodedGaussians", "PictureNetwork"],
+            "keyss.core.errors": [
+                "BackendError",
+                "InputError",
+                "Interrupted",
+                "KeyssError",
+                "KeyssWarning",
+                "OtherProcessError",
+                "OutputError",
+                "QualityError",
+                "UsageError",
+                "WrongKeyError",
+                "signal_of",
+            ],
+            "keyss.core.extras": ["import_extra"],
+            "keyss.core.gaussians": ["DRAWN_OPACITY", "Gaussians", "SH_C0", "same_bits"],
+            "keyss.core.pruning_compensation": ["compensate_pruning"],
+            "keyss.core.scene": ["Camera", "Scene", "View", "ViewOptions", "camera_positions", "focus_point"],
+            "keyss.core.similarity": ["Similarity"],
+        },
+    )

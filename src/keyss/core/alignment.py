@@ -7,18 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from keyss.core.scene import Camera, camera_positions
+from keyss.core.scene import Camera, camera_axes, camera_positions, focus_point
 from keyss.core.similarity import Similarity
 
-# Weight of the fallback point in `focus_point`, against a mean of projections whose eigenvalues are at
-# most 1: it takes over where the viewing axes differ by less than about two degrees.
-_FALLBACK_WEIGHT = 1e-3
 # A mean of unit vectors shorter than this is no direction: they point everywhere.
-_LEAST_UP = 0.1
-_LEAST_HEADING = 0.2
+_MIN_UP = 0.1
+_MIN_HEADING = 0.2
 
 
 def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> Similarity:
@@ -37,27 +33,6 @@ def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> 
     return Similarity(scale, rotation, cover.focus - scale * rotation @ secret.focus)
 
 
-def focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """[3] float64 point nearest to all viewing axes, in the least-squares sense.
-
-    Where the axes are nearly parallel, or meet behind most cameras, it is the point in front of the mean
-    camera at the distance by which the cameras are spread (1 if they all stand in one place).
-    Raises ValueError when there are no cameras.
-    """
-    if not cameras:
-        raise ValueError("cameras: expected at least one, got none")
-    positions, forward = camera_positions(cameras).double(), _axis(cameras, 2)
-    mean = positions.mean(0)
-    spread = float((positions - mean).norm(dim=1).mean())
-    fallback = mean + forward.mean(0) * (spread if spread > 0 else 1.0)
-    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]  # [C, 3, 3]
-    normal = across.mean(0) + _FALLBACK_WEIGHT * torch.eye(3, dtype=torch.float64)
-    target = torch.einsum("cij,cj->i", across, positions) / len(cameras) + _FALLBACK_WEIGHT * fallback
-    focus = torch.linalg.solve(normal, target)
-    depths = ((focus - positions) * forward).sum(1)
-    return focus if 2 * int((depths > 0).sum()) >= len(cameras) else fallback
-
-
 def up_direction(cameras: Sequence[Camera]) -> Tensor | None:
     """[3] float64 unit up direction of the world that the cameras show, None where they show none.
 
@@ -65,10 +40,10 @@ def up_direction(cameras: Sequence[Camera]) -> Tensor | None:
     plane, while the mean of the cameras' own up vectors leans forward by up to 20 degrees on a half ring.
     The mean is what is left where the horizontal axes span no plane.
     """
-    mean = _axis(cameras, 1).mean(0).neg()
-    if float(mean.norm()) < _LEAST_UP:
+    mean = camera_axes(cameras, 1).mean(0).neg()
+    if float(mean.norm()) < _MIN_UP:
         return None
-    right = _axis(cameras, 0)
+    right = camera_axes(cameras, 0)
     spread, axes = torch.linalg.eigh(right.T @ right / len(cameras))
     normal: Tensor = axes[:, 0] * torch.sign(axes[:, 0] @ mean)
     planar = bool(spread[1] > 0.05 and spread[0] < 0.2 * spread[1])
@@ -93,9 +68,9 @@ class _Capture:
         up = up_direction(cameras)
         heading = None
         if up is not None:
-            forward = _axis(cameras, 2).mean(0)
+            forward = camera_axes(cameras, 2).mean(0)
             across = forward - up * (up @ forward)
-            if float(across.norm()) > _LEAST_HEADING:
+            if float(across.norm()) > _MIN_HEADING:
                 heading = _unit(across)
         return _Capture(focus, distance if distance > 0 else 1.0, up, heading)
 
@@ -107,6 +82,8 @@ def _rotation(secret: _Capture, cover: _Capture) -> Tensor:
     """
     if secret.up is None or cover.up is None:
         return torch.eye(3, dtype=torch.float64)
+    from scipy.spatial.transform import Rotation  # takes long to load
+
     if secret.heading is None or cover.heading is None:
         rotation, _ = Rotation.align_vectors(cover.up[None], secret.up[None])
     else:
@@ -117,8 +94,3 @@ def _rotation(secret: _Capture, cover: _Capture) -> Tensor:
 
 def _unit(vector: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vector, dim=0)
-
-
-def _axis(cameras: Sequence[Camera], row: int) -> Tensor:
-    """[C, 3] float64 unit vectors of one camera axis in the world: 0 right, 1 down, 2 forward."""
-    return torch.stack([camera.viewmat[row, :3].double() for camera in cameras])

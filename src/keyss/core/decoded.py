@@ -11,8 +11,8 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 
-MOST_FEATURES = 32  # channels that rasterizers draw at once
-MOST_LAYERS, MOST_CHANNELS = 16, 256  # of a network: files of others may ask for any memory
+MAX_FEATURES = 32  # channels that rasterizers draw at once
+MAX_LAYERS, MAX_CHANNELS = 16, 256  # of a network: files of others may ask for any memory
 Layers = tuple[tuple[Tensor, Tensor], ...]  # weight [out, in, 3, 3] and bias [out] of each
 
 
@@ -28,15 +28,15 @@ class PictureNetwork:
 
     def __post_init__(self) -> None:
         channels = len(self.background)
-        if not 1 <= channels <= MOST_FEATURES or not 1 <= len(self.layers) <= MOST_LAYERS:
-            raise ValueError(f"expected 1 to {MOST_FEATURES} channels and 1 to {MOST_LAYERS} layers")
+        if not 1 <= channels <= MAX_FEATURES or not 1 <= len(self.layers) <= MAX_LAYERS:
+            raise ValueError(f"expected 1 to {MAX_FEATURES} channels and 1 to {MAX_LAYERS} layers")
         for weight, bias in self.layers:
             if weight.dim() != 4 or tuple(weight.shape[1:]) != (channels, 3, 3):
                 raise ValueError(f"weight: expected [out, {channels}, 3, 3], got {list(weight.shape)}")
             channels = len(weight)
-            if tuple(bias.shape) != (channels,) or not 1 <= channels <= MOST_CHANNELS:
+            if tuple(bias.shape) != (channels,) or not 1 <= channels <= MAX_CHANNELS:
                 raise ValueError(
-                    f"bias: expected [{channels}], {MOST_CHANNELS} at most, got {list(bias.shape)}"
+                    f"bias: expected [{channels}], {MAX_CHANNELS} at most, got {list(bias.shape)}"
                 )
         if channels != 3:
             raise ValueError(f"layers: expected 3 channels from the last, got {channels}")

@@ -1,8 +1,8 @@
-"""Errors that a person can cause. Each carries an exit status of its own for the command line.
+"""Errors that users can cause, each with its exit status.
 
-A message says what was expected, what came, and what to do. It names arguments as Python does, between
-backticks: `overwrite=True`, `method="learned"`, `sh_degree`. The command line prints it in one line, with its
-own flags instead, and never shows a traceback for these.
+A message says what was expected, what was found, and what to do. It names arguments as in Python, between
+backticks: `overwrite=True`, `method="carry"`, `sh_degree`. The command line prints it in one line, with flags
+in place of those, and without a traceback.
 """
 
 from __future__ import annotations
@@ -10,55 +10,63 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+OPENS_NOTHING = (
+    "this key opens nothing here: it may be another key or misspelt; the model may have changed since it was "
+    "published (converted or quantised, moved, scaled, pruned, edited or trained on); or nothing is hidden"
+)
+
 
 class KeyssError(Exception):
-    """Base of every error that a person can cause."""
+    """Base of all errors that users can cause."""
 
     exit_status = 1
 
 
 class UsageError(KeyssError):
-    """Arguments that contradict each other or are out of range."""
+    """Arguments that are out of range or contradict each other."""
 
     exit_status = 2
 
 
 class WrongKeyError(KeyssError):
-    """The key opens nothing here."""
+    """The key opens nothing; the message is the same whatever the reason."""
 
     exit_status = 3
 
+    def __init__(self, message: str = OPENS_NOTHING) -> None:
+        super().__init__(message)
+
 
 class InputError(KeyssError):
-    """A file or folder that cannot be read as what it should be."""
+    """A file or folder that is missing, unreadable or of another kind."""
 
     exit_status = 4
 
 
 class OutputError(KeyssError):
-    """A result that cannot be written (it exists, the disk is full, no permission)."""
+    """A result that cannot be written: it exists, the disk is full, permission is denied."""
 
     exit_status = 5
 
 
 class QualityError(KeyssError):
-    """What was made is not good enough to be given out."""
+    """A result that fails its quality check."""
 
     exit_status = 7
 
 
 class BackendError(KeyssError):
-    """A backend or an optional dependency that is not there."""
+    """A missing backend or optional package."""
 
     exit_status = 6
 
 
 class OtherProcessError(BackendError):
-    """Of several processes that work on one run, another one has ended: that one knows why."""
+    """Another process of the same run has ended, and reports the reason itself."""
 
 
 class KeyssWarning(UserWarning):
-    """A result came out, but there is something to know about it; worded as messages of errors are."""
+    """A problem that does not prevent a result."""
 
 
 class Interrupted(KeyboardInterrupt):

@@ -10,8 +10,8 @@ import torch
 from keyss.core.gaussians import Gaussians
 
 _GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
-_MOST_LOST = 0.9  # share; a greater loss is compensated as this one
-_LEAST_LOST = 0.01  # share; a smaller loss changes opacities no more than rounding does
+_MAX_LOST = 0.9  # share; a greater loss is compensated as this one
+_MIN_LOST = 0.01  # share; a smaller loss changes opacities no more than rounding does
 
 
 def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
@@ -21,8 +21,8 @@ def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
     deviations grow by p^-0.25. When a quarter of a model is lost, this wins back 0.4 to 1 dB of 2 to 4.
     Returns `gaussians` unchanged when fewer than 1 % were lost or `count` is 0 (unknown).
     """
-    share = max(len(gaussians) / max(count, 1), 1 - _MOST_LOST)
-    if share >= 1 - _LEAST_LOST:
+    share = max(len(gaussians) / max(count, 1), 1 - _MAX_LOST)
+    if share >= 1 - _MIN_LOST:
         return gaussians
     transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7) ** (1 / share)
     return replace(

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from keyss.core.errors import UsageError
+
+# Weight of the fallback point in `focus_point`, against a mean of projections whose eigenvalues are at
+# most 1: it takes over where the viewing axes differ by less than about two degrees.
+_FALLBACK_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,24 @@ class View:
 
 
 @dataclass(frozen=True)
+class ViewOptions:
+    """How the views of scenes are read, or rendered where a model stands for a scene; see `load_scene`."""
+
+    width: int | None = None  # pixels that wider photos are shrunk to
+    background: tuple[float, ...] | None = None  # [3] in [0, 1]
+    skip_missing: bool = False  # whether photos that are not on disk are left out
+
+    @staticmethod
+    def of(
+        width: int | None = None,
+        background: Tensor | Sequence[float] | None = None,
+        skip_missing: bool = False,
+    ) -> ViewOptions:
+        colour = None if background is None else tuple(float(each) for each in background)
+        return ViewOptions(width, colour, skip_missing)
+
+
+@dataclass(frozen=True)
 class Scene:
     """Posed images of one scene, split into training and test views, and its sparse points."""
 
@@ -66,8 +91,6 @@ class Scene:
         positions = camera_positions(cameras)
         reach = float((positions - positions.mean(0)).norm(dim=1).max())
         if reach == 0:
-            from keyss.core.alignment import focus_point  # which needs this module
-
             seen = self.points.double().mean(0) if len(self.points) else focus_point(cameras)
             reach = float((positions[0].double() - seen).norm())
         return 1.1 * reach
@@ -87,3 +110,37 @@ class Scene:
 def camera_positions(cameras: Sequence[Camera]) -> Tensor:
     """[C, 3] centres of projection."""
     return torch.stack([camera.position for camera in cameras])
+
+
+def camera_axes(cameras: Sequence[Camera], row: int) -> Tensor:
+    """[C, 3] float64 unit vectors of one camera axis in the world: 0 right, 1 down, 2 forward."""
+    return torch.stack([camera.viewmat[row, :3].double() for camera in cameras])
+
+
+def focus_point(cameras: Sequence[Camera]) -> Tensor:
+    """[3] float64 point nearest to all viewing axes, in the least-squares sense.
+
+    Where the axes are nearly parallel, or meet behind most cameras, it is the point in front of the mean
+    camera at the distance by which the cameras are spread (1 if they all stand in one place).
+    Raises ValueError when there are no cameras.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none")
+    positions, forward = camera_positions(cameras).double(), camera_axes(cameras, 2)
+    mean = positions.mean(0)
+    spread = float((positions - mean).norm(dim=1).mean())
+    fallback = mean + forward.mean(0) * (spread if spread > 0 else 1.0)
+    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]  # [C, 3, 3]
+    normal = across.mean(0) + _FALLBACK_WEIGHT * torch.eye(3, dtype=torch.float64)
+    target = torch.einsum("cij,cj->i", across, positions) / len(cameras) + _FALLBACK_WEIGHT * fallback
+    focus = torch.linalg.solve(normal, target)
+    depths = ((focus - positions) * forward).sum(1)
+    return focus if 2 * int((depths > 0).sum()) >= len(cameras) else fallback
+
+
+def checked_background(background: Tensor | Sequence[float]) -> Tensor:
+    """A colour [3]. Raises UsageError for one out of range."""
+    values = [float(value) for value in background]
+    if len(values) != 3 or not all(math.isfinite(v) and 0 <= v <= 1 for v in values):
+        raise UsageError(f"expected a background of three numbers in [0, 1], got {values}")
+    return torch.tensor(values, dtype=torch.float32)

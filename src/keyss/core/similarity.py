@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
@@ -75,6 +74,8 @@ class Similarity:
 
         Lengths of the quaternions and opacities stay as they are. Differentiable.
         """
+        from scipy.spatial.transform import Rotation  # loaded where something is turned
+
         x, y, z, w = Rotation.from_matrix(self.rotation.numpy()).as_quat().tolist()
         # [4, 4]: the Hamilton product of the rotation's quaternion with another, wxyz.
         rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]

@@ -1,22 +1,17 @@
-"""Scenes, models and photos on disk: readers that trust no byte, and writers that leave no half file.
+"""Scenes, models and photos on disk: readers that trust no byte, and writers that leave no half file."""
 
-The names below are loaded at first use (PEP 562): a model is read without what reads photos.
-"""
+from typing import TYPE_CHECKING
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from keyss._lazy import lazily
 
 if TYPE_CHECKING:
-    from keyss.files.models import read_model, write_model
-    from keyss.files.scenes import load_scene
-
-__all__ = ["load_scene", "read_model", "write_model"]
-
-_HOMES = {"load_scene": "scenes", "read_model": "models", "write_model": "models"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'keyss.files' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(f"keyss.files.{_HOMES[name]}"), name)
-    return value
+    from keyss.files.models import read_model as read_model, write_model as write_model
+    from keyss.files.scenes import load_scene as load_scene
+else:
+    __getattr__, __dir__, __all__ = lazily(
+        __name__,
+        {
+            "keyss.files.models": ["read_model", "write_model"],
+            "keyss.files.scenes": ["load_scene"],
+        },
+    )

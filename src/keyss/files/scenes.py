@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
-from keyss.core.scene import Camera, Scene, View
+from keyss.core.scene import Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 from keyss.files.foreign import what_it_is
 from keyss.files.images import is_turned, probe_image, read_image, shrink
@@ -141,11 +140,3 @@ def _view(
         height = max(1, round(camera.height * width / camera.width))
         camera, pixels = camera.resized(width, height), shrink(pixels, width, height)
     return View(camera, torch.from_numpy(np.ascontiguousarray(pixels)))
-
-
-def checked_background(background: Tensor | Sequence[float]) -> Tensor:
-    """A colour [3]. Raises UsageError for one out of range."""
-    values = [float(value) for value in background]
-    if len(values) != 3 or not all(math.isfinite(v) and 0 <= v <= 1 for v in values):
-        raise UsageError(f"expected a background of three numbers in [0, 1], got {values}")
-    return torch.tensor(values, dtype=torch.float32)

@@ -10,7 +10,7 @@ from typing import BinaryIO
 from keyss.core.errors import InputError, OutputError, UsageError
 
 STANDARD = "-"
-MOST_BYTES = 4 << 30  # 16 million Gaussians of SH degree 3
+MAX_BYTES = 4 << 30  # 16 million Gaussians of SH degree 3
 _CHUNK_BYTES = 1 << 20
 
 
@@ -22,7 +22,7 @@ def is_standard(path: Path | str) -> bool:
 class StandardInput:
     """All that standard input gives, read once; as far as a reader of models is concerned, a `Path`."""
 
-    def __init__(self, limit: int = MOST_BYTES) -> None:
+    def __init__(self, limit: int = MAX_BYTES) -> None:
         """Raises InputError for a terminal, for more than `limit` bytes and when the system refuses."""
         stream = getattr(sys.stdin, "buffer", None)
         if stream is None:

@@ -2,7 +2,7 @@
 
 It moves all Gaussians, also those that the view does not show. Leaving these out ("selective" Adam,
 Mallick et al. 2024, "Taming 3DGS") saves no time here, because gaps break up the reading of memory, and
-costs quality, see docs/method.md.
+costs quality, see docs/lessons.md.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import safetensors
 import safetensors.torch
@@ -14,7 +14,9 @@ from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
-from keyss.fitting.parameters import Optimizers, Parameters
+
+if TYPE_CHECKING:
+    from keyss.fitting.parameters import Optimizers, Parameters
 
 State = dict[str, Tensor]
 

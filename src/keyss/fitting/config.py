@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 from keyss.core.errors import UsageError
 
-MOST_SEED = 2**48 - 1  # every reader of JSON takes it as it is
-MOST_VIEWS = 10**4  # of a step
+MAX_SEED = 2**48 - 1  # every reader of JSON takes it as it is
+MAX_VIEWS = 10**4  # of a step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class FitConfig:
 
     # Share of the run, at its end, over which all rates fall to a tenth: at constant ones Gaussians jitter
     # around their optimum. A model that is trained on, and does not grow, gains by it; others do not
-    # (docs/method.md).
+    # (docs/lessons.md).
     settle: float = 0.0
 
     grow_start: float = 1 / 6  # densification begins here, or at 500 iterations if that is earlier
@@ -52,8 +52,8 @@ class FitConfig:
     checkpoint_seconds: float = 180.0
 
     def __post_init__(self) -> None:
-        if self.views_per_step is not None and not 1 <= self.views_per_step <= MOST_VIEWS:
-            raise UsageError(f"`views_per_step`: expected 1 to {MOST_VIEWS}, got {self.views_per_step}")
+        if self.views_per_step is not None and not 1 <= self.views_per_step <= MAX_VIEWS:
+            raise UsageError(f"`views_per_step`: expected 1 to {MAX_VIEWS}, got {self.views_per_step}")
         for name, low, high in (
             ("iterations", 1, 10**7),
             ("max_gaussians", 16, 10**8),
@@ -64,14 +64,14 @@ class FitConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise UsageError(f"`{name}`: expected {low} to {high}, got {value}")
-        if self.seed is not None and not 0 <= self.seed <= MOST_SEED:
-            raise UsageError(f"`seed`: expected 0 to {MOST_SEED}, got {self.seed}")
+        if self.seed is not None and not 0 <= self.seed <= MAX_SEED:
+            raise UsageError(f"`seed`: expected 0 to {MAX_SEED}, got {self.seed}")
 
     def seeded(self, otherwise: int | None = None) -> FitConfig:
         """The same with a seed: its own, else `otherwise`, else one that the system draws now."""
         if self.seed is not None:
             return self
-        return replace(self, seed=secrets.randbelow(MOST_SEED + 1) if otherwise is None else otherwise)
+        return replace(self, seed=secrets.randbelow(MAX_SEED + 1) if otherwise is None else otherwise)
 
     @property
     def known_seed(self) -> int:
@@ -83,7 +83,7 @@ class FitConfig:
     def seed_of(self, use: str) -> int:
         """A seed for one part of a run, from which nothing follows of those of the other parts."""
         digest = hashlib.sha256(f"keyss/v1/seed {self.known_seed} {use}".encode()).digest()
-        return int.from_bytes(digest[:8], "little") & MOST_SEED
+        return int.from_bytes(digest[:8], "little") & MAX_SEED
 
     def sh_degree_at(self, iteration: int) -> int:
         """SH degree in use: one more every 1,000 iterations or every sixth of a shorter run."""
@@ -93,5 +93,5 @@ class FitConfig:
 PRESETS: dict[str, FitConfig] = {
     "quick": FitConfig(iterations=1000, max_gaussians=10_000),
     "default": FitConfig(),
-    "paper": FitConfig(iterations=30_000, max_gaussians=500_000, grow_start=1 / 60, grow_stop=0.5),
+    "full": FitConfig(iterations=30_000, max_gaussians=500_000, grow_start=1 / 60, grow_stop=0.5),
 }

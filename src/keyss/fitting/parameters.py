@@ -14,9 +14,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from keyss.core.alignment import focus_point
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.scene import Scene, camera_positions
+from keyss.core.scene import Scene, camera_positions, focus_point
 from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 

@@ -15,7 +15,7 @@ from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpac
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Drawn, combine_densification, draw_views
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
-from keyss.fitting.loop import Reporter, train
+from keyss.fitting.loop import train
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
@@ -25,6 +25,7 @@ from keyss.fitting.parameters import (
     to_parameters,
 )
 from keyss.fitting.ranks import here
+from keyss.fitting.reporting import Reporter
 from keyss.fitting.sampling import Shuffle
 from keyss.rendering import render_with_meta
 

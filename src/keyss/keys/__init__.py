@@ -1,39 +1,25 @@
-"""Keys: from what a person types to derived keys, and authenticated encryption under them.
+"""Keys: from what a person types to derived keys, and authenticated encryption under them."""
 
-All of it is loaded at first use (PEP 562): a new key is there without torch, which takes seconds.
-"""
+from typing import TYPE_CHECKING
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from keyss._lazy import lazily
 
 if TYPE_CHECKING:
-    from keyss.keys.derivation import DerivedKey, KeyDerivation, random_embeddings
-    from keyss.keys.generation import generate_key, length_for
-    from keyss.keys.strength import key_strength_bits, weakness
-
-__all__ = [
-    "DerivedKey",
-    "KeyDerivation",
-    "generate_key",
-    "key_strength_bits",
-    "length_for",
-    "random_embeddings",
-    "weakness",
-]
-
-_HOMES = {
-    "DerivedKey": "derivation",
-    "KeyDerivation": "derivation",
-    "generate_key": "generation",
-    "key_strength_bits": "strength",
-    "length_for": "generation",
-    "random_embeddings": "derivation",
-    "weakness": "strength",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'keyss.keys' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(f"keyss.keys.{_HOMES[name]}"), name)
-    return value
+    from keyss.keys.derivation import (
+        DerivedKey as DerivedKey,
+        KeyDerivation as KeyDerivation,
+        random_embeddings as random_embeddings,
+    )
+    from keyss.keys.generation import generate_key as generate_key, length_for as length_for
+    from keyss.keys.master import MasterKey as MasterKey
+    from keyss.keys.strength import key_strength_bits as key_strength_bits, weakness as weakness
+else:
+    __getattr__, __dir__, __all__ = lazily(
+        __name__,
+        {
+            "keyss.keys.derivation": ["DerivedKey", "KeyDerivation", "random_embeddings"],
+            "keyss.keys.generation": ["generate_key", "length_for"],
+            "keyss.keys.master": ["MasterKey"],
+            "keyss.keys.strength": ["key_strength_bits", "weakness"],
+        },
+    )

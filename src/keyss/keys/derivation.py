@@ -20,7 +20,6 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
-from scipy.special import ndtri
 from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
@@ -33,8 +32,8 @@ _STREAM_BLOCK = 1 << 16  # bytes that are made at a time
 
 
 TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4
-MOST = 4  # times the memory, and times the work, that this program asks for: a file may come from anybody
-MOST_PASSES = 4
+MAX_FACTOR = 4  # a file may ask for so many times the memory and the work of this program's own
+MAX_PASSES = 4
 
 
 @dataclass(frozen=True)
@@ -50,19 +49,19 @@ class KeyDerivation:
         if len(self.salt) != SALT_BYTES:
             raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(self.salt)}")
         ranges = (
-            ("time_cost", 1, MOST_PASSES),
-            ("memory_kib", 8 * 1024, MOST * MEMORY_KIB),
+            ("time_cost", 1, MAX_PASSES),
+            ("memory_kib", 8 * 1024, MAX_FACTOR * MEMORY_KIB),
             ("parallelism", 1, 16),
         )
         for name, low, high in ranges:
             value = getattr(self, name)
             if not (type(value) is int and low <= value <= high):
                 raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
-        work, most = self.time_cost * self.memory_kib, MOST * TIME_COST * MEMORY_KIB
+        work, most = self.time_cost * self.memory_kib, MAX_FACTOR * TIME_COST * MEMORY_KIB
         if work > most:
             raise InputError(
-                f"key derivation: expected passes times KiB of at most {most:,}, {MOST} times what this "
-                f"program asks for, got {self.time_cost} times {self.memory_kib:,}"
+                f"key derivation: expected passes times KiB of at most {most:,}, {MAX_FACTOR} times what "
+                f"this program asks for, got {self.time_cost} times {self.memory_kib:,}"
             )
 
 
@@ -141,6 +140,8 @@ class DerivedKey:
 
     def embedding(self) -> Tensor:
         """[64] float32 unit vector, uniform on the sphere over keys: what the decoder is conditioned on."""
+        from scipy.special import ndtri  # takes longer to load than a key takes to derive
+
         words = np.frombuffer(self.expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
         uniform = (words.astype(np.float64) + 0.5) / 2.0**64
         return unit_vector(torch.from_numpy(ndtri(uniform.clip(1e-16, 1 - 1e-16))))

@@ -18,8 +18,8 @@ from keyss.keys.derivation import expand
 
 DATA_KEY_BYTES = 32
 MAX_PAYLOAD_BYTES = 64 << 20  # before compression
-# A payload that compresses to n bytes has at most MOST_RATIO n + SMALL_PAYLOAD, or is not compressed at all.
-MOST_RATIO, SMALL_PAYLOAD = 16, 1 << 20
+# A payload that compresses to n bytes has at most MAX_RATIO n + SMALL_PAYLOAD, or is not compressed at all.
+MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
 SMALLEST_BUCKET = 4096
 OVERHEAD = 4 + 16  # length of what is compressed, and the tag
 _NONCE = bytes(12)
@@ -93,4 +93,4 @@ def _compressed(payload: bytes) -> bytes:
 
 def _most(packed: int) -> int:
     """Bytes that `packed` bytes may become: what a reader spends memory on."""
-    return min(MAX_PAYLOAD_BYTES, MOST_RATIO * packed + SMALL_PAYLOAD)
+    return min(MAX_PAYLOAD_BYTES, MAX_RATIO * packed + SMALL_PAYLOAD)

@@ -1,8 +1,8 @@
-"""How far apart the Gaussians of two models are as distributions, and how much of that is chance.
+"""Distances between the Gaussians of two models as distributions, and how much of them is chance.
 
-Beside 3D-Sinkhorn, which does not see most changes (`keyss.measure.sinkhorn`): exact 1-D Wasserstein
-distances along axes and along random directions (sliced Wasserstein, Bonneel et al. 2015) of features that
-do not depend on how the same Gaussian was written down.
+Exact 1-D Wasserstein distances along axes and random directions (sliced Wasserstein, Bonneel et al. 2015) of
+features that are equal for equal Gaussians, however they are stored. They detect what 3D-Sinkhorn misses: see
+`keyss.measure.sinkhorn`.
 """
 
 from __future__ import annotations
@@ -16,26 +16,25 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from keyss.core.errors import UsageError
-from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core import SH_C0, Gaussians, UsageError, import_extra
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
 Floats = npt.NDArray[np.float32]
 
 ATTRIBUTES = ("position", "scale", "rotation", "opacity", "colour", "harmonics")
 SLICES = 32
-MOST = 100_000  # Gaussians of a model that are compared; of larger ones a random subset
-_RESOLUTION = 1e-6  # of a row's largest magnitude: what float32 can hardly tell apart is no range
+MAX_GAUSSIANS = 100_000  # of each model; larger ones are subsampled
+_RESOLUTION = 1e-6  # of a row's largest magnitude: a smaller range is rounding
 
 
 @dataclass(frozen=True)
 class AttributeDistance:
-    """How far one attribute of a model is from that of control models, in units of their 5 to 95 % range."""
+    """The distance of one attribute from control models, in units of their 5 to 95 % range."""
 
     distance: float  # mean over the controls
     control: float  # mean over pairs of controls: seed-to-seed variation
-    ratio: float | None  # of the two, 1 is what one more training seed would give; None where `control` is 0
-    original: float | None = None  # the same ratio of the cover's own plain model
+    ratio: float | None  # distance / control; 1 is another training seed; None if `control` is 0
+    original: float | None = None  # the same ratio for the cover's own plain model
 
 
 def attribute_distances(
@@ -43,15 +42,13 @@ def attribute_distances(
 ) -> dict[str, float]:
     """Wasserstein distances of two models' attributes, in units of the reference's 5 to 95 % range.
 
-    Keys: those of `features`, and `joint`, over all of them at once. An attribute's
-    value is the mean over its axes and `slices` random directions in it; that of `joint` is the mean over
-    random directions in the space of everything, where each attribute has the same weight. Directions
-    depend on `seed` alone, so that all comparisons share them.
-    What does not vary in the reference is measured in units of both models' whole range; what is one
-    constant in both is left out. Models may differ in size and SH degree; of one with more than `MOST`
-    Gaussians, a random subset of so many is taken (by `seed`). Raises UsageError for an empty model.
+    By attribute, as in `features`: the mean over its axes and `slices` random directions. `joint`: the mean
+    over random directions in the space of all attributes, equally weighted. All comparisons with one `seed`
+    share their directions. An attribute that is constant in the reference is measured in units of the range
+    of both models; one that is the same constant in both is skipped. Models may differ in size and SH degree;
+    one with more than `MAX_GAUSSIANS` Gaussians is subsampled. Raises UsageError for an empty model.
     """
-    one, two = (features(model, most=MOST, seed=seed) for model in (reference, other))
+    one, two = (features(model, limit=MAX_GAUSSIANS, seed=seed) for model in (reference, other))
     return _distances(one, two, seed, slices)
 
 
@@ -62,18 +59,18 @@ def against_controls(
     original: Gaussians | None = None,
     seed: int = 0,
 ) -> dict[str, AttributeDistance]:
-    """How far `model` is from control models of the same scene, beside how far these are from each other.
+    """Distances of `model` from control models of the scene, and of the controls from each other.
 
-    By attribute, the keys of `attribute_distances`. `original`: another model of the scene, compared with the
-    controls in the same way, for one plain model may lie further from the others than these from each other.
-    Raises UsageError for fewer than two controls and for an empty model.
+    By attribute, as in `attribute_distances`. `original`: another model of the scene that is compared with
+    the controls too, since a plain model can be further from them than they are from each other. Raises
+    UsageError for fewer than two controls and for an empty model.
     """
     if len(controls) < 2:
         raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
-    plain = [features(each, most=MOST, seed=seed) for each in controls]
+    plain = [features(each, limit=MAX_GAUSSIANS, seed=seed) for each in controls]
 
     def mean_distances(other: Gaussians) -> dict[str, float]:
-        theirs = features(other, most=MOST, seed=seed)
+        theirs = features(other, limit=MAX_GAUSSIANS, seed=seed)
         return _means([_distances(each, theirs, seed, SLICES) for each in plain])
 
     distance = mean_distances(model)
@@ -89,25 +86,25 @@ def against_controls(
     }
 
 
-def features(gaussians: Gaussians, *, most: int | None = None, seed: int = 0) -> dict[str, Floats]:
-    """[N, D] float32 numbers of each attribute, by the names in `ATTRIBUTES`.
+def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -> dict[str, Floats]:
+    """[N, D] float32 features of each attribute in `ATTRIBUTES`.
 
     - `position`: D = 3.
     - `scale`: the 3 log scales in ascending order.
-    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, those off the diagonal times sqrt 2, which
-      makes distances Frobenius'. Neither sign nor length of the quaternion nor the order of axes matters.
-    - `opacity`: the logit, between -16 and 16; NaN counts as transparent.
+    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, with those off the diagonal times sqrt 2,
+      for Frobenius distances. Sign and length of the quaternion and the order of axes do not matter.
+    - `opacity`: the logit, clamped to -16 and 16; NaN counts as transparent.
     - `colour`: RGB of the constant coefficients.
-    - `harmonics`: the 45 other coefficients, zeros where the model's degree is lower than 3.
+    - `harmonics`: the 45 other coefficients, zeros above the model's degree.
 
-    With `most`, of a random subset (by `seed`) of at most so many Gaussians. Raises UsageError for an empty
+    `limit`: the maximum number of Gaussians, chosen at random by `seed`. Raises UsageError for an empty
     model.
     """
     if len(gaussians) == 0:
         raise UsageError("expected a model with Gaussians in it, got an empty one")
     flat = gaussians.detach().to("cpu")
-    if most is not None and len(flat) > most:
-        chosen = np.random.default_rng(seed).choice(len(flat), most, replace=False)
+    if limit is not None and len(flat) > limit:
+        chosen = np.random.default_rng(seed).choice(len(flat), limit, replace=False)
         flat = flat.map(lambda tensor: tensor[chosen])
     log_scales, sh = flat.log_scales.numpy(), flat.with_sh_degree(3).sh.numpy()
     logits = np.nan_to_num(flat.opacity_logits.numpy(), nan=-OPACITY_LOGIT_BOUND)
@@ -147,49 +144,47 @@ def _distances(
 
 
 def _directions(generator: np.random.Generator, count: int, size: int) -> Floats:
-    """[count, size] random unit vectors; none in one dimension, which has its axis only."""
+    """[count, size] random unit vectors; none in one dimension, where the axis is enough."""
     vectors = generator.standard_normal((count if size > 1 else 0, size))
     unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     return unit
 
 
 def _mean(distances: Floats, units: Floats) -> float:
-    """Over what varies at all."""
+    """Over the rows with a range."""
     return float(distances[units > 0].mean()) if (units > 0).any() else 0.0
 
 
 def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
-    """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and these units [D].
+    """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and the units [D].
 
-    Both are 0 where there is one constant in both.
+    Both are 0 for a row that is one constant in both.
     """
-    from ot import wasserstein_1d  # slow to import
-
     one, two = np.sort(reference, axis=1), np.sort(other, axis=1)
     last = one.shape[1] - 1
     span = np.maximum(one[:, -1], two[:, -1]) - np.minimum(one[:, 0], two[:, 0])
-    least = np.float32(_RESOLUTION) * np.abs(np.stack([one[:, 0], one[:, -1], two[:, 0], two[:, -1]])).max(
-        axis=0
-    )
+    ends = np.stack([one[:, 0], one[:, -1], two[:, 0], two[:, -1]])
+    smallest = np.float32(_RESOLUTION) * np.abs(ends).max(axis=0)
     units = one[:, round(0.95 * last)] - one[:, round(0.05 * last)]
-    units = np.where(units > least, units, np.where(span > least, span, 0))
+    units = np.where(units > smallest, units, np.where(span > smallest, span, 0))
     if one.shape == two.shape:
         areas: Floats = np.abs(one - two).mean(axis=1)
     else:
-        areas = wasserstein_1d(one.T.astype(np.float64), two.T.astype(np.float64), require_sort=False)
+        ot = import_extra("ot", "audit", "compute distances")
+        areas = ot.wasserstein_1d(one.T.astype(np.float64), two.T.astype(np.float64), require_sort=False)
     return _in_units(areas, units), units
 
 
 def _in_units(values: Floats, units: Floats) -> Floats:
-    """`values` divided by units that broadcast to them, 0 where the unit is."""
+    """`values` / `units`, which broadcast; 0 where the unit is 0."""
     divisors: Floats = np.where(units > 0, units, np.inf)
     return values / divisors
 
 
 def _elongation(quats: Floats, log_scales: Floats) -> npt.NDArray[np.float64]:
-    """[N, 6] along what, and by how much, each Gaussian is longer than wide: see `features`."""
+    """[N, 6] direction and amount of each Gaussian's elongation: see `features`."""
     xyzw = quats[:, [1, 2, 3, 0]].astype(np.float64)
-    xyzw[~xyzw.any(axis=1), 3] = 1  # zeros turn nothing
+    xyzw[~xyzw.any(axis=1), 3] = 1  # a zero quaternion means no rotation
     axes = Rotation.from_quat(xyzw).as_matrix()
     lengths = log_scales.astype(np.float64)
     lengths -= lengths.mean(axis=1, keepdims=True)

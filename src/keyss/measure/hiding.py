@@ -1,4 +1,4 @@
-"""How well a hiding works, on the test views of its scenes: the numbers of `metrics.json`."""
+"""The quality of a hiding on the test views of its scenes: the numbers of `metrics.json`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from keyss.fitting.image_metrics import (
     view_quality,
 )
 from keyss.keys import random_embeddings
-from keyss.methods.base import Opened
+from keyss.methods.opened import Opened
 from keyss.rendering import render
 
 WRONG_KEYS = 32
@@ -31,17 +31,17 @@ _FIDELITY_VIEWS = 8
 
 @dataclass(frozen=True)
 class BaselineQuality:
-    """Plain 3DGS of the same scenes; None where there is none of one.
+    """Plain 3DGS of the same scenes; None if a scene has no plain model.
 
-    A bound only where `equal`: of as many Gaussians and as many training steps. Else it is the plain model
-    from which the training of the scene went on.
+    It is a bound only if `equal`, with as many Gaussians and training steps; else it is the model that
+    training started from.
     """
 
     cover: ImageQuality | None
     secrets: tuple[ImageQuality | None, ...]
     gaussians: tuple[int | None, ...]  # of the plain models of the cover and of the secrets
-    steps: tuple[int | None, ...] = ()  # of their training; None: they were given, and it is not known
-    equal: tuple[bool, ...] = ()  # whether that is as long as the scene itself was trained, in all
+    steps: tuple[int | None, ...] = ()  # of their training; None: given models, unknown
+    equal: tuple[bool, ...] = ()  # whether the scene itself had as many steps in all
 
 
 @dataclass(frozen=True)
@@ -55,38 +55,38 @@ class PsnrRange:
 
 @dataclass(frozen=True)
 class WrongKeys:
-    """What decoders make of wrong embeddings, against test views."""
+    """PSNRs of what decoders show for wrong embeddings, on test views."""
 
     keys: int
     vs_cover: PsnrRange  # means over the decoders
-    vs_secrets: tuple[PsnrRange, ...]  # each decoder's, seen from the cameras of its secret
+    vs_secrets: tuple[PsnrRange, ...]  # of each decoder, from its secret's cameras
 
 
 @dataclass(frozen=True)
 class RenderFidelity:
-    """Renders of a model against those of the plain model that it should show, from test cameras."""
+    """Renders of a model against those of the plain model that it should look like, from test cameras."""
 
-    psnr: float  # dB, of the mean square error over all views; at most 120
-    nothing: float  # dB, what empty pictures would come to
+    psnr: float  # dB, of the mean squared error over all views; at most 120
+    nothing: float  # dB, of empty renders
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a model shows on the test views of its scene, and the plain model beside it."""
+    """The quality of a model on the test views of its scene, and of the plain model."""
 
     quality: ImageQuality
-    plain: ImageQuality | None  # None, and what follows, where there is no plain model
+    plain: ImageQuality | None  # this and the next are None without a plain model
     fidelity: RenderFidelity | None
 
 
 @dataclass(frozen=True)
 class HidingQuality:
-    """Cover and secrets on their test views, and what they are to be compared with."""
+    """Cover and secrets on their test views, with the numbers to compare them with."""
 
     cover: ImageQuality
     secrets: tuple[ImageQuality, ...]
     baseline: BaselineQuality
-    wrong_key: WrongKeys | None  # None where keys condition no decoder
+    wrong_key: WrongKeys | None  # None for methods without a keyed decoder
     chance_level: tuple[float, ...]  # dB, the stego model itself against each secret's test views
 
 
@@ -100,13 +100,13 @@ def measure_hiding(
     equal: Sequence[bool] = (),
     wrong_keys: int = WRONG_KEYS,
     seed: int = 0,
-    shown: Sequence[Shown] | None = None,  # of stego model and secrets, where it is known: they are not drawn
+    shown: Sequence[Shown] | None = None,  # of stego model and secrets, if known: they are not rendered again
 ) -> HidingQuality:
-    """Qualities of cover and secrets, of plain models, and what wrong keys show.
+    """Qualities of cover and secrets, of plain models, and of what wrong keys show.
 
-    Wrong keys are embeddings drawn as those of random keys fall. Only somebody who has a decoder but not its
-    key would see what they show; it should look like the cover, that is, be at the chance level.
-    Raises UsageError for no wrong keys at all.
+    Wrong keys are embeddings sampled like those of random keys. Whoever has a decoder without its key sees
+    what they show; it should look like the cover, that is, be at the chance level. Raises UsageError for no
+    wrong keys.
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
@@ -137,7 +137,7 @@ def measure_hiding(
 def what_wrong_keys_show(
     stego: Gaussians, opened: Sequence[Opened], scenes: Sequence[Scene], embeddings: Tensor
 ) -> WrongKeys | None:
-    """PSNRs of what the decoders make of embeddings [E, 64] that are not theirs; None without decoders."""
+    """PSNRs of what decoders show for wrong embeddings [E, 64]; None without decoders."""
     cover = scenes[0]
     decoders = [
         (each.decode, frame_of(each, secret, cover), secret)
@@ -160,7 +160,7 @@ def what_wrong_keys_show(
 
 
 def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
-    """From the secret's frame into the cover's; where it never was there, to where the cameras fit best."""
+    """From the secret's frame into the cover's; if it has none there, where the cameras fit best."""
     if opened.frame is not None:
         return opened.frame
     return align([view.camera for view in secret.train], [view.camera for view in cover.train])
@@ -168,10 +168,10 @@ def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
 
 @torch.no_grad()
 def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
-    """Both models on the test views of their scene; every picture is drawn once, and none is kept.
+    """Both models on the test views of their scene; every view is rendered once, and no render is kept.
 
-    Fidelity is how near a model comes to the plain model, where no photo says anything about either.
-    `of_plain`: the scene has no photos, its pictures are of the plain model, and are not drawn again.
+    Fidelity compares a model with the plain model itself, independently of photos. `of_plain`: the scene has
+    no photos, its images are renders of the plain model, which are not rendered again.
     """
     background = scene.background.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
@@ -204,7 +204,7 @@ def _range(values: Sequence[float]) -> PsnrRange:
 
 
 def _psnr_in(scene: Scene, model: Gaussians, frame: Similarity | None = None) -> float:
-    """Of a model on the test views of a scene, from whose frame `frame` leads into the model's."""
+    """PSNR of a model on the test views of a scene; `frame` leads from the scene's frame into the model's."""
     views = scene.test
     if frame is not None:
         views = tuple(View(frame.apply_camera(view.camera), view.image) for view in views)

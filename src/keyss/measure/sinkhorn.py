@@ -1,9 +1,9 @@
-"""3D-Sinkhorn as published (KeySS, section 3.3): a measure to be comparable by.
+"""3D-Sinkhorn as published (KeySS, section 3.3), for comparison with published numbers.
 
-It is blind to most changes. A norm says nothing of direction, and dividing each model by its own maximum
-cancels any common factor: doubled scales, turned Gaussians or colours with red and blue exchanged give
-exactly what the identical model gives, which is not 0 either. It does answer to the lengths of quaternions,
-which nobody sees. `keyss.measure.distances` has none of these faults.
+It misses most changes: norms ignore directions, and dividing each model by its own maximum cancels common
+factors. Doubled scales, rotated Gaussians and swapped red and blue give the same value as an identical model,
+which is not 0 either. It does change with the lengths of quaternions, which no render shows.
+`keyss.measure.distances` has none of these faults.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from keyss.core.errors import UsageError
-from keyss.core.gaussians import Gaussians
+from keyss.core import Gaussians, UsageError, import_extra
 
 BINS = 100
 REGULARISATION = 0.01
@@ -39,12 +38,11 @@ class Sinkhorn3D:
 def sinkhorn_3d(original: Gaussians, other: Gaussians) -> Sinkhorn3D:
     """3D-Sinkhorn of two models.
 
-    The histograms, of 100 bins, are of opacities and of the lengths of scales (as standard deviations), raw
-    quaternions, positions and constant colour coefficients, each model's divided by its own maximum. The
-    range of `original`'s values is divided into bins; what of `other` lies outside it is dropped, and if that
-    is all of it, the distance is 1. Cost: the difference of the bins' centres. Entropic regularisation: 0.01,
-    so d(p, p) > 0; at most 1,000 iterations, as is POT's default. Not symmetric.
-    Raises UsageError for an empty model.
+    Histograms of 100 bins of opacities and of the norms of scales (standard deviations), raw quaternions,
+    positions and constant colour coefficients, each divided by the model's own maximum. The bins span
+    `original`'s values; values of `other` outside are dropped, and if none is left, the distance is 1. Cost:
+    the difference of bin centres. Entropic regularisation: 0.01, hence d(p, p) > 0; at most 1,000 iterations,
+    POT's default. Not symmetric. Raises UsageError for an empty model, BackendError without POT.
     """
     if not (len(original) and len(other)):
         raise UsageError("expected two models with Gaussians in them, got an empty one")
@@ -55,7 +53,7 @@ def sinkhorn_3d(original: Gaussians, other: Gaussians) -> Sinkhorn3D:
 
 
 def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> float:
-    """The paper's one number for fidelity and stealth, the greater the better (KeySS, eq. 10).
+    """The paper's combined score of fidelity and stealth; higher is better (KeySS, eq. 10).
 
     `distance` is the `sum` of `sinkhorn_3d`; PSNRs in dB.
     """
@@ -63,7 +61,7 @@ def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> f
 
 
 def _magnitudes(gaussians: Gaussians) -> dict[str, Doubles]:
-    """[N] non-negative numbers of each attribute, divided by the largest."""
+    """[N] magnitudes of each attribute, divided by the largest."""
     flat = gaussians.detach().to("cpu").map(Tensor.double)
     sizes = {
         "opacity": flat.opacities.nan_to_num(0),
@@ -76,14 +74,13 @@ def _magnitudes(gaussians: Gaussians) -> dict[str, Doubles]:
 
 
 def _sinkhorn(original: Doubles, other: Doubles) -> float:
-    import ot  # slow to import
-
+    ot = import_extra("ot", "audit", "compute 3D-Sinkhorn")
     ours, edges = np.histogram(original, BINS)
     theirs, _ = np.histogram(other, edges)
     centres = (edges[:-1] + edges[1:]) / 2
     if not theirs.any():
         return 1.0
-    # Empty bins take no part in the problem, but POT divides by them and returns what it started from.
+    # POT divides by empty bins and returns its initial value; they do not affect the problem.
     i, j = np.flatnonzero(ours), np.flatnonzero(theirs)
     cost = np.abs(centres[i, None] - centres[None, j])
     return float(ot.sinkhorn2(ours[i] / ours.sum(), theirs[j] / theirs.sum(), cost, REGULARISATION))

@@ -1,4 +1,4 @@
-"""What a user feels: how long things take, how large files are, whether other people's programs read them."""
+"""Rendering and revealing times, file sizes, and whether third-party programs read the files."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Columns = dict[str, np.ndarray[Any, Any]]
 
 @dataclass(frozen=True)
 class RenderTime:
-    """How long a picture of a model takes, beside one of a plain model of the same scene; medians."""
+    """The time of one render of a model and of a plain model of the same scene; medians."""
 
     model: str
-    ratio: float  # the median over pairs of pictures, so that what else the machine does cancels
+    ratio: float  # median over pairs of renders, which cancels other load
     seconds: float
     plain_seconds: float
     gaussians: int
@@ -42,18 +42,18 @@ class RenderTime:
 
 @dataclass(frozen=True)
 class ReaderResult:
-    """Whether somebody else's program reads a file of ours."""
+    """Whether a third-party program reads a file."""
 
     reader: str
     file: str
-    loads: bool | None  # whether all values are those that we read, to the last bit; None: not tried
-    gaussians: int | None = None  # that it finds
-    note: str | None = None  # why it fails or was not tried, or how to install it
+    loads: bool | None  # whether all values are equal to the last bit; None: not tried
+    gaussians: int | None = None  # as many as it reads
+    note: str | None = None  # why it fails or was not tried
 
 
 @dataclass(frozen=True)
 class FileSize:
-    """A file that is published, or that revealing gives."""
+    """A published or a revealed file."""
 
     name: str
     bytes: int
@@ -69,7 +69,7 @@ class SpeedResult:
     readers: tuple[ReaderResult, ...]
 
 
-def speed(
+def measure_speed(
     stego: Path,
     reopen: Sequence[Reopen],  # one for each secret
     scenes: Sequence[Scene],  # the cover, then the secrets
@@ -81,8 +81,8 @@ def speed(
 ) -> SpeedResult:
     """Measure the published model, and what the keys reveal, beside plain models of the same scenes.
 
-    `progress`: called with models done, models in all, and the next one's name. Raises KeyssError where a
-    secret does not open.
+    `progress`: called with models done, models in all, and the next one's name. Raises KeyssError if a secret
+    does not open.
     """
     names = ["stego", *(f"secret {number}" for number in range(1, len(scenes)))]
     files, rendered, revealed = [], [], []
@@ -109,10 +109,10 @@ def speed(
 def render_time(
     name: str, model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
 ) -> RenderTime:
-    """How long a picture of `model`, called `name`, takes beside one of `plain`, from a scene's test cameras.
+    """The render time of `model`, called `name`, and of `plain`, from a scene's test cameras.
 
-    Each round draws at most `views` views with both, one right after the other and the first in turns; the
-    first round warms up and does not count.
+    Each round renders at most `views` views with both models, in alternating order; the first round is a
+    warm-up.
     """
     cameras = [view.camera for view in subsample_views(scene.test, views)]
     background = scene.background.to(model.device)
@@ -142,13 +142,13 @@ def reveal_seconds(stego: Path, reopen: Reopen, out: Path, *, repeats: int = 3) 
 
 
 def readers(path: Path) -> list[ReaderResult]:
-    """Whether other people's programs read a model of ours: plyfile, gsply and splat-transform."""
+    """Whether plyfile, gsply and splat-transform read a model file."""
     programs = (("plyfile", _plyfile), ("gsply", _gsply), ("splat-transform", _splat_transform))
     if path.name.endswith(DECODED_SUFFIX):
-        note = "a network makes its pictures: it is no 3DGS model"
+        note = "a network renders it: it is not a 3DGS model"
         return [ReaderResult(name, path.name, False, note=note) for name, _ in programs]
     if path.suffix != ".ply" or is_compressed(path):
-        note = "only a .ply of floats has every number as it is"
+        note = "only a .ply of floats stores every number exactly"
         return [ReaderResult(name, path.name, None, note=note) for name, _ in programs]
     expected = _columns_of(read_ply(path))
     found: list[ReaderResult] = []

@@ -1,8 +1,7 @@
 """StegExpose (2014): four detectors of LSB replacement in 8-bit images, their mean, and whole folders.
 
-Written anew from a description of what the original program computes; it gives the original's scores,
-quirks included. For any renderer's output an AUC near 0.5 is to be expected: nothing there replaces the
-last bits of pixels.
+An independent implementation that reproduces the original's scores, quirks included. On a renderer's output
+an AUC near 0.5 is expected: nothing replaces the last bits of pixels.
 """
 
 from __future__ import annotations
@@ -20,38 +19,36 @@ from PIL import Image
 
 from keyss.core.errors import InputError, UsageError
 from keyss.files.images import open_image
-from keyss.fitting.loop import Reporter, SilentReporter
+from keyss.fitting.reporting import Reporter, SilentReporter
 from keyss.measure.lsb_detectors import chi_square, primary_sets, rs, sample_pairs
 
 THRESHOLD = 0.2  # the original's
-# In the order in which the original program runs them, which matters to whoever stops early.
+# In the order of the original program, which matters when it stops early.
 _ORDER = {"primary_sets": primary_sets, "sample_pairs": sample_pairs, "chi_square": chi_square, "rs": rs}
 DETECTORS = ("primary_sets", "chi_square", "sample_pairs", "rs")  # in the order of its table
 
 
 @dataclass(frozen=True)
 class Scores:
-    """What StegExpose says of one image, each in [0, 1].
+    """StegExpose's scores of one image, each in [0, 1].
 
-    A detector is NaN where its equation has no solution and None where it does not take the image (Sample
-    Pairs: an odd width or height; Chi Square: less than about 87,700 pixels) or was not reached. `fusion` is
-    the mean of the others, NaN where there are none. It averages whatever answered: compare only images of
-    one size.
+    A detector is NaN if its equation has no solution, and None if it does not accept the image (Sample Pairs:
+    odd width or height; Chi Square: less than about 87,700 pixels) or was skipped. `fusion` is the mean of
+    the available scores, NaN if there are none: compare only images of one size.
     """
 
     primary_sets: float | None
     chi_square: float | None
     sample_pairs: float | None
     rs: float | None
-    fusion: float | None  # None in records of what is NaN
+    fusion: float | None  # records store NaN as None
 
 
 def score_image(image: NDArray[np.uint8], *, stop_below: float | None = None) -> Scores:
     """Scores of an image [H, W, 3] uint8.
 
-    `stop_below` is the original's fast mode: as soon as the mean of what has answered is below it, the
-    detectors that are left are not run. Such means are of different detectors: make no ROC of them.
-    Raises UsageError for another shape or type.
+    `stop_below` is the original's fast mode: as soon as the mean so far is below it, the remaining detectors
+    are skipped. Such means are not comparable with each other. Raises UsageError for another shape or type.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise UsageError(f"expected an image [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}")
@@ -76,9 +73,9 @@ def score_file(path: Path | str, *, stop_below: float | None = None) -> Scores:
 def read_pixels(path: Path | str) -> NDArray[np.uint8]:
     """[H, W, 3] of an image file as Java's ImageIO decodes it.
 
-    Transparency is ignored, not blended. Grey of 8 and 16 bits is taken for linear light and gets the sRGB
-    curve, so that 256 levels become 183. Colours of 16 bits keep their upper byte, which may be 1 off.
-    Raises InputError for what cannot be read or has more than 89 million pixels.
+    Transparency is ignored, not blended. Grey of 8 and 16 bits counts as linear light and gets the sRGB
+    curve, which turns 256 levels into 183. Colours of 16 bits keep their upper byte, which may be off by 1.
+    Raises InputError for files that cannot be read and for more than 89 million pixels.
     """
     path = Path(path)
     with open_image(path) as image:
@@ -93,11 +90,11 @@ def read_pixels(path: Path | str) -> NDArray[np.uint8]:
 def _decode(image: Image.Image) -> NDArray[np.uint8]:
     if image.mode.startswith("I"):
         light = np.asarray(image, dtype=np.float64).clip(0, 65535) / 65535
-    elif image.mode in ("L", "LA") and image.format != "BMP":  # a grey BMP has a palette, in truth
+    elif image.mode in ("L", "LA") and image.format != "BMP":  # a grey BMP has a palette
         light = np.asarray(image.getchannel(0)) / 255
     else:
         image.load()
-        image.info.pop("transparency", None)  # Pillow would warn that it gets lost
+        image.info.pop("transparency", None)  # avoids a warning by Pillow
         return np.array(image.convert("RGB"), dtype=np.uint8)
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
     return np.repeat(np.rint(255 * encoded).astype(np.uint8)[:, :, None], 3, axis=2)
@@ -105,17 +102,17 @@ def _decode(image: Image.Image) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Row:
-    """One image: its file name, its scores, and what they are taken for."""
+    """One image: its file name, its scores, and the verdict."""
 
     file: str
     scores: Scores
     flagged: bool  # fusion above the threshold
-    secret_bytes: int  # size of the secret, guessed as fusion x size of the file / 3
+    secret_bytes: int  # estimated size of the secret: fusion x size of the file / 3
 
 
 @dataclass(frozen=True)
 class Steganalysis:
-    """The images of a folder by name, and the names of the files that are no readable images."""
+    """The images of a folder by name, and the names of the files that were skipped."""
 
     rows: list[Row]
     skipped: list[str]
@@ -134,11 +131,11 @@ def steganalyze(
     fast: bool = False,
     reporter: Reporter | None = None,
 ) -> Steganalysis:
-    """Scores of all images in `folder`, not in those below it, sorted by name.
+    """Scores of all images in `folder`, sorted by name; subfolders are ignored.
 
-    `fast` stops with an image as soon as it looks clean (see `score_image`). Files that are no readable
-    images are skipped and named in the result. Raises InputError when there is no readable image, and
-    UsageError for a threshold outside of [0, 1].
+    `fast` skips detectors of an image as soon as it looks clean (see `score_image`). Unreadable files are
+    skipped and listed in the result. Raises InputError if there is no readable image, and UsageError for a
+    threshold outside of [0, 1].
     """
     folder = Path(folder)
     if not 0 <= threshold <= 1:
@@ -163,7 +160,7 @@ def steganalyze(
 
 
 def csv_bytes(rows: Sequence[Row]) -> bytes:
-    """A table in UTF-8: `null` where a detector does not take the image, `NaN` where it finds no solution."""
+    """A table in UTF-8: `null` if a detector does not accept the image, `NaN` if it has no solution."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["file", *DETECTORS, "fusion", "flagged", "secret_bytes"])

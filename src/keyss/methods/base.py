@@ -11,30 +11,44 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
-from torch import Tensor
 
-from keyss.channels.base import Content, Payload
-from keyss.channels.rooms import AnyChannel, Publish
-from keyss.core.decoded import PictureNetwork
+from keyss.channels import AnyChannel, Channel, Payload, Publish, channel_for
 from keyss.core.errors import KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.core.similarity import Similarity
-from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import Reporter
-
-Frame = Literal["secret", "cover"]
+from keyss.fitting.config import PRESETS, FitConfig
+from keyss.fitting.reporting import Reporter
+from keyss.methods.opened import Opened
+from keyss.methods.plan import Plan
 
 
 @dataclass(frozen=True)
-class SceneInput:
-    """What is known of a scene before anything is rendered or trained."""
+class Source:
+    """The cover or a secret: what is given of it, and later its pictures and its plain model."""
 
-    model: Gaussians | None  # a plain model on the CPU; None: one will be fitted to the photos
-    photos: bool  # False: the model is all there is, and pictures of it take the place of photos
+    given: Gaussians | None  # a plain 3DGS model on the CPU; None: one is fitted to the photos
+    photos: bool  # False: only the model is given, and renders of it take the place of photos
+    key: str = field(default="", repr=False)  # of a secret, where the method has keys
+    loaded: Scene | None = None
+    fitted: Gaussians | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """Photos, or renders of the model."""
+        if self.loaded is None:
+            raise ValueError("the scene is not loaded yet")
+        return self.loaded
+
+    @property
+    def model(self) -> Gaussians:
+        """The plain model, in the scene's own frame, on the CPU."""
+        found = self.fitted if self.given is None else self.given
+        if found is None:
+            raise ValueError("the plain model is not fitted yet")
+        return found
 
 
 @dataclass(frozen=True)
@@ -42,41 +56,7 @@ class Training:
     """What a method's own training is for one scene: what makes a plain model of it comparable."""
 
     steps: int = 0  # in which it is drawn
-    goes_on: bool = True  # from its plain model, so that the steps of that one count too
-
-
-@dataclass(frozen=True)
-class Outlook:
-    """What is known of a hiding before it begins: of given models exactly, else as much as is allowed."""
-
-    gaussians: int  # of the published model, at most
-    sh_degree: int  # of the published model
-    asked: int  # Gaussians that the secrets have together, at most
-    capacity: int  # of these, how many fit
-    steps: int = 0  # of the method's own training
-    drawn: tuple[int, ...] = ()  # Gaussians of the cover and of each secret that a step of it draws
-    notes: tuple[str, ...] = ()  # what the options cost, a sentence each
-    # By way of which pictures of the cover and of each secret are made, untrained; () where there are none.
-    networks: tuple[PictureNetwork | None, ...] = ()
-    # What all Gaussians go through in a step of it, None where they are drawn as they are; and how often.
-    decode: Callable[[Gaussians], Gaussians] | None = None
-    decodings: float = 0.0
-
-
-@dataclass(frozen=True)
-class Source:
-    """One scene as a method gets it: pictures of it, and a plain 3DGS model."""
-
-    scene: Scene  # photos, or pictures rendered of the model
-    model: Gaussians  # in the scene's own frame, on the CPU
-
-
-@dataclass(frozen=True)
-class KeyedSource:
-    """A secret and the key that is to open it."""
-
-    source: Source
-    key: str = field(repr=False)
+    continues: bool = True  # from its plain model, whose steps count too
 
 
 @dataclass(frozen=True)
@@ -89,54 +69,6 @@ class Context:
     reporter: Reporter | None = None
     # 32 bytes that nobody else can know, for a run that is to be repeated to the byte; None: the system's.
     entropy: bytes | None = field(default=None, repr=False)
-
-
-@dataclass(frozen=True)
-class Remains:
-    """How much of a secret a model still gives."""
-
-    found: int  # Gaussians
-    hidden: int  # Gaussians that there were; 0: not known
-    chunks: tuple[int, int] | None = None  # of its payload: those left and those there were; None: no chunks
-    slack: float = 0.0  # share by which the numbers may differ although nothing was lost
-
-    @property
-    def share(self) -> float:
-        """Of the hidden Gaussians those found: 0 to 1, more where Gaussians were added."""
-        return self.found / self.hidden if self.hidden else float(self.found > 0)
-
-    @property
-    def whole(self) -> bool:
-        """Whether nothing was lost or added."""
-        return abs(self.share - 1) <= self.slack and (self.chunks is None or self.chunks[0] == self.chunks[1])
-
-
-class Opened(Protocol):
-    """A secret as its key opens it, before it is revealed."""
-
-    @property
-    def frame(self) -> Similarity | None:
-        """From the secret's own frame into the cover's; None where it was never in the cover's."""
-
-    @property
-    def decode(self) -> Callable[[Gaussians, Tensor], Gaussians] | None:
-        """From a stego model and an embedding [64] to what a decoder makes of them, in the cover's frame.
-
-        Differentiable in the embedding where the decoder is: the white-box attack goes by that gradient. None
-        where keys condition no decoder, so that a wrong key shows nothing at all.
-        """
-
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The secret as a model of its own, on the CPU; `force`: also from a model that was changed.
-
-        Raises InputError for a model that it does not belong to, UsageError for a frame that it never was in.
-        """
-
-    def remains(self, revealed: Gaussians) -> Remains:
-        """How much of the secret there is in what `reveal` gave."""
-
-    def fingerprint(self) -> str:
-        """16 hexadecimal digits by which a run knows its secrets; they say nothing without the secret."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +103,7 @@ class CommandLineOption:
 
     help: str
     metavar: str | None = None  # stands for the value in the help
-    alias: str | None = None  # another name
+    default: str | None = None  # what None stands for
     parse: Callable[[str], Any] | None = None  # makes the value of text, where the type does not
 
 
@@ -179,12 +111,13 @@ class CommandLineOption:
 class MethodOptions:
     """What every method can be told; each has a class of its own that adds to it."""
 
+    method: ClassVar[str]  # its name in files and on the command line, 1 to 15 ASCII characters
+
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
     publish: Publish = "ply"  # format that the published model is passed on in; any: it may be converted
     # Of models that may be converted: appended Gaussians hold everything, and everybody can see that they are
     # there; colours hold little and show less.
     channel: AnyChannel = "appended"
-    repair: bool = False  # colours: a short fit of the harmonics afterwards, so that views look as before
 
     def __post_init__(self) -> None:
         """Raise UsageError for what does not go together."""
@@ -192,20 +125,45 @@ class MethodOptions:
             raise UsageError(
                 f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
             )
-        if self.repair and self.channel != "colours":
-            raise UsageError('`repair` is for what is written into colours (`channel="colours"`)')
+
+    @classmethod
+    def preset(cls, size: str) -> Self:
+        """Options of one of the sizes in `keyss.fitting.config.PRESETS`. Raises UsageError."""
+        if size not in PRESETS:
+            raise UsageError(f"preset {size!r}: expected {' or '.join(PRESETS)}")
+        return cls(fit=PRESETS[size])
+
+    @property
+    def place(self) -> Channel:
+        """The channel that secrets lie in."""
+        return channel_for(self.publish, self.channel)
+
+    @property
+    def trains(self) -> bool:
+        """Whether hiding is a training of its own, after the plain models; prepared."""
+        return any(each.steps for each in self.training(2))
+
+    @property
+    def may_train(self) -> bool:
+        """Whether steps may count when models of all scenes are given; known before scenes are."""
+        return self.trains
+
+    def fits(self, scenes: int) -> list[FitConfig]:
+        """How plain models of the cover and of each secret are fitted; of `scenes` together, prepared."""
+        return [self.fit] * scenes
 
     def training(self, scenes: int) -> tuple[Training, ...]:
         """The method's own training of the cover and of each secret; of `scenes` together, prepared."""
         return (Training(),) * scenes
 
+    @classmethod
+    def variants(cls) -> Mapping[str, Self]:
+        """Other kinds of the method, by name, that a comparison lists beside it."""
+        return {}
+
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
-
-    def adapted(self, **changes: Any) -> Self:
-        """The same with changed fields, and with what follows from them."""
-        return replace(self, **changes)
 
 
 class Method(Protocol):
@@ -213,15 +171,11 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """In files and on the command line, 1 to 15 ASCII characters."""
+        """That of its options."""
 
     @property
     def summary(self) -> str:
         """One line that goes on from the name."""
-
-    @property
-    def trains(self) -> bool:
-        """Whether hiding is a training of its own, after the plain models."""
 
     @property
     def most_secrets(self) -> int:
@@ -235,27 +189,20 @@ class Method(Protocol):
     def options(self) -> type[MethodOptions]:
         """The class of its options."""
 
-    @property
-    def presets(self) -> Mapping[str, MethodOptions]:
-        """Options by name; the first are the default."""
-
-    def prepare(self, inputs: Sequence[SceneInput], options: Any) -> Any:
-        """The options with all that depends on the scenes: `inputs` of the cover, then of the secrets.
+    def prepare(self, sources: Sequence[Source], options: Any) -> Any:
+        """The options with all that depends on the scenes: the cover, then the secrets.
 
         Refuses what cannot work, before anything is trained. Raises UsageError and InputError.
         """
 
-    def outlook(self, inputs: Sequence[SceneInput], options: Any) -> Outlook:
-        """What will come of it; `options` are prepared."""
+    def plan(self, sources: Sequence[Source], options: Any) -> Plan:
+        """What will come of it, as far as a method knows; `options` are prepared."""
 
-    def hide(self, cover: Source, secrets: Sequence[KeyedSource], options: Any, context: Context) -> Stego:
+    def hide(self, cover: Source, secrets: Sequence[Source], options: Any, context: Context) -> Stego:
         """Hide the secrets; `options` are prepared and have a seed.
 
         Raises KeyssError and its children, Interrupted.
         """
-
-    def unpack(self, content: Content) -> Opened:
-        """The secret in what a channel gave or what was handed over. Raises InputError for damage."""
 
 
 def role_of(index: int, scenes: int) -> str:

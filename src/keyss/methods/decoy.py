@@ -9,7 +9,7 @@ import torch
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
-from keyss.methods.base import Frame, Remains
+from keyss.methods.opened import Frame, Remains
 
 _STRENGTH = 0.02  # standard deviation of the changes of opacity logits
 _MOVE = 1e-4  # of turns (radians), shifts (of the model's size) and changes of scale

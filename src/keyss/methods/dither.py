@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.low_bits.usable import chance_of_bits, is_uniform
+from keyss.channels import chance_of_bits, is_uniform
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import os
 
-from keyss.channels.base import METHOD_BYTES, Payload, pack_method, unpack_method
+from keyss.channels import METHOD_BYTES, Payload, pack_method, unpack_method
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
 from keyss.keys.encryption import DATA_KEY_BYTES, decrypt, encrypt
 
 SUFFIX = ".keyss"
-MOST_BYTES = 1 << 30
+MAX_BYTES = 1 << 30
 _MAGIC = b"keyss handed 1\0\0"
 _HEADER = len(_MAGIC) + METHOD_BYTES + 1 + SALT_BYTES
 _NOT_ONE = "expected a file that was handed over, as `keyss hide` writes them for some methods"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, field
 
-from keyss.channels.base import Content, Payload
+from keyss.channels import Content, Payload
 from keyss.core.errors import InputError, UsageError
 
 NAME = "file"  # in the place of a method's
-MOST_NAME_BYTES = 255
+MAX_NAME_BYTES = 255
 
 _LENGTH = struct.Struct("<B")
 
@@ -22,10 +22,10 @@ class HiddenFile:
     data: bytes = field(repr=False)
 
     def payload(self) -> Payload:
-        """What a channel carries. Raises UsageError for a name of more than MOST_NAME_BYTES."""
+        """What a channel carries. Raises UsageError for a name of more than MAX_NAME_BYTES."""
         name = self.name.encode()
-        if len(name) > MOST_NAME_BYTES:
-            raise UsageError(f"expected a name of at most {MOST_NAME_BYTES} bytes, got {len(name)}")
+        if len(name) > MAX_NAME_BYTES:
+            raise UsageError(f"expected a name of at most {MAX_NAME_BYTES} bytes, got {len(name)}")
         return Payload(NAME, _LENGTH.pack(len(name)) + name + self.data)
 
     @staticmethod
@@ -38,3 +38,14 @@ class HiddenFile:
         if not content.data or len(name) < size:
             raise InputError("the hidden file is damaged: its name is cut off")
         return HiddenFile(name.decode(errors="replace"), data)
+
+
+class OpensAFileError(InputError):
+    """The key opens a hidden file where a scene was expected."""
+
+    def __init__(self, file: HiddenFile) -> None:
+        super().__init__(
+            f"this key opens a file of {len(file.data):,} bytes, not a scene: give it a name that is not a "
+            "model's"
+        )
+        self.file = file

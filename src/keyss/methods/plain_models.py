@@ -8,36 +8,35 @@ from dataclasses import dataclass, replace
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import of_secret
+from keyss.fitting.reporting import of_secret
 from keyss.fitting.side_by_side import Fit, fit_scenes
-from keyss.methods.base import Context, Training, role_of
+from keyss.methods.base import Context, Source, Training, role_of
 
 
-def plain_models(
-    scenes: Sequence[Scene],  # the cover, then the secrets
-    given: Sequence[Gaussians | None],
-    config: FitConfig,
+def with_plain_models(
+    sources: Sequence[Source],  # the cover, then the secrets
+    configs: Sequence[FitConfig],
     context: Context,
-) -> list[Gaussians]:
-    """Plain models of the scenes on the CPU, in their own frames; those that are not given are fitted.
+) -> list[Source]:
+    """The sources with plain models on the CPU, in their own frames; those that are not given are fitted.
 
-    Each from a seed of its own, which follows from that of `config`: what one model tells of its seed tells
-    nothing of the others'. See `fit_scenes` for what it raises.
+    Each has a seed of its own, which follows from that of its config: one model tells nothing of the seeds of
+    others. See `fit_scenes` for what it raises.
     """
     missing = {
         index: _fit(
-            scene,
+            source.scene,
             replace(config, seed=config.seed_of(f"plain model {index}")),
-            f"{plain_stage(role_of(index, len(scenes)))} ({scene.name})",
+            f"{plain_stage(role_of(index, len(sources)))} ({source.scene.name})",
             f"plain-{index}",
             index,
             context,
         )
-        for index, (scene, model) in enumerate(zip(scenes, given, strict=True))
-        if model is None
+        for index, (source, config) in enumerate(zip(sources, configs, strict=True))
+        if source.given is None
     }
     fitted = _fitted(missing, context)
-    return [fitted[index] if model is None else model for index, model in enumerate(given)]
+    return [replace(source, fitted=fitted.get(index)) for index, source in enumerate(sources)]
 
 
 def plain_stage(role: str) -> str:
@@ -55,7 +54,7 @@ class Bound:
     @staticmethod
     def of(training: Training, plain_steps: int | None) -> Bound:
         """Of a scene whose plain model had `plain_steps`, where they are known."""
-        if not training.goes_on:
+        if not training.continues:
             return Bound(training.steps, training.steps == plain_steps)
         if not training.steps:
             return Bound(plain_steps, True)

@@ -1,7 +1,7 @@
 """Combined camera poses (KeySS, section 3.4): what each scene looks like from every training pose.
 
-Where a scene has a photo for a pose, that is its target; elsewhere a plain 3DGS model of the scene
-renders it. Everything is in the cover's frame. And which Gaussians may be seen from a pose.
+The target of a scene is its photo where there is one for the pose, and elsewhere a render of its plain 3DGS
+model. Everything is in the cover's frame.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ CACHE_BYTES = 2 << 30
 
 @dataclass(frozen=True)
 class PlacedScene:
-    """A scene and its plain model, both brought into the cover's frame."""
+    """A scene and its plain model, both moved into the cover's frame."""
 
     scene: Scene
     plain: Gaussians
+    frame: Similarity  # from its own frame into the cover's
 
     @staticmethod
     def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
@@ -37,7 +38,7 @@ class PlacedScene:
             test=tuple(_moved(view, frame) for view in scene.test),
             points=frame.apply_points(scene.points),
         )
-        return PlacedScene(moved, frame.apply_gaussians(plain))
+        return PlacedScene(moved, frame.apply_gaussians(plain), frame)
 
 
 def _moved(view: View, frame: Similarity) -> View:
@@ -76,25 +77,3 @@ class CombinedPoses:
             self._rendered[scene, owner, index] = pixels
             self._bytes += pixels.numel()
         return pixels
-
-
-@torch.no_grad()
-def possibly_seen(gaussians: Gaussians, camera: Camera, slack: float) -> Tensor:
-    """Indices of the Gaussians that may touch the view once decoded: only they are worth decoding.
-
-    A Gaussian is left out when a ball of 3 standard deviations around it, widened by `slack` (world units, by
-    what the decoder may move it), lies outside the frustum, widened by a tenth.
-    """
-    viewmat, intrinsics = camera.viewmat.to(gaussians.device), camera.K
-    x, y, z = (gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
-    radius = 3 * gaussians.scales.amax(1) + slack
-    depth = z + radius
-    fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    half_width = max(cx, camera.width - cx) / fx
-    half_height = max(cy, camera.height - cy) / fy
-    seen = (
-        (depth > 0.01)
-        & (x.abs() - radius < 1.1 * half_width * depth)
-        & (y.abs() - radius < 1.1 * half_height * depth)
-    )
-    return seen.nonzero()[:, 0]

@@ -1,39 +1,62 @@
-"""The methods there are, each entered with one line."""
+"""The methods there are, each entered with one line and loaded when it is needed."""
 
 from __future__ import annotations
 
-from keyss.channels.appended import AppendedReader
-from keyss.channels.base import Content
-from keyss.channels.opening import open_content, quick_attempts
+from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING, NamedTuple
+
+from keyss.channels import Content, open_content, quick_attempt
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.methods import handed, hidden_file
-from keyss.methods.base import Method, MethodOptions, Opened
-from keyss.methods.carry.method import CarryMethod
-from keyss.methods.carry.options import CarryOptions as CarryOptions
 from keyss.methods.decoy import Decoy
-from keyss.methods.hidden_file import HiddenFile
-from keyss.methods.learned.method import LearnedMethod
-from keyss.methods.learned.options import LearnedOptions as LearnedOptions
-from keyss.methods.peers import PEERS
+from keyss.methods.hidden_file import HiddenFile, OpensAFileError
+from keyss.methods.opened import Opened
 
-METHODS: dict[str, Method] = {method.name: method for method in (LearnedMethod(), CarryMethod(), *PEERS)}
+if TYPE_CHECKING:
+    from keyss.methods.base import Method, MethodOptions
+
+
+class Modules(NamedTuple):
+    """Where a method is."""
+
+    hiding: str  # has METHOD, a `keyss.methods.base.Method`
+    opening: str  # has `unpack`: from what a channel gave, or what was handed over, to an `Opened`
+
+
+_ROOM = "keyss.methods"
+DEFAULT = "carry"
+METHODS = {
+    "carry": Modules(f"{_ROOM}.carry.method", f"{_ROOM}.records.opening"),
+    "keyss": Modules(f"{_ROOM}.keyss.method", f"{_ROOM}.keyss.secret"),
+    **{
+        name: Modules(f"{_ROOM}.peers.{module}", f"{_ROOM}.peers.{module}")
+        for name, module in {
+            "3dgs": "bound",
+            "3dgs-sh": "sh",
+            "3dgs-decoder": "decoder",
+            "gs-hider": "gs_hider",
+            "watergs": "watergs",
+        }.items()
+    },
+}
 
 
 def get(name: str) -> Method:
     """The method of that name. Raises UsageError."""
     if name not in METHODS:
         raise UsageError(f"method {name!r}: expected {' or '.join(METHODS)}")
-    return METHODS[name]
+    method: Method = import_module(METHODS[name].hiding).METHOD
+    return method
 
 
 def of_options(options: MethodOptions) -> Method:
     """The method whose options these are. Raises UsageError."""
-    for method in METHODS.values():
-        if type(options) is method.options:
-            return method
-    known = ", ".join(method.options.__name__ for method in METHODS.values())
-    raise UsageError(f"expected options of a method ({known}), got {type(options).__name__}")
+    name = getattr(options, "method", None)
+    if name not in METHODS or type(options) is not get(name).options:
+        raise UsageError(f"expected options of a method ({', '.join(METHODS)}), got {type(options).__name__}")
+    return get(name)
 
 
 def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
@@ -44,12 +67,12 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     """
     if not decoy:
         return _unpacked(open_content(stego, key))
-    for derived, reader in quick_attempts(stego, key):
-        try:
-            return _unpacked(reader.extract(derived))
-        except WrongKeyError:
-            return Decoy.of(stego, derived, appended=isinstance(reader, AppendedReader))
-    raise WrongKeyError("this key opens nothing here")
+    found = quick_attempt(stego, key)
+    if found is None:
+        raise WrongKeyError()
+    if found.content is None:
+        return Decoy.of(stego, found.key, appended=found.appended)
+    return _unpacked(found.content)
 
 
 def open_handed(data: bytes, key: str | None) -> Opened:
@@ -61,14 +84,12 @@ def open_handed(data: bytes, key: str | None) -> Opened:
 
 
 def _unpacked(content: Content) -> Opened:
-    if content.method == hidden_file.NAME:
-        size = len(HiddenFile.of(content).data)
+    name = content.method
+    if name == hidden_file.NAME:
+        raise OpensAFileError(HiddenFile.of(content))
+    if name not in METHODS:
         raise InputError(
-            f"this key opens a file of {size:,} bytes, not a scene: take a name for it that does not end as "
-            "that of a model (keyss.api.reveal_file)"
+            f"the secret was hidden by the method {name!r}; this program has {', '.join(METHODS)}"
         )
-    if content.method not in METHODS:
-        raise InputError(
-            f"the secret was hidden by the method {content.method!r}; this program has {', '.join(METHODS)}"
-        )
-    return METHODS[content.method].unpack(content)
+    unpack: Callable[[Content], Opened] = import_module(METHODS[name].opening).unpack
+    return unpack(content)

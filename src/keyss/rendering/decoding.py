@@ -7,7 +7,7 @@ from typing import Any
 import torch.nn.functional as F
 from torch import Tensor
 
-from keyss.core.decoded import DecodedGaussians, PictureNetwork
+from keyss.core.decoded import PictureNetwork
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.rendering.rasterize import rasterization
@@ -38,18 +38,3 @@ def draw_features(
         backgrounds=background.to(features.device)[None],
     )
     return images.squeeze(0), meta | {"alpha": alphas.squeeze(0).squeeze(-1)}
-
-
-def draw_decoded(
-    model: DecodedGaussians, camera: Camera, sh_degree: int | None = None
-) -> tuple[Tensor, dict[str, Any]]:
-    """The picture [H, W, 3] and the meta of `rasterization`."""
-    from keyss.rendering.view import render_with_meta  # which calls this for such models
-
-    network = model.network
-    if model.features is not None:
-        drawn, meta = draw_features(model, model.features, camera, network.background)
-    else:
-        plain = Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits, model.sh)
-        drawn, meta = render_with_meta(plain, camera, network.background, sh_degree=sh_degree)
-    return decode_picture(drawn, network), meta

@@ -1,4 +1,4 @@
-"""How much two models differ in pictures."""
+"""How alike the renders of two models are."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ _AROUND, _OF_A_SCENE, _SIZE = 4, 8, 256
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """From where models are compared, and before which background."""
+    """The cameras from which models are compared, and the background."""
 
     cameras: Sequence[Camera]
     background: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] in [0, 1]
 
     @staticmethod
     def around(model: Gaussians) -> Viewpoints:
-        """Four views of all of a model and from near, for models of which no more is known."""
+        """Four views around a model, for when nothing but the model is known."""
         return Viewpoints(orbit(model, _SIZE, _AROUND))
 
     @staticmethod
     def of(scene: Scene) -> Viewpoints:
-        """Up to eight of the training views of a scene, which people look at from about there."""
+        """Up to eight training views of a scene: people look at it from about there."""
         cameras = [view.camera for view in scene.train[:: max(1, -(-len(scene.train) // _OF_A_SCENE))]]
         return Viewpoints([_small(camera) for camera in cameras], scene.background)
 
 
 @torch.no_grad()
-def cost(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | None = None) -> float:
-    """PSNR in dB of pictures of two models, by default from around the first; at most 120."""
+def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | None = None) -> float:
+    """PSNR in dB between renders of two models, at most 120; by default seen from around the first."""
     views = viewpoints or Viewpoints.around(before)
     errors = [
         (_picture(before, camera, views) - _picture(after, camera, views)).square().mean()

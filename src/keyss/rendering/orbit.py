@@ -11,11 +11,10 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.scene import Camera, Scene, View
+from keyss.core.scene import Camera, Scene, View, checked_background
 from keyss.files.models import is_model_path
-from keyss.files.scenes import checked_background
-from keyss.rendering import render
 from keyss.rendering.arguments import MAX_SIDE
+from keyss.rendering.view import render
 
 VIEWS = 96
 IMAGE_SIZE = 400  # pixels of a square picture
@@ -24,7 +23,7 @@ HIGHEST = 60.0  # degrees of elevation, and of depression
 # Distances in turn, in units of that from which the whole model is seen: people look at all of it, then near.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY = 12
-_LARGE, _MOST = 0.95, 10.0  # a weight's quantile, and what the largest may be of it
+_LARGE, _MAX = 0.95, 10.0  # a weight's quantile, and what the largest may be of it
 _SAMPLE = 200_000  # Gaussians that tell where a model lies
 
 
@@ -105,7 +104,7 @@ def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
     model = model[:: max(1, len(model) // _SAMPLE)]
     scales = model.scales.sort(dim=1).values
     weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu().nan_to_num(0.0)
-    weight = weight.clamp_max(_MOST * _quantile(weight, torch.ones(len(model)), _LARGE))
+    weight = weight.clamp_max(_MAX * _quantile(weight, torch.ones(len(model)), _LARGE))
     means = model.means.cpu()
     middle = torch.stack([_quantile(means[:, axis], weight, 0.5) for axis in range(3)])
     distance = (means - middle).norm(dim=1)

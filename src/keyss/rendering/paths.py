@@ -11,10 +11,10 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from keyss.core.alignment import focus_point, up_direction
+from keyss.core.alignment import up_direction
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera, camera_positions
+from keyss.core.scene import Camera, camera_positions, focus_point
 from keyss.rendering.orbit import FIELD_OF_VIEW, look_at, looking, middle_and_radius
 
 ELEVATION = 20.0  # degrees

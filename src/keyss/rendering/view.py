@@ -8,7 +8,7 @@ from torch import Tensor
 
 from keyss.core import Camera, Gaussians
 from keyss.core.decoded import DecodedGaussians
-from keyss.rendering.decoding import draw_decoded
+from keyss.rendering.decoding import decode_picture, draw_features
 from keyss.rendering.rasterize import rasterization
 
 
@@ -29,7 +29,7 @@ def render_with_meta(
 ) -> tuple[Tensor, dict[str, Any]]:
     """Like `render`, with the meta of `rasterization` for this one camera and `alpha` [H, W] in it."""
     if isinstance(gaussians, DecodedGaussians):
-        return draw_decoded(gaussians, camera, sh_degree)
+        return _draw_decoded(gaussians, camera, sh_degree)
     device = gaussians.device
     images, alphas, meta = rasterization(
         gaussians.means,
@@ -46,3 +46,16 @@ def render_with_meta(
     )
     # Unlike an index, a squeezed axis costs no copy in the backward pass.
     return images.squeeze(0), meta | {"alpha": alphas.squeeze(0).squeeze(-1)}
+
+
+def _draw_decoded(
+    model: DecodedGaussians, camera: Camera, sh_degree: int | None = None
+) -> tuple[Tensor, dict[str, Any]]:
+    """The picture [H, W, 3] and the meta of `rasterization`."""
+    network = model.network
+    if model.features is not None:
+        drawn, meta = draw_features(model, model.features, camera, network.background)
+    else:
+        plain = Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits, model.sh)
+        drawn, meta = render_with_meta(plain, camera, network.background, sh_degree=sh_degree)
+    return decode_picture(drawn, network), meta

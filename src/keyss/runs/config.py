@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from torch import Tensor
-
 from keyss._version import __version__
 from keyss.core.errors import InputError
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import ViewOptions
 from keyss.fitting.config import FitConfig
 from keyss.methods import registry
-from keyss.methods.base import MethodOptions, Opened
+from keyss.methods.base import MethodOptions
+from keyss.methods.opened import Opened
 from keyss.runs.records import read_record
 
-PathLike = str | Path
-Background = Tensor | Sequence[float] | None
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
 
 
@@ -35,9 +30,7 @@ class RunConfig(Generic[OptionsT]):
     cover: str | None
     secrets: tuple[str | None, ...]
     models_given: tuple[bool, ...]  # of the cover, then of the secrets: a plain model, and not fitted
-    width: int | None  # to which photos were shrunk
-    background: tuple[float, float, float] | None  # where it was chosen
-    skip_missing: bool = False  # whether photos that are not there were left out
+    views: ViewOptions
     payloads: tuple[str, ...]  # `secret_ids` of the secrets
     options: OptionsT  # of the method
 
@@ -49,9 +42,7 @@ class FitRunConfig:
     version: int = 1
     keyss: str = __version__
     scene: str | None
-    width: int | None
-    background: tuple[float, float, float] | None
-    skip_missing: bool = False
+    views: ViewOptions
     config: FitConfig
 
 
@@ -63,7 +54,7 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
         known = ", ".join(registry.METHODS)
         raise InputError(f"{path}: method {name!r} is not known; this program has {known}")
     generic: Any = RunConfig
-    config: RunConfig[MethodOptions] = read_record(path, generic[registry.METHODS[name].options])
+    config: RunConfig[MethodOptions] = read_record(path, generic[registry.get(name).options])
     if config.options.fit.seed is None:
         raise InputError(f"{path}: expected the seed of the run, got none")
     return config
@@ -73,16 +64,3 @@ def secret_ids(seed: int, opened: Iterable[Opened]) -> tuple[str, ...]:
     """By what a run of this seed knows its secrets; the same secret has another name in every run."""
     made_of = (f"keyss/v1/secret {seed} {each.fingerprint()}".encode() for each in opened)
     return tuple(hashlib.sha256(data).hexdigest()[:16] for data in made_of)
-
-
-def path_of(source: PathLike | Scene | Gaussians) -> str | None:
-    """Where a scene can be found again, None for one in memory."""
-    return None if isinstance(source, Scene | Gaussians) else os.path.realpath(source)
-
-
-def colour_of(background: Background) -> tuple[float, float, float] | None:
-    """As it is written."""
-    if background is None:
-        return None
-    red, green, blue = (float(x) for x in background)
-    return red, green, blue

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from keyss.channels.codes.published import SUFFIXES, suffix_of
+from keyss.channels import SUFFIXES, suffix_of
 from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians

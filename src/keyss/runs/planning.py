@@ -1,7 +1,7 @@
-"""What a hiding will take, before it begins: steps, room, time, memory, disk.
+"""What a run will take, before it begins: steps, room, time, memory, disk.
 
-Sizes follow from the models and the options. Times are those of a few steps at the sizes to come, on this
-machine and while it does what else it does, extrapolated: rough, mostly within a factor of two.
+Sizes follow from the models and the options. Times come from constants and are rough; the progress of a run
+knows better as soon as it has begun.
 """
 
 from __future__ import annotations
@@ -20,173 +20,140 @@ from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.ranks import here
-from keyss.fitting.side_by_side import SIDE_BY_SIDE, Fit, at_once, process_bytes
-from keyss.methods.base import Method, MethodOptions, Outlook, SceneInput, role_of
+from keyss.methods.base import Method, MethodOptions, Source, role_of
 from keyss.methods.plain_models import Bound, plain_stage
+from keyss.methods.plan import Plan, Stage
 from keyss.progress import about
-from keyss.rendering.orbit import TEST_EVERY, VIEWS
-from keyss.runs.probing import Probe, decoding_seconds
 
 _LONG = 1000  # steps
-_WATCHED = 8  # views that a training looks at every `evaluate_every` steps
 _KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and opening it again
-_CODING_SECONDS = 2e-5  # for each Gaussian of the published model: finding carriers, encrypting, writing
-_STATE_COPIES = 3  # numbers that a checkpoint has for one of a model: itself and two moments
+_STATE_COPIES = 3  # numbers in a checkpoint for each one of a model: itself and two moments
 _APPENDED = 7  # Gaussians that one of a secret of SH degree 3 becomes, at most, where they are appended
 _OTHER_BYTES = 4 << 20  # records in JSON, locks, and what a file system adds
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A part of a run."""
+class _Speed:
+    """Seconds of a training step, forward and backward; rendering alone takes a third."""
 
-    name: str
-    steps: int  # 0 where nothing is trained
-    gaussians: int  # at its end, at most
-    seconds: float
+    step: float
+    gaussian: float
+    pixel: float
+    weight: float  # of a network
 
+    @staticmethod
+    def of(device: torch.device) -> _Speed:
+        if device.type != "cpu":
+            return _Speed(5e-3, 1e-8, 5e-9, 1e-12)
+        threads = 0.5 + 0.5 * torch.get_num_threads()
+        return _Speed(3e-3, 8e-7 / threads, 3e-7 / threads, 3e-10 / threads)
 
-@dataclass(frozen=True)
-class Plan:
-    """A whole run. Times, memory and disk are estimates."""
-
-    method: str
-    stages: tuple[Stage, ...]
-    outlook: Outlook
-    file_bytes: int  # of the published model, at most
-    disk_bytes: int  # of all files that are there at the same time, checkpoints included
-    free_bytes: int | None  # where they are to be written, None without such a place
-    memory_bytes: int
-
-    @property
-    def seconds(self) -> float:
-        return sum(stage.seconds for stage in self.stages)
-
-    def __str__(self) -> str:
-        """In one line, what a person wants to know before the run begins."""
-        return _line(self.seconds, self.memory_bytes, self.disk_bytes)
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One of several runs that are asked for."""
-
-    name: str
-    done: bool
-    seconds: float = 0.0  # that it takes, roughly; 0 for one that is done
-    error: str | None = None  # why it is not possible
+    def steps(self, gaussians: float, pixels: int, plan: Plan | None = None) -> float:
+        """Seconds of a step with one view."""
+        weights = 0.0
+        if plan is not None:
+            weights = plan.gaussian_weights * plan.gaussians + plan.pixel_weights * pixels
+        return self.step + self.gaussian * gaussians + self.pixel * pixels + self.weight * weights
 
 
 def plan_hiding(
     method: Method,
     options: MethodOptions,  # prepared
-    inputs: Sequence[SceneInput],  # of the cover, then of the secrets
-    scenes: Sequence[Scene],  # of these, at least with their test pictures
+    sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test pictures
     device: torch.device,
     out: Path | None,
     *,
     bound: bool = False,
 ) -> Plan:
-    """What hiding `scenes` comes to, after a few steps of training at the sizes to come. Writes nothing.
+    """What a hiding will take. Writes nothing.
 
     `bound`: with plain 3DGS of as many steps as scenes have, where that is more than plain models have.
     """
-    outlook = method.outlook(inputs, options)
-    fits = [each.model is None for each in inputs]
-    trains = method.trains or any(fits)
-    probes = [
-        Probe(scene, each.model, options.fit, outlook.sh_degree, device, trains)
-        for scene, each in zip(scenes, inputs, strict=True)
+    plan, speed, fit = method.plan(sources, options), _Speed.of(device), options.fit
+    sizes, configs = _sizes(options, sources), options.fits(len(sources))
+    roles = [role_of(index, len(sources)) for index in range(len(sources))]
+    scenes = [each.scene for each in sources]
+    stages = [
+        _fitting(plain_stage(role), config, each.scene, size, speed)
+        for role, each, config, size in zip(roles, sources, configs, sizes, strict=True)
+        if each.given is None
     ]
-    # As the method itself makes pictures: by way of networks, where it has some.
-    networks = outlook.networks or (None,) * len(inputs)
-    shown = [
-        probe if network is None else probe.through(network)
-        for probe, network in zip(probes, networks, strict=True)
-    ]
-    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
-    stages, plain, bounds = list[Stage](), list[Fit](), list[Fit]()
-    for index, (probe, each) in enumerate(zip(probes, inputs, strict=True)):
-        role = role_of(index, len(inputs))
-        if not each.photos:
-            views = VIEWS if trains else VIEWS // TEST_EVERY
-            stages.append(
-                Stage(f"pictures of the {role}", 0, sizes[index], views * probe.picture(sizes[index]))
-            )
-        if each.model is None:
-            plain.append(Fit(scenes[index], options.fit, plain_stage(role)))
-            stages.append(_fitting(plain[-1].title, options.fit, probe, sizes[index]))
-    if method.trains:
-        decoding = 0.0
-        if outlook.decode is not None:
-            of_scene = (scenes[0], outlook.gaussians, options.fit, device)
-            decoding = outlook.decodings * decoding_seconds(outlook.decode, *of_scene)
-        stages.append(_hiding(options.fit, shown, outlook, decoding))
-    for index, (probe, each, training) in enumerate(
-        zip(probes, inputs, options.training(len(inputs)), strict=True)
+    if plan.steps:
+        drawn = sum(plan.drawn)
+        views = [_pixels(scene) for scene, count in zip(scenes, plan.drawn, strict=True) if count]
+        each_step = sum(speed.steps(drawn / len(views), pixels, plan) for pixels in views)
+        stages.append(Stage("hiding", plan.steps, drawn, plan.steps * _views(fit) * each_step))
+    for role, each, config, size, training in zip(
+        roles, sources, configs, sizes, options.training(len(sources)), strict=True
     ):
-        longer = Bound.of(training, options.fit.iterations if each.model is None else None)
+        longer = Bound.of(training, config.iterations if each.given is None else None)
         if bound and each.photos and not longer.equal and longer.steps is not None:
-            name, config = f"bound of the {role_of(index, len(inputs))}", longer.config(options.fit)
-            bounds.append(Fit(scenes[index], config, name))
-            stages.append(_fitting(name, config, probe, sizes[index]))
-    stages, processes = _side_by_side(stages, (plain, bounds), device)
-    writing = _KEY_SECONDS * len(inputs[1:]) + _CODING_SECONDS * outlook.gaussians
-    stages.append(Stage("encrypting, opening again", 0, outlook.gaussians, writing))
-    stages.append(
-        Stage("measuring", 0, outlook.gaussians, _measuring(method, probes, shown, scenes, sizes, outlook))
+            stages.append(_fitting(f"bound of the {role}", longer.config(fit), each.scene, size, speed))
+    views_measured = 6 * sum(
+        len(scene.test) * speed.steps(size, _pixels(scene)) / 3
+        for scene, size in zip(scenes, sizes, strict=True)
     )
-
-    state = outlook.gaussians * _floats(outlook.sh_degree) * 4
-    pictures = sum(
-        (VIEWS - VIEWS // TEST_EVERY) * _pixels(scene) * 3
-        for scene, each in zip(scenes, inputs, strict=True)
-        if not each.photos and trains
-    )
-    # Parameters, gradients and moments, twice more all that a checkpoint holds while it is written.
-    trained = state * (4 + 2 * _STATE_COPIES) if trains else 3 * state
-    memory = _resident_bytes() + pictures + max(trained, processes)
-    return Plan(
+    keys = _KEY_SECONDS * len(sources[1:])
+    stages.append(Stage("encrypting, opening, measuring", 0, plan.gaussians, keys + views_measured))
+    trains = options.trains or any(each.given is None for each in sources)
+    return replace(
+        plan,
         method=method.name,
         stages=tuple(stages),
-        outlook=outlook,
-        file_bytes=_file_bytes(outlook.gaussians, outlook.sh_degree),
-        disk_bytes=disk_bytes(method, options, inputs),
+        file_bytes=_file_bytes(plan.gaussians, plan.sh_degree),
+        disk_bytes=disk_bytes(options, sources),
         free_bytes=None if out is None else free_bytes(out),
-        memory_bytes=memory,
+        memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, trains),
     )
 
 
-def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> str:
-    """What a plain fit will take, in one line."""
-    most = config.max_gaussians
-    stage = _fitting("fit", config, Probe(scene, None, config, config.sh_degree, device, True), most)
-    state = most * _floats(config.sh_degree) * 4
-    disk = 2 * _STATE_COPIES * state + _file_bytes(most, config.sh_degree) + _OTHER_BYTES
-    return _line(stage.seconds, _resident_bytes() + state * (4 + 2 * _STATE_COPIES), disk)
+def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
+    """What a plain fit will take."""
+    most, degree = config.max_gaussians, config.sh_degree
+    disk = 2 * _STATE_COPIES * most * _floats(degree) * 4 + _file_bytes(most, degree) + _OTHER_BYTES
+    return Plan(
+        gaussians=most,
+        sh_degree=degree,
+        asked=0,
+        capacity=0,
+        steps=config.iterations,
+        stages=(_fitting("fit", config, scene, most, _Speed.of(device)),),
+        file_bytes=_file_bytes(most, degree),
+        disk_bytes=disk,
+        memory_bytes=_memory_bytes(most, degree, trains=True),
+    )
 
 
 def worth_planning(config: FitConfig) -> bool:
-    """Whether a training takes so much longer than to plan it that a person wants to know."""
+    """Whether a training is so long that its estimate is worth a line."""
     return config.iterations >= _LONG
 
 
-def _line(seconds: float, memory: int, disk: int) -> str:
+def in_a_line(plan: Plan) -> str:
+    """Time, memory and disk of a run that begins."""
     return (
-        f"about {about(seconds)} on this machine as busy as it is, {memory / 1e9:.1f} GB of memory, up to "
-        f"{disk / 1e6:,.0f} MB of disk"
+        f"about {about(plan.seconds)}, {plan.memory_bytes / 1e9:.1f} GB of memory, up to "
+        f"{plan.disk_bytes / 1e6:,.0f} MB of disk"
     )
 
 
-def disk_bytes(method: Method, options: MethodOptions, inputs: Sequence[SceneInput]) -> int:
+def _sizes(options: MethodOptions, sources: Sequence[Source]) -> list[int]:
+    """Gaussians of each plain model, at most."""
+    return [
+        config.max_gaussians if each.given is None else len(each.given)
+        for each, config in zip(sources, options.fits(len(sources)), strict=True)
+    ]
+
+
+def disk_bytes(options: MethodOptions, sources: Sequence[Source]) -> int:
     """The most bytes that a hiding has on disk at once: results, plain models, checkpoints being replaced."""
-    sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
-    degrees = [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
+    sizes = _sizes(options, sources)
+    degrees = [options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources]
     plain = [_file_bytes(*each) for each in zip(sizes, degrees, strict=True)]
-    fitted = [size for size, each in zip(plain, inputs, strict=True) if each.model is None]
-    appends = options.publish == "any" and options.channel == "appended"
-    published = _file_bytes(sizes[0] + _APPENDED * sum(sizes[1:]), degrees[0]) if appends else plain[0]
-    if not method.trains:
+    fitted = [size for size, each in zip(plain, sources, strict=True) if each.given is None]
+    appended = _APPENDED * sum(sizes[1:]) if options.place.grows else 0
+    published = _file_bytes(sizes[0] + appended, degrees[0])
+    if not options.trains:
         return sum(plain) + published + 2 * _STATE_COPIES * sum(fitted) + _OTHER_BYTES
     trained = min(_file_bytes(sum(sizes), options.fit.sh_degree), sum(plain) + max(plain))
     published = max(trained, published)
@@ -202,9 +169,9 @@ def free_bytes(out: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
-def check_disk(out: Path, method: Method, options: MethodOptions, inputs: Sequence[SceneInput]) -> None:
+def check_disk(out: Path, options: MethodOptions, sources: Sequence[Source]) -> None:
     """Raise OutputError unless there is room for all that a hiding writes."""
-    needed, free = disk_bytes(method, options, inputs), free_bytes(out)
+    needed, free = disk_bytes(options, sources), free_bytes(out)
     if free < needed:
         raise OutputError(
             f"{out}: expected {needed / 1e6:,.0f} MB of free space for models and checkpoints, found "
@@ -212,74 +179,24 @@ def check_disk(out: Path, method: Method, options: MethodOptions, inputs: Sequen
         )
 
 
-def _fitting(name: str, config: FitConfig, probe: Probe, most: int) -> Stage:
-    """A plain fit: as many Gaussians as points at first, growing to the cap while it densifies."""
-    grows, grown = config.grow_start, 0.5 * (config.grow_start + config.grow_stop)
-    first, last = probe.step(probe.start), probe.step(most)
-    each = grows * first + (grown - grows) * 0.5 * (first + last) + (1 - grown) * last
-    seconds = config.iterations * _views(config) * each + _watching(config, [probe], [most])
+def _fitting(name: str, config: FitConfig, scene: Scene, most: int, speed: _Speed) -> Stage:
+    """A plain fit, whose Gaussians grow to the cap while it densifies."""
+    mean = 0.75 * most
+    seconds = config.iterations * _views(config) * speed.steps(mean, _pixels(scene))
     return Stage(name, config.iterations, most, seconds)
 
 
-def _side_by_side(
-    stages: Sequence[Stage], groups: Sequence[Sequence[Fit]], device: torch.device
-) -> tuple[list[Stage], int]:
-    """The stages where fits of a group are done at the same time; bytes that their processes take."""
-    factors, most = dict[str, float](), 0
-    for fits in groups:
-        if (count := at_once(fits, device)) > 1:
-            factors |= {fit.title: SIDE_BY_SIDE for fit in fits}
-            most = max(most, sum(sorted(map(process_bytes, fits))[-count:]))
-    return [replace(each, seconds=each.seconds * factors.get(each.name, 1.0)) for each in stages], most
-
-
-def _hiding(config: FitConfig, probes: Sequence[Probe], outlook: Outlook, decoding: float) -> Stage:
-    """The method's own training: a picture of every scene that it draws, and `decoding` seconds, a step."""
-    drawn = [(probe, count) for probe, count in zip(probes, outlook.drawn, strict=True) if count]
-    each = _views(config) * (decoding + sum(probe.step(count) for probe, count in drawn))
-    watching = _watching(config, [probe for probe, _ in drawn], [count for _, count in drawn], outlook.steps)
-    return Stage("hiding", outlook.steps, sum(outlook.drawn), outlook.steps * each + watching)
-
-
 def _views(config: FitConfig) -> int:
-    """Views of a step that this process draws."""
+    """Views of a step that this process renders."""
     return here().views(config.views_per_step) // here().count
 
 
-def _watching(
-    config: FitConfig, probes: Sequence[Probe], sizes: Sequence[float], steps: int | None = None
-) -> float:
-    """Seconds of looking at held-out views during a training."""
-    if not config.evaluate_every:
-        return 0.0
-    times = (config.iterations if steps is None else steps) // config.evaluate_every
-    views = (min(_WATCHED, len(probe.scene.test)) for probe in probes)
-    return times * sum(
-        count * probe.picture(size) for count, probe, size in zip(views, probes, sizes, strict=True)
-    )
-
-
-def _measuring(
-    method: Method,
-    probes: Sequence[Probe],
-    shown: Sequence[Probe],
-    scenes: Sequence[Scene],
-    sizes: Sequence[int],
-    outlook: Outlook,
-) -> float:
-    """Seconds for all pictures of the results: of each scene its own, the plain model's, and wrong keys'."""
-    share = min(1.0, outlook.gaussians / sum(sizes)) if method.trains else 1.0
-    plain, own = (
-        [
-            len(scene.test) * probe.picture(share * size)
-            for probe, scene, size in zip(each, scenes, sizes, strict=True)
-        ]
-        for each in (probes, shown)
-    )
-    wrong = 32 if method.trains else 0  # keys, seen from the cameras of the cover and of the secret
-    wrong *= method.capabilities.keys
-    decoding = sum(own[:1]) * len(own[1:]) + sum(own[1:])
-    return 3 * sum(plain) + 3 * sum(own) + wrong * decoding
+def _memory_bytes(gaussians: int, sh_degree: int, trains: bool) -> int:
+    """Parameters, gradients and moments, twice more what a checkpoint holds, and what is there already."""
+    state = gaussians * _floats(sh_degree) * 4
+    unit = 1 if sys.platform == "darwin" else 1024
+    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    return resident + (4 + 2 * _STATE_COPIES if trains else 3) * state
 
 
 def _floats(sh_degree: int) -> int:
@@ -295,9 +212,3 @@ def _file_bytes(gaussians: int, sh_degree: int) -> int:
 def _pixels(scene: Scene) -> int:
     camera = scene.test[0].camera
     return camera.width * camera.height
-
-
-def _resident_bytes() -> int:
-    """The most memory that this process has had."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

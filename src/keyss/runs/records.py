@@ -15,7 +15,7 @@ from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
 from keyss.files.reading import read_file
 
-MOST_BYTES = 16 * 2**20
+MAX_BYTES = 16 * 2**20
 
 T = TypeVar("T")
 
@@ -24,7 +24,7 @@ class _Versioned(msgspec.Struct):
     version: int
 
 
-def read_record(path: Path, type: type[T], *, at_most: int = MOST_BYTES) -> T:
+def read_record(path: Path, type: type[T], *, at_most: int = MAX_BYTES) -> T:
     """The record of a dataclass in a JSON file of at most so many bytes.
 
     Raises InputError that names the file and the place in it: for a file that is missing, too large or no

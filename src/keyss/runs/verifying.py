@@ -8,14 +8,14 @@ import torch
 
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.rendering.orbit import middle_and_radius
-from keyss.runs.revealing import RevealResult
+from keyss.runs.revealing import Revealed
 
 # Far beyond what the trained and public models hold that were looked at: none has a Gaussian beyond 10 radii,
 # or larger than one; one has 3.5 % duplicates.
 _FAR, _ENORMOUS = 1000.0, 100.0  # radii of what can be seen
 _DUPLICATES = 0.1  # of all
 _LARGEST = 1000.0  # of a harmonic
-_LEAST_QUATERNION = 1e-12  # length
+_MIN_QUATERNION = 1e-12  # length
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def check_model(model: Gaussians) -> ModelCheck:
     lengths = model.quats.double().norm(dim=1)
     counts = {
         "duplicates": len(model) - len(torch.unique(torch.cat(columns, dim=1), dim=0)),
-        "no_rotation": int((lengths < _LEAST_QUATERNION).sum()),
+        "no_rotation": int((lengths < _MIN_QUATERNION).sum()),
         "far": int(((model.means - middle).double().norm(dim=1) > _FAR * radius).sum()),
         "enormous": int((drawn & (model.log_scales.amax(1).double().exp() > _ENORMOUS * radius)).sum()),
         "out_of_range": int((model.sh.abs().flatten(1).amax(1) > _LARGEST).sum()),
@@ -94,7 +94,7 @@ def check_model(model: Gaussians) -> ModelCheck:
     )
 
 
-def check_secret(found: RevealResult) -> SecretCheck:
+def check_secret(found: Revealed) -> SecretCheck:
     """What is missing of a secret that was revealed."""
     remains = found.remains
     left, chunks = remains.chunks or (None, None)

@@ -20,7 +20,7 @@ from typing import BinaryIO, Literal, Self
 from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import model_bytes
-from keyss.fitting.loop import Reporter
+from keyss.fitting.reporting import Reporter
 from keyss.viewer.page import page_live
 from keyss.viewer.serving import PageServer
 

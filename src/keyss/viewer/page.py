@@ -19,8 +19,8 @@ from keyss.files.output import check_not_an_input, check_output_file
 from keyss.viewer.showing import shown
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
-MOST_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers take text of 512 MiB, and time for it
-MOST_BYTES = 2 << 30
+MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers take text of 512 MiB, and time for it
+MAX_BYTES = 2 << 30
 # Argon2id is WebAssembly; workers, and pictures that are saved, come from blobs that the page makes itself.
 _WASM, _SELF = "'wasm-unsafe-eval'", "'self'"
 _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
@@ -75,17 +75,17 @@ def export_html(
     """
     model, out = Path(model), Path(out)
     found = shown(model)
-    if found.bytes > MOST_BYTES:
-        raise UsageError(f"{model} has {found.bytes:,} bytes, and a page takes {MOST_BYTES:,}")
+    if found.bytes > MAX_BYTES:
+        raise UsageError(f"{model} has {found.bytes:,} bytes, and a page takes {MAX_BYTES:,}")
     try:
         with found.open() as file:
             data = file.read()
     except OSError as error:
         raise InputError(f"{model}: cannot be read: {error.strerror}") from error
     if out.suffix.lower() in (".html", ".htm"):
-        if len(data) > MOST_IN_ONE_FILE:
+        if len(data) > MAX_IN_ONE_FILE:
             raise UsageError(
-                f"{model} has {len(data):,} bytes, and one page takes {MOST_IN_ONE_FILE:,}: name a folder "
+                f"{model} has {len(data):,} bytes, and one page takes {MAX_IN_ONE_FILE:,}: name a folder "
                 "for the output, which a web server can serve"
             )
         check_not_an_input(out, [model])

@@ -12,8 +12,8 @@ from typing import BinaryIO
 from keyss.core.errors import KeyssWarning
 
 # What the page reads: by first bytes, or by the ends of names of formats that have no other sign.
-_MAGIC, _NAMES = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04", b"glTF"), (".splat", ".ksplat")
-_MOST_HEADER = 64 << 10  # bytes of a .ply
+_MAGIC, _NAMES = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04"), (".splat",)
+_MAX_HEADER = 64 << 10  # bytes of a .ply
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ def shown(model: Path) -> Shown:
     """
     try:
         with model.open("rb") as file:
-            header = file.read(_MOST_HEADER)
+            header = file.read(_MAX_HEADER)
             size = file.seek(0, 2)
     except OSError:
         header, size = b"", 0  # what it is will be said
@@ -44,7 +44,7 @@ def shown(model: Path) -> Shown:
 
 def is_shown(name: str, start: bytes) -> bool:
     """Whether a file of this name that begins so is one that the page reads, if it is not damaged."""
-    if start.startswith(b"ply") and b"\nformat ascii" in start[:_MOST_HEADER].partition(b"end_header")[0]:
+    if start.startswith(b"ply") and b"\nformat ascii" in start[:_MAX_HEADER].partition(b"end_header")[0]:
         return False
     return start.startswith(_MAGIC) or bool(start and name.lower().endswith(_NAMES))
 
@@ -56,7 +56,7 @@ def _converted(model: Path) -> Shown:
     in_folder = model.name.lower() == "meta.json"
     name = f"{model.absolute().parent.name or 'model'}.sog" if in_folder else f"{model.stem}.ply"
     data = model_bytes(name, found)
-    what = "a SOG in a folder" if in_folder else "a .ply in text"
+    what = "a SOG in a folder" if in_folder else f"a {model.suffix}, or a .ply in text,"
     warnings.warn(
         f"{model}: the page does not read {what}, and shows it as {name}, which holds the same",
         KeyssWarning,

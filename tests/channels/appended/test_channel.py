@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,14 +15,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from files.formats.conftest import splat_transform as splat_transform  # a fixture
-from keyss.channels.appended import AppendedReader, appended_for, embed
-from keyss.channels.base import Payload
-from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
-from keyss.core.gaussians import DRAWN_OPACITY
-from keyss.core.similarity import Similarity
+from keyss.channels import APPENDED, AppendedReader, Payload
+from keyss.core import (
+    DRAWN_OPACITY,
+    Gaussians,
+    InputError,
+    KeyssError,
+    KeyssWarning,
+    Similarity,
+    UsageError,
+    WrongKeyError,
+)
 from keyss.files import read_model, write_model
-from keyss.measure.robustness.changes import cropping, fewer_harmonics, half_floats, random_pruning
-from keyss.rendering.difference import cost
+from keyss.measure import cropping, fewer_harmonics, half_floats, random_pruning
+from keyss.rendering import psnr_between
 from measure.lifelike import lifelike
 
 KEY, ENTROPY = "Rosebud, 1941", bytes(range(32))
@@ -37,7 +43,13 @@ def cover() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def stego(cover: Gaussians) -> Gaussians:
-    return embed(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY)
+    return embedded(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY)
+
+
+def embedded(
+    cover: Gaussians, secrets: Sequence[tuple[str, Payload]], entropy: bytes | None = None
+) -> Gaussians:
+    return APPENDED.prepare(cover).embed(secrets, entropy=entropy)
 
 
 def opened(model: Gaussians, key: str = KEY) -> bytes:
@@ -51,11 +63,11 @@ def opened(model: Gaussians, key: str = KEY) -> bytes:
 @given(size=st.integers(0, 4000), seed=st.integers(0, 2**32))
 def test_every_size_comes_back(cover: Gaussians, size: int, seed: int) -> None:
     data = np.random.default_rng(seed).bytes(size)
-    stego = embed(cover, [(KEY, Payload("carry", data))], entropy=seed.to_bytes(32, "little"))
+    stego = embedded(cover, [(KEY, Payload("carry", data))], entropy=seed.to_bytes(32, "little"))
     reader = AppendedReader.of(stego)
     assert reader is not None
     assert reader.open(KEY) == Payload("carry", data)
-    assert abs(len(stego) - len(cover) - appended_for(size)) < 100
+    assert abs(len(stego) - len(cover) - APPENDED.appended(size)) < 100
 
 
 def test_the_cover_stays_and_looks_the_same(cover: Gaussians, stego: Gaussians) -> None:
@@ -63,7 +75,7 @@ def test_the_cover_stays_and_looks_the_same(cover: Gaussians, stego: Gaussians) 
     appended = stego[len(cover) :]
     assert bool((torch.round(appended.opacities * 255) == 1).all())
     assert bool((appended.sh[:, 1:] == 0).all())
-    assert cost(cover, stego) > 60
+    assert psnr_between(cover, stego) > 60
 
 
 def test_a_model_without_anything_opens_nothing(cover: Gaussians) -> None:
@@ -77,13 +89,13 @@ def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
     faint = torch.arange(len(cover)) % 4 == 0
     cover = replace(cover, opacity_logits=torch.where(faint, -5.5, cover.opacity_logits))
     for seed in range(4):
-        stego = embed(cover, [(KEY, Payload("file", b"a note"))], entropy=bytes([seed] * 32))
+        stego = embedded(cover, [(KEY, Payload("file", b"a note"))], entropy=bytes([seed] * 32))
         assert opened(_turned(scale)(stego)) == b"a note"
 
 
 @pytest.mark.argon2
 def test_a_wrong_key_opens_nothing_in_about_the_same_time(cover: Gaussians) -> None:
-    reader = AppendedReader.of(embed(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
+    reader = AppendedReader.of(embedded(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
     assert reader is not None
 
     def seconds(key: str) -> float:
@@ -101,23 +113,23 @@ def test_a_wrong_key_opens_nothing_in_about_the_same_time(cover: Gaussians) -> N
 def test_two_secrets_each_with_its_key(cover: Gaussians) -> None:
     payloads = [Payload("file", bytes(100)), Payload("carry", DATA)]
     with pytest.warns(KeyssWarning, match="other secrets"):
-        stego = embed(cover, list(zip(("one key", "another"), payloads, strict=True)))
+        stego = embedded(cover, list(zip(("one key", "another"), payloads, strict=True)))
     reader = AppendedReader.of(stego)
     assert reader is not None
     assert [reader.open("one key"), reader.open("another")] == payloads
     with pytest.raises(UsageError, match="same key"):
-        embed(cover, [("one key", payloads[0]), ("one key", payloads[1])])
+        embedded(cover, [("one key", payloads[0]), ("one key", payloads[1])])
     with pytest.raises(UsageError, match="at least one"):
-        embed(cover, [])
+        embedded(cover, [])
 
 
 def test_no_two_files_share_anything(cover: Gaussians) -> None:
     """From equal entropy too: what is hidden is mixed in."""
-    two = [embed(cover, [(KEY, Payload("file", data))], entropy=ENTROPY) for data in (b"a", b"b")]
+    two = [embedded(cover, [(KEY, Payload("file", data))], entropy=ENTROPY) for data in (b"a", b"b")]
     readers = [AppendedReader.of(each[len(cover) :]) for each in two]
     assert readers[0] is not None
     assert readers[1] is not None
-    assert readers[0].salt != readers[1].salt
+    assert readers[0].salts != readers[1].salts
     assert not {*map(bytes, readers[0].words)} & {*map(bytes, readers[1].words)}
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from channels.low_bits.trained_like import trained_like
-from keyss.core import Gaussians
+from keyss.channels import CodesCover, CodesReader, Payload
+from keyss.core import Gaussians, WrongKeyError
 from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import in_morton_order
 
@@ -30,6 +31,20 @@ def model_of(count: int = 6000, seed: int = 0, sh_degree: int = 1) -> Gaussians:
 
 def codes_of(suffix: str, count: int = 6000, seed: int = 0, sh_degree: int = 1) -> Any:
     return FORMATS[suffix].quantise(model_of(count, seed, sh_degree))
+
+
+def written(cover: CodesCover, *payloads: bytes, entropy: bytes = bytes(range(32))) -> Any:
+    """The codes with payloads under the keys "0", "1" and so on."""
+    secrets = [(str(index), Payload("carry", data)) for index, data in enumerate(payloads)]
+    return cover.embed(secrets, entropy=entropy).codes
+
+
+def opened(codes: Any, key: str = "0") -> bytes:
+    """What a key opens in codes. Raises WrongKeyError and InputError."""
+    reader = CodesReader.of(codes)
+    if reader is None:
+        raise WrongKeyError("no room")
+    return reader.open(key).data
 
 
 def there_and_back(suffix: str, codes: Any) -> Any:

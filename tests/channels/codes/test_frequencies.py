@@ -7,9 +7,8 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from channels.codes.published import FORMATS, codes_of, model_of
-from channels.codes.test_channel import written
-from keyss.channels.codes import CodesCover, CodesReader
+from channels.codes.published import FORMATS, codes_of, model_of, written
+from keyss.channels import CodesCover, CodesReader
 from keyss.channels.codes.matching import matched
 from keyss.channels.codes.order import Counted
 

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from channels.codes.published import FORMATS, codes_of
-from channels.codes.test_channel import key, written
+from channels.codes.published import FORMATS, codes_of, opened, written
 from files.formats.examples import random_compressed, random_sog, random_spz
-from keyss.channels.base import Payload
-from keyss.channels.codes import CodesCover, CodesReader
-from keyss.channels.codes.layout import Header, Room, find_header
+from keyss.channels import CodesCover, CodesReader, Payload
+from keyss.channels.codes.layout import Header, Zones, find_header
 from keyss.core import InputError, UsageError, WrongKeyError
-from keyss.methods.records.embedding import unpack_records
+from keyss.keys import DerivedKey
+from keyss.methods.records.opening import unpack
 
+KEY = DerivedKey.of_master(bytes(32))
 EVERY = pytest.mark.parametrize("suffix", FORMATS)
 
 
@@ -33,12 +33,12 @@ def test_random_codes_open_nothing(seed: int, kind: str) -> None:
         "compressed": lambda: random_compressed(rng, count, 3),
     }[kind]()
     with pytest.raises(WrongKeyError):
-        CodesReader.of(codes).extract(key(0))
+        opened(codes)
     try:
         file = written(CodesCover.of(codes), b"data")
     except (InputError, UsageError):  # no room, or none but for the headers: all fields are left alone
         return
-    assert CodesReader.of(file).extract(key(0)).data == b"data"
+    assert opened(file) == b"data"
 
 
 @EVERY
@@ -54,10 +54,10 @@ def test_mutated_files_open_or_are_refused(suffix: str) -> None:
         if rng.random() < 0.3:
             del changed[int(rng.integers(len(changed))) :]
         try:
-            found = CodesReader.of(format_.parse(bytes(changed))).extract(key(0))
+            found = opened(format_.parse(bytes(changed)))
         except (InputError, WrongKeyError):
             continue
-        assert found.data == bytes(range(200))
+        assert found == bytes(range(200))
     assert time.process_time() - start < 60
 
 
@@ -66,16 +66,16 @@ def test_mutated_files_open_or_are_refused(suffix: str) -> None:
     [Header(9, 0, 0), Header(9, 0, 2**32 - 1), Header(9, 2**32 - 1, 1), Header(0, 0, 1), Header(1025, 0, 1)],
 )
 def test_a_header_that_names_more_than_there_is(header: Header) -> None:
-    room = Room(20_000)
-    zone = bytes(16) + header.encrypt(key(0), 0) + bytes(28 * (room.slots - 1))
+    room = Zones(20_000)
+    zone = bytes(16) + header.encrypt(KEY, 0) + bytes(28 * (room.slots - 1))
     with pytest.raises(InputError, match="more than there is"):
-        find_header(zone, key(0), room)
+        find_header(zone, KEY, room)
 
 
 def test_payloads_that_are_no_models() -> None:
     for data in (b"", b"\0" * 3, b"\x01\0\0\0", bytes(300), b"\xff" * 300):
         with pytest.raises(InputError, match="damaged"):
-            unpack_records(Payload("carry", data))
+            unpack(Payload("carry", data))
 
 
 def test_formats_whose_codes_carry_nothing() -> None:

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from channels.codes.published import FORMATS, codes_of
-from channels.codes.test_channel import written
-from keyss.channels.codes import CodesCover
+from channels.codes.published import FORMATS, codes_of, written
+from keyss.channels import CodesCover
 from keyss.channels.codes.fields import sog_distances
 from keyss.channels.codes.kept import changeable
 from keyss.channels.codes.order import Counted

@@ -12,14 +12,11 @@ import torch
 
 from channels.codes.published import FORMATS, model_of
 from files.formats.conftest import splat_transform  # noqa: F401
-from keyss.channels.base import Payload
-from keyss.channels.codes.published import SUFFIXES, coded, prepare
-from keyss.channels.rooms import room_in
+from keyss.channels import SUFFIXES, Payload, channel_for
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model, write_model
-from keyss.methods import registry
-from keyss.methods.records.embedding import embed_whole
-from keyss.rendering.difference import Viewpoints
+from keyss.methods import embed_whole, registry
+from keyss.rendering import Viewpoints
 
 EVERY = pytest.mark.parametrize("name", SUFFIXES)
 # How far two files may be apart: positions in sizes of the Gaussian (the middle one of its scales), half of
@@ -29,10 +26,10 @@ STEPS = {"spz": (1 / 16, 1e-6), "sog": (1.5 / 16, 1e-6), "compressed-ply": (1e-6
 
 def files(name: str, folder: Path) -> tuple[Path, Path]:
     """An untouched file, and one that carries something under the key "key"."""
-    cover = prepare(model_of(), name)
+    cover = channel_for(name).prepare(model_of())  # type: ignore[arg-type]
     plain, stego = (folder / f"{which}{SUFFIXES[name]}" for which in ("plain", "stego"))
-    write_model(plain, coded(cover.codes))
-    write_model(stego, coded(cover.embed([("key", Payload("carry", b"data"))])))
+    write_model(plain, cover.cover)
+    write_model(stego, cover.embed([("key", Payload("carry", b"data"))]))
     return plain, stego
 
 
@@ -84,7 +81,7 @@ def test_splat_transform_reads_it(
 
 @EVERY
 def test_it_opens_from_the_very_file_and_from_no_other(name: str, tmp_path: Path) -> None:
-    room, secret = room_in(model_of(), name, "appended"), model_of(200, seed=3)  # type: ignore[arg-type]
+    room, secret = channel_for(name).prepare(model_of()), model_of(200, seed=3)  # type: ignore[arg-type]
     _, stego = files(name, tmp_path)
     made = embed_whole(room, ["key"], [secret], [Viewpoints.around(secret)], prune=False)
     write_model(stego, made.stego)

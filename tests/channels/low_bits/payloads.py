@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from keyss.channels.base import Payload
-from keyss.channels.low_bits import LOW_BITS, LowBitsReader
+from keyss.channels import LOW_BITS, LowBitsReader, Payload
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 
@@ -25,7 +24,7 @@ def embed_derived(
 
 
 def extract(stego: Gaussians, key: str) -> bytes:
-    return _data(LOW_BITS.extract(stego, key))
+    return _data(LOW_BITS.reader(stego).open(key))
 
 
 def extract_derived(stego: Gaussians | LowBitsReader, key: DerivedKey) -> bytes:

@@ -9,9 +9,8 @@ import torch
 
 from channels.low_bits.payloads import embed, extract
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels.base import RecordRequest, Records
-from keyss.channels.low_bits import LOW_BITS, LowBitsReader
-from keyss.core import Gaussians, KeyssWarning
+from keyss.channels import LOW_BITS, LowBitsReader, RecordRequest, Records
+from keyss.core import Gaussians
 
 KEY = "the right key"
 
@@ -43,18 +42,6 @@ def test_copies_count_once(cover: Gaussians) -> None:
     assert isinstance(other, Records)
     assert len(one.records) == len(other.records) == 200
     assert {row.tobytes() for row in one.records} == {row.tobytes() for row in other.records}
-
-
-@pytest.mark.parametrize("same_cover", [True, False])
-def test_two_secrets_under_one_key_are_told(cover: Gaussians, same_cover: bool) -> None:
-    """One comes out, and the warning names both."""
-    first = embed(cover, [(KEY, b"first")])
-    second = embed(cover if same_cover else trained_like(1500, 14), [(KEY, b"the second")])
-    with pytest.warns(KeyssWarning, match="two secrets") as caught:
-        data = extract(Gaussians.cat([first, second]), KEY)
-    assert data in (b"first", b"the second")
-    assert "5 bytes of the method 'test'" in str(caught[0].message)
-    assert "10 bytes of the method 'test'" in str(caught[0].message)
 
 
 def test_who_adds_or_removes_gaussians_is_not_warned(cover: Gaussians) -> None:

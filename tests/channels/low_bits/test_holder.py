@@ -10,8 +10,7 @@ import pytest
 
 from channels.low_bits.holder import seen_by_holder
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels.base import RecordRequest, Records
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels import LOW_BITS, RecordRequest, Records
 from keyss.core import KeyssWarning
 
 COVER = 9000

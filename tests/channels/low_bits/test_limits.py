@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels.base import Payload
-from keyss.channels.low_bits import LOW_BITS, LowBitsReader, writing
+from keyss.channels import LOW_BITS, LowBitsReader, Payload, reed_solomon
+from keyss.channels.low_bits import spread, writing
 from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
-from keyss.channels.low_bits.spread import MAX_BLOCKS, Spread
-from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError
-from keyss.keys.encryption import _NONCE, SMALL_PAYLOAD, _cipher, decrypt, encrypt
+from keyss.keys import encryption
 
 
 @contextmanager
@@ -36,21 +34,21 @@ def at_most(megabytes: float) -> Iterator[None]:
 def test_short_data_become_no_large_payload() -> None:
     packed = zlib.compress(bytes(60 << 20), 9)
     plain = struct.pack("<I", len(packed)) + packed
-    bomb = _cipher(bytes(32)).encrypt(_NONCE, plain, b"")
+    bomb = encryption._cipher(bytes(32)).encrypt(encryption._NONCE, plain, b"")
     assert len(bomb) < 64_000
     with at_most(8), pytest.raises(InputError, match="larger than"):
-        decrypt(bytes(32), bomb)
+        encryption.decrypt(bytes(32), bomb)
 
 
-@pytest.mark.parametrize("size", [SMALL_PAYLOAD, SMALL_PAYLOAD + 1, 5 << 20])
+@pytest.mark.parametrize("size", [encryption.SMALL_PAYLOAD, encryption.SMALL_PAYLOAD + 1, 5 << 20])
 def test_payloads_that_compress_too_well_come_out_all_the_same(size: int) -> None:
-    assert decrypt(bytes(32), encrypt(bytes(32), bytes(size))) == bytes(size)
+    assert encryption.decrypt(bytes(32), encryption.encrypt(bytes(32), bytes(size))) == bytes(size)
 
 
 def test_as_many_blocks_as_there_can_be_take_no_memory() -> None:
-    spread = Spread(MAX_BLOCKS, MAX_CHUNKS, MAX_CHUNKS, 66)
+    most = spread.Spread(spread.MAX_BLOCKS, reed_solomon.MAX_CHUNKS, reed_solomon.MAX_CHUNKS, 66)
     with at_most(1), pytest.raises(InputError, match="too much of the model was removed"):
-        spread.decode(np.zeros((100, 69), np.uint8), spread.capacity)
+        most.decode(np.zeros((100, 69), np.uint8), most.capacity)
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +59,20 @@ def cover() -> Gaussians:
 @pytest.mark.parametrize(
     "hostile",
     [
-        lambda found: replace(found, spread=Spread(MAX_BLOCKS, 255, 255, 66), size=1_000_000_000),
-        lambda found: RecordParameters("carry", found.salts, 1, 71, bytes(4096)),
-        lambda found: RecordParameters("carry", found.salts, 1, 65_535, b""),
-        lambda found: RecordParameters("carry", found.salts, 4, 60, b""),
+        lambda found: replace(
+            found, spread=spread.Spread(spread.MAX_BLOCKS, 255, 255, 66), size=1_000_000_000
+        ),
+        lambda found: RecordParameters("carry", 1, 71, bytes(4096)),
+        lambda found: RecordParameters("carry", 1, 65_535, b""),
+        lambda found: RecordParameters("carry", 4, 60, b""),
     ],
     ids=["blocks", "header", "records", "cells"],
 )
 def test_hostile_parameters_end_in_a_sentence(
     cover: Gaussians, hostile: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def packed(method: str, salts: bytes, size: int, spread: Spread) -> object:
-        return hostile(PayloadParameters(method, salts, size, spread))  # type: ignore[operator]
+    def packed(method: str, size: int, own: spread.Spread) -> object:
+        return hostile(PayloadParameters(method, size, own))  # type: ignore[operator]
 
     monkeypatch.setattr(writing, "PayloadParameters", packed)
     stego = LOW_BITS.prepare(cover).embed_derived([(keys(), Payload("carry", b"x"))])

@@ -11,15 +11,15 @@ import pytest
 from scipy.stats import ks_2samp
 
 from channels.low_bits.trained_like import keys
-from keyss.channels.base import Content, Payload, RecordRequest, Records
+from keyss.channels import Content, Payload, RecordRequest, Records
+from keyss.channels.low_bits import ciphers
 from keyss.channels.low_bits.cells import CellCipher
-from keyss.channels.low_bits.ciphers import chunk_cipher, key_cipher, parameter_cipher
-from keyss.channels.low_bits.layout import SALTS, Room
+from keyss.channels.low_bits.layout import SALTS, Carriers
 from keyss.channels.low_bits.writing import Writer
 from keyss.core import KeyssWarning
 
 CARRIERS, WIDTH = 3000, 75
-ROOM = Room(CARRIERS, WIDTH)
+ROOM = Carriers(CARRIERS, WIDTH)
 NAMES = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
@@ -47,7 +47,7 @@ def _payloads(sizes: Sequence[int]) -> list[Content]:
 
 def _seen(contents: Sequence[Content]) -> list[float]:
     """What the holder of the first key can count of its own cells, and of all others together."""
-    writer = Writer(NAMES, WIDTH, os.urandom(32), [os.urandom(16)] * SALTS)
+    writer = Writer(NAMES, WIDTH, os.urandom(32))
     keyed = [([each] * SALTS, content) for each, content in zip([OWN[0], *OWN[1:]], contents, strict=False)]
     if isinstance(contents[0], Payload):
         writer.payloads([(key, each) for key, each in keyed if isinstance(each, Payload)], CARRIERS)
@@ -55,18 +55,18 @@ def _seen(contents: Sequence[Content]) -> list[float]:
         writer.records([(key, each) for key, each in keyed if isinstance(each, Records)])
     low = np.empty_like(writer.table)
     low[writer.order] = writer.table
-    fits, found = key_cipher(OWN[0]).decrypt(NAMES, low)
+    fits, found = ciphers.key_cipher(OWN[0]).decrypt(NAMES, low)
     data_key = found[0].tobytes()
-    headers = fits | parameter_cipher(data_key, WIDTH).decrypt(NAMES, low)[0]
+    headers = fits | ciphers.parameter_cipher(data_key, WIDTH).decrypt(NAMES, low)[0]
     if isinstance(contents[0], Payload):
-        own = chunk_cipher(data_key, WIDTH).decrypt(NAMES, low)[0][:, None]
+        own = ciphers.chunk_cipher(data_key, WIDTH).decrypt(NAMES, low)[0][:, None]
     else:
         cells, size = contents[0].plan.cells_per_carrier, contents[0].records.shape[1]
-        ciphers = [CellCipher(data_key, label, size) for label in ("record", "copy")]
+        both = [CellCipher(data_key, label, size) for label in ("record", "copy")]
         step = WIDTH // cells
         own = np.stack(
             [
-                np.any([each.decrypt(NAMES, low[:, slot * step :], slot)[0] for each in ciphers], axis=0)
+                np.any([each.decrypt(NAMES, low[:, slot * step :], slot)[0] for each in both], axis=0)
                 for slot in range(cells)
             ],
             axis=1,

@@ -17,13 +17,10 @@ from argon2.low_level import Type, hash_secret_raw
 from channels.low_bits.payloads import embed, embed_derived, extract, extract_derived
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
-from keyss.channels.low_bits import LowBitsReader, cells, reading
-from keyss.channels.low_bits.bits import identities, read_low_bits
-from keyss.channels.low_bits.ciphers import key_cipher
+from keyss.channels import LowBitsReader, check_payload_fits, identities, read_low_bits, usable_carriers
+from keyss.channels.low_bits import cells, ciphers, reading, spread
 from keyss.channels.low_bits.reading import SALTS_TRIED
 from keyss.channels.low_bits.salts import salt_rows
-from keyss.channels.low_bits.spread import carriers_for, check_payload_fits, payload_capacity, plan_spread
-from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey, generate_key
@@ -104,7 +101,7 @@ def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: in
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
     model = trained_like(4000)
     own, other = keys(), keys(1)
-    room = payload_capacity(4000)
+    room = spread.payload_capacity(4000)
     stego = embed_derived(model, [(own, os.urandom(room * 9 // 10))])
     order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
     first = salt_rows(stego, identities(stego), read_low_bits(stego))[:1]
@@ -193,7 +190,7 @@ def test_the_holder_of_a_key_sees_the_same_whether_there_is_another_secret_or_no
 
 
 def _opened(stego: Gaussians, key: DerivedKey) -> np.ndarray:
-    return key_cipher(key).decrypt(identities(stego), read_low_bits(stego))[1]
+    return ciphers.key_cipher(key).decrypt(identities(stego), read_low_bits(stego))[1]
 
 
 def _neighbours(key: str) -> list[str]:
@@ -247,14 +244,14 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
 ) -> None:
     """Up to the decryption of the payload: as many blocks of AES; in seconds: benchmarks/attempts.py."""
     blocks = 0
-    real = cells._encrypt
+    real = cells.encrypted_blocks
 
     def counted(key: bytes, data: np.ndarray) -> np.ndarray:
         nonlocal blocks
         blocks += data.size // 16
         return real(key, data)
 
-    monkeypatch.setattr(cells, "_encrypt", counted)
+    monkeypatch.setattr(cells, "encrypted_blocks", counted)
     reader = LowBitsReader.of(stego)
     right = next(reader.keys(KEY))
     assert extract_derived(reader, right) == PAYLOAD
@@ -290,16 +287,17 @@ def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
 
 
 def test_capacity_grows_with_the_model_and_its_plan_is_kept_to() -> None:
-    sizes = [payload_capacity(cells) for cells in (100, 500, 1000, 5000, 20_000, 200_000)]
+    capacity = spread.payload_capacity
+    sizes = [capacity(cells) for cells in (100, 500, 1000, 5000, 20_000, 200_000)]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
     assert sizes[-1] / 200_000 > 18
-    assert payload_capacity(20_000, 2) == payload_capacity(20_000, 1) > 1.9 * payload_capacity(20_000, 3)
+    assert capacity(20_000, 2) == capacity(20_000, 1) > 1.9 * capacity(20_000, 3)
     for size in (4096, 131_072):
-        need = carriers_for(size, 1, 75)
-        assert payload_capacity(need) >= size > payload_capacity(need - 1)
-        assert plan_spread(need, 2, 75, size) is not None
-        assert plan_spread(need - 1, 2, 75, size) is None
+        need = spread.carriers_for(size, 1, 75)
+        assert capacity(need) >= size > capacity(need - 1)
+        assert spread.plan_spread(need, 2, 75, size) is not None
+        assert spread.plan_spread(need - 1, 2, 75, size) is None
 
 
 @pytest.mark.parametrize("change", UNNATURAL)

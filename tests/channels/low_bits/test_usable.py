@@ -11,10 +11,10 @@ import torch
 from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys, trained_like
 from files.test_ply import assert_same_bits
-from keyss.channels.low_bits import LOW_BITS, LowBitsReader
-from keyss.channels.low_bits.bits import Layout, read_low_bits, used_words, write_low_bits
+from keyss.channels import LOW_BITS, LowBitsReader, chance_of_bits, read_low_bits, usable_carriers
+from keyss.channels.low_bits.bits import Layout, used_words, write_low_bits
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
-from keyss.channels.low_bits.usable import GIVEN_AWAY, chance_of_bits, check_usable, usable_carriers
+from keyss.channels.low_bits.usable import GIVEN_AWAY, check_usable
 from keyss.core import Gaussians, InputError
 
 STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
@@ -57,7 +57,11 @@ def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussi
     # The control: new bits in every Gaussian.
     random = np.random.default_rng(0)
     careless = [
-        write_low_bits(model, np.arange(len(model)), random.integers(0, 256, (len(model), 75), np.uint8))
+        write_low_bits(
+            model,
+            Layout.of(model),
+            [(np.arange(len(model)), random.integers(0, 256, (len(model), 75), np.uint8))],
+        )
         for model in rounded
     ]
     assert _auc(plain, [small_even_numbers(model) for model in careless]) > 0.95

@@ -11,8 +11,7 @@ import pytest
 
 from keyss.channels.low_bits.cells import CellCipher
 from keyss.core import errors
-from keyss.keys import DerivedKey, KeyDerivation
-from keyss.keys.encryption import decrypt
+from keyss.keys import DerivedKey, KeyDerivation, encryption
 
 pytestmark = pytest.mark.argon2
 
@@ -45,14 +44,14 @@ def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
 def test_sealing() -> None:
     vector = SEALING["sealed"]
     parts = (bytes.fromhex(vector[name]) for name in ("data_key", "sealed", "associated"))
-    assert decrypt(*parts).hex() == vector["payload"]
+    assert encryption.decrypt(*parts).hex() == vector["payload"]
 
 
 @pytest.mark.parametrize("vector", SEALING["invalid"], ids=lambda vector: vector["why"])
 def test_sealing_that_must_fail(vector: dict[str, Any]) -> None:
     good = SEALING["sealed"]
     with pytest.raises(getattr(errors, vector["error"]), match=vector["words"]):
-        decrypt(
+        encryption.decrypt(
             bytes.fromhex(good["data_key"]),
             bytes.fromhex(vector["sealed"]),
             bytes.fromhex(good["associated"]),

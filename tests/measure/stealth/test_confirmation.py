@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from channels.low_bits.trained_like import keys
-from keyss.measure.stealth.confirmation import candidate_scores, changed_low_bits, confirmed
+from keyss.measure import candidate_scores, changed_low_bits
 from measure.stealth.careless import banded, overwritten, plain, shuffled
 from methods.carry.carried import embed_derived
+from stealth_detection import confirmed
 
 SECRETS = 4
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from keyss.measure.stealth.detection import Examples, areas, learned_detectors, single_detectors
-from keyss.measure.stealth.suite import stealth_statistics
+from keyss.measure import stealth_statistics
 from measure.stealth.careless import overwritten, plain, plain_rounded
+from stealth_detection import Examples, areas, learned_detectors, single_detectors
 
 SCENES = 4
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from keyss.core import UsageError
-from keyss.measure.stealth.judging import judge
+from keyss.measure import judge
 from measure.stealth.careless import banded, normalised, overwritten, plain, plain_rounded
 
 LIMIT = 0.01

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from keyss.measure.stealth.predictor import BitPredictor
 from measure.stealth.careless import grey, overwritten, plain, plain_rounded
+from stealth_predictor import BitPredictor
 
 RANDOM_NOISE = 4.5  # standard errors
 

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from keyss.core import Gaussians
+from keyss.measure import stealth_statistics
 from keyss.measure.stealth.colours import colours
+from keyss.measure.stealth.judging import KINDS
 from keyss.measure.stealth.opacities import modes
-from keyss.measure.stealth.suite import KINDS, stealth_statistics
 from measure.stealth.careless import (
     banded,
     grey,

@@ -14,17 +14,14 @@ import torch
 
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
-from keyss.channels.low_bits import LOW_BITS, LowBitsReader
-from keyss.channels.low_bits.bits import identities, read_low_bits
+from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, usable_carriers
 from keyss.channels.low_bits.ciphers import key_cipher
-from keyss.channels.low_bits.layout import Room, plan_records
 from keyss.channels.low_bits.salts import salt_rows
-from keyss.channels.low_bits.usable import usable_carriers
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files.ply import read_ply, write_ply
 from keyss.keys import DerivedKey
-from keyss.methods.records.encoding import check_degrees, encode_all, record_request, subsampled_counts
-from keyss.methods.records.table import Table
+from keyss.methods import RecordRoom, Table, Wanted, encode_all, record_request
+from keyss.methods.records.encoding import check_degrees
 from keyss.rendering import render
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 from tiny_scenes import ring_cameras
@@ -80,11 +77,11 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
         with pytest.raises(
             UsageError, match=f"SH degree 1 cannot carry a secret of SH degree {secret_degree}"
         ):
-            check_degrees(LOW_BITS, model.sh_degree, [hidden.sh_degree])
+            check_degrees(model.sh_degree, [hidden.sh_degree])
         with pytest.raises(UsageError, match="room for records of"):
             embed_derived(model, [(own, hidden)])
         return
-    check_degrees(LOW_BITS, model.sh_degree, [hidden.sh_degree])
+    check_degrees(model.sh_degree, [hidden.sh_degree])
     carried = extract_derived(LowBitsReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
     assert len(carried.gaussians) == 900
@@ -92,7 +89,7 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
 
 def test_a_cover_without_spherical_harmonics_is_refused() -> None:
     with pytest.raises(UsageError, match="SH degree 0 cannot carry"):
-        check_degrees(LOW_BITS, 0, [0])
+        check_degrees(0, [0])
     with pytest.raises(UsageError, match="room for records of 0 bytes"):
         embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
     with pytest.raises(WrongKeyError):
@@ -311,13 +308,13 @@ def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians
 
 def test_layouts_follow_from_a_secret_s_own_size() -> None:
     """Whole carriers up to a fifth of them, halves above; others do not change that while there is room."""
-    room = Room(90_000, 75)
+    room = LOW_BITS.room(90_000, 3)
     left = 90_000 - 4 * room.header_carriers(record_request(1, 3).header_bytes)
     small, middle, large = (record_request(count, 3) for count in (16_000, 40_000, 85_000))
-    alone = [plan_records([each], 90_000, 3)[0] for each in (small, middle, large)]
+    alone = [room.plan_records([each])[0] for each in (small, middle, large)]
     assert [each.cells_per_carrier for each in alone] == [1, 2, 2]
     assert [each.copies for each in alone] == [left // 5 - 16_000, left // 2 - 40_000, left - 85_000]
-    assert plan_records([record_request(10_000, 3)], 90_000, 3)[0].copies == 2500
+    assert room.plan_records([record_request(10_000, 3)])[0].copies == 2500
     for fitting in (
         [small] * 4,
         [middle] * 4,
@@ -325,11 +322,11 @@ def test_layouts_follow_from_a_secret_s_own_size() -> None:
         [large, large],
         [middle, middle, small],
     ):
-        plans = plan_records(fitting, 90_000, 3)
-        assert plans == [plan_records([each], 90_000, 3)[0] for each in fitting]
+        plans = room.plan_records(fitting)
+        assert plans == [room.plan_records([each])[0] for each in fitting]
         assert room.arrangement(plans, fitting).as_alone
     for crowded in ([small] * 5, [record_request(60_000, 3)] * 2 + [middle]):
-        plans = plan_records(crowded, 90_000, 3)
+        plans = room.plan_records(crowded)
         assert not room.arrangement(plans, crowded).as_alone
     table = Table.of_size(8 * alone[0].record_bytes, 3)
     assert table is not None
@@ -338,19 +335,20 @@ def test_layouts_follow_from_a_secret_s_own_size() -> None:
 
 def test_too_large_a_secret_is_refused_with_the_number_that_fits(cover: Gaussians) -> None:
     prepared = LOW_BITS.prepare(cover)
-    header = Room(prepared.carriers, 75).header_carriers(record_request(1, 3).header_bytes)
+    header = LOW_BITS.room(prepared.carriers, 3).header_carriers(record_request(1, 3).header_bytes)
     fits = 2 * (prepared.carriers - header)
     too_large, small = trained_like(8000, 5), trained_like(500, 6)
     assert prepared.record_capacity([record_request(8000, 3)]) == fits
     with pytest.raises(UsageError, match=rf"8,000 Gaussians are too many.*{fits:,} would fit"):
-        encode_all(prepared, [too_large], "carry")
-    assert subsampled_counts(prepared, [too_large]) == [fits]
-    assert encode_all(prepared, [too_large[:fits]], "carry")[0].plan.cells_per_carrier == 2
-    kept = subsampled_counts(prepared, [small, too_large])
-    assert kept[0] == 500
-    assert encode_all(prepared, [small, too_large[: kept[1]]], "carry")
-    with pytest.raises(UsageError, match="nothing fits"):
-        subsampled_counts(LOW_BITS.prepare(cover[:200]), [too_large])
+        encode_all(prepared, [too_large])
+    place = RecordRoom(len(cover), 3, prepared.carriers)
+    assert place.sizes([Wanted.of(too_large)]) == [(fits, 3)]
+    assert encode_all(prepared, [too_large[:fits]])[0].plan.cells_per_carrier == 2
+    kept = place.sizes([Wanted.of(small), Wanted.of(too_large)])
+    assert kept[0] == (500, 3)
+    assert encode_all(prepared, [small, too_large[: kept[1][0]]])
+    with pytest.raises(UsageError, match="too small"):
+        RecordRoom(200, 3, 200).sizes([Wanted.of(too_large)])
     assert Table.floor(3).total <= 264
 
 

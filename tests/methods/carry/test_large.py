@@ -7,7 +7,7 @@ import time
 import pytest
 
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels.low_bits import LowBitsReader
+from keyss.channels import LowBitsReader
 from keyss.core import WrongKeyError
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 

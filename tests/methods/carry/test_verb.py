@@ -13,12 +13,12 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
-from keyss.channels.low_bits import LOW_BITS
+from keyss.channels import LOW_BITS
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.ply import read_ply, write_ply
-from keyss.methods.records.encoding import most_visible, record_request
+from keyss.methods import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -84,20 +84,19 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").rglob("*.json"))
 
 
-@pytest.mark.parametrize("flag", ["--prune-to-fit", "--thin"])
 def test_too_large_secrets_are_refused_or_pruned(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path, flag: str
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     hide = ("hide", "--method", "carry", "--width", 48, "--cover", "cover.ply", "--key-file", "key")
     hide = (*hide, "--secret", "large.ply")
-    status, _, err = run(*hide, "-o", tmp_path / "out")
+    status, _, err = run(*hide, "-o", tmp_path / "out", "--refit", "never")
     assert status == 2
     cover = LOW_BITS.prepare(read_ply("cover.ply"))
     fits = cover.record_capacity([record_request(6000, 3)])
     assert 4000 < fits < 4800
     assert f"{fits:,} would fit; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()
-    assert run(*hide, "-o", tmp_path / "out", flag)[0] == 0
+    assert run(*hide, "-o", tmp_path / "out", "--prune-to-fit")[0] == 0
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [fits]
     assert metrics["details"]["gaussians_before_pruning"] == [6000]
@@ -110,11 +109,11 @@ def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
 ) -> None:
     write_ply(tmp_path / "tiny.ply", trained_like(100))
     hide = ("hide", "--method", "carry", "--cover", tmp_path / "tiny.ply", "--key-file", "key")
-    for flags in ((), ("--thin",)):
+    for flags in ((), ("--prune-to-fit",), ("--refit=never",)):
         status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", *flags)
         assert status == 2
         assert "--publish any" in err
-        assert "--prune-to-fit" not in err
+        assert "would fit" not in err
         assert not (tmp_path / "out").exists()
 
 
@@ -132,12 +131,11 @@ def test_one_key_for_two_secrets_is_refused_before_any_work(
 @pytest.mark.parametrize(
     ("arguments", "having"),
     [
-        (("--start", "points", "--method", "carry"), "learned"),
-        (("--mask", "op", "--method=carry"), "learned"),
-        (("--key_encoder=clip", "--method", "learned", "--method", "carry"), "learned"),
-        (("--thin",), "carry"),
-        (("--prune-to-fit",), "carry"),
-        (("--dither", "--method", "learned"), "carry"),
+        (("--design", "released"), "keyss"),
+        (("--mask", "op", "--method=carry"), "keyss"),
+        (("--key_encoder=clip", "--method", "keyss", "--method", "carry"), "keyss"),
+        (("--prune-to-fit", "--method", "keyss"), "carry"),
+        (("--dither", "--method=keyss"), "carry"),
     ],
 )
 def test_options_of_the_other_method_are_refused(
@@ -167,7 +165,7 @@ def test_dithering_says_what_it_costs(
     )
     status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out")
     assert status == 4
-    assert "gives it new low bits" in err
+    assert "--dither makes room" in err
     status, out, _ = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", "--dither")
     assert status == 0
     assert "dithered cover psnr against the one before: " in out
@@ -186,7 +184,7 @@ def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) ->
     (secret,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
     assert plain is not None
     assert secret.psnr == pytest.approx(plain.psnr, abs=0.05)
-    revealed = keyss.reveal(tmp_path / "run/publish/stego.ply", KEY)
+    revealed = keyss.reveal(tmp_path / "run/publish/stego.ply", KEY).gaussians
     assert (len(revealed),) == result.metrics.secret_gaussians
     with pytest.raises(UsageError, match="scenes in memory"):
         keyss.evaluate(tmp_path / "run", [KEY])
@@ -229,6 +227,6 @@ def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -
     flat = random_gaussians(1500, sh_degree=0)
     model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))
     other = Secret(tiny_scene(1), KEY + "2")
-    with pytest.raises(UsageError, match="SH degree 0 cannot carry"):
+    with pytest.raises(UsageError, match="SH degree 0 has no room"):
         keyss.hide(flat, [other, model], method="carry", out=tmp_path / "run")
     assert not (tmp_path / "run").exists()

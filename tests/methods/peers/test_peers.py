@@ -12,35 +12,31 @@ import torch
 
 import keyss
 from keyss import FitConfig, Secret
-from keyss.api import SecretFile, hide_files
-from keyss.audit import audit
+from keyss.audits import audit
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.core.decoded import DecodedGaussians
 from keyss.core.similarity import Similarity
 from keyss.fitting.checkpoint import State
-from keyss.methods import peers, registry
-from keyss.methods.peers.options import PeerOptions
-from keyss.methods.peers.training import PeerRun
-from keyss.methods.poses import PlacedScene
+from keyss.methods import JointTraining, PeerOptions, PlacedScene, registry
 from keyss.runs.files import handed_names, stego_in
 from test_api import write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 
 FIT = FitConfig(iterations=120, max_gaussians=300, sh_degree=1, grow_every=30, evaluate_every=60, seed=0)
-PEERS = [each.name for each in peers.PEERS]
-TRAINED = [each.name for each in peers.PEERS if each.trains]
+PEERS = [name for name, where in registry.METHODS.items() if ".peers." in where.hiding]
+TRAINED = [name for name in PEERS if name != "3dgs"]
 KEY = "a key of many characters: 93hXmQ2"
 
 
 def options_of(name: str, **changes: Any) -> PeerOptions:
     """Small enough for seconds."""
-    found: Any = registry.METHODS[name].options
+    found: Any = registry.get(name).options
     return replace(found(fit=FIT, common_poses=0.5), **changes)  # type: ignore[no-any-return]
 
 
 def key_of(name: str) -> str:
-    return KEY if registry.METHODS[name].capabilities.keys else ""
+    return KEY if registry.get(name).capabilities.keys else ""
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ def test_what_is_written_is_what_was_measured(made: Made) -> None:
 
 
 def test_both_files_show_the_secret(made: Made, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    capabilities = registry.METHODS[made.name].capabilities
+    capabilities = registry.get(made.name).capabilities
     stego = stego_in(made.out)
     assert (stego.suffix == ".ply") == capabilities.standard
     out = tmp_path / ("secret.ply" if capabilities.models else "secret.3dgs.safetensors")
@@ -147,7 +143,7 @@ def test_the_command_line(
     given = ["--key-file", str(key)] if made.keys else []
     assert main(["evaluate", str(made.out), *given]) == 0
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in capsys.readouterr().out
-    models = registry.METHODS[made.name].capabilities.models
+    models = registry.get(made.name).capabilities.models
     out = str(tmp_path / ("a.ply" if models else "a.3dgs.safetensors"))
     stego = str(stego_in(made.out))
     assert main(["reveal", stego, "--handed", str(made.handed), *given, "-o", out]) == 0
@@ -166,18 +162,18 @@ def test_a_key_for_what_has_none_and_what_it_cannot_do_are_refused(folders: tupl
     with pytest.raises(UsageError, match="publish"):
         options_of("gs-hider", publish="any")
     with pytest.raises(UsageError, match="key is empty"):
-        keyss.hide(folders[0], [Secret(folders[1])], method="learned")
+        keyss.hide(folders[0], [Secret(folders[1])], method="carry")
 
 
 def test_what_a_network_draws_is_no_cover(made: Made, folders: tuple[Path, Path]) -> None:
-    if registry.METHODS[made.name].capabilities.standard:
+    if registry.get(made.name).capabilities.standard:
         return
     stego = stego_in(made.out)
     for cover, secret in ((stego, folders[1]), (folders[0], stego)):
         with pytest.raises(UsageError, match="network"):
             keyss.hide(cover, [Secret(secret, KEY)])
     with pytest.raises(UsageError, match="network"):
-        hide_files(stego, [SecretFile(made.handed, KEY)], out=made.out.parent / "files")
+        keyss.hide(stego, [Secret(file=made.handed, key=KEY)], out=made.out.parent / "files")
 
 
 @pytest.mark.parametrize("name", TRAINED)
@@ -185,10 +181,10 @@ def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
     """All state is in checkpoints: parameters that a peer adds, networks, moments, the order of poses."""
     scenes = [tiny_scene(0), tiny_scene(1)]
     placed = [PlacedScene.of(scene, random_gaussians(50), Similarity.identity()) for scene in scenes]
-    method: Any = registry.METHODS[name]
-    whole, resumed = (method.begin(placed, options_of(name), torch.device("cpu")) for _ in range(2))
+    method: Any = registry.get(name)
+    whole, resumed = (method.training(placed, options_of(name), torch.device("cpu")) for _ in range(2))
 
-    def run_to(run: PeerRun, end: int) -> State:
+    def run_to(run: JointTraining, end: int) -> State:
         torch.manual_seed(run.iteration)  # which `train` keeps
         while run.iteration < end:
             run.step()
@@ -206,9 +202,9 @@ def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
 def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
     if made.name not in ("3dgs-decoder", "gs-hider"):  # the others are 3DGS models throughout
         return
-    standard = registry.METHODS[made.name].capabilities.standard
+    standard = registry.get(made.name).capabilities.standard
     if not standard:
-        with pytest.raises(UsageError, match="no 3DGS model"):
+        with pytest.raises(UsageError, match="not publish a 3DGS model"):
             audit(made.out, [], only=["images", "stealth"])
     found = audit(made.out, [], only=["images", "speed"], controls=2)
     assert found.run.standard == standard
@@ -218,5 +214,5 @@ def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[
     ours = [each for each in found.speed.readers if each.file == "secret 1"]
     assert ours
     assert not any(each.loads for each in ours)
-    assert main(["report", str(made.out)]) == 0
-    assert ("no 3DGS model" in (made.out / "private" / "report.html").read_text()) != standard
+    assert main(["audit", str(made.out), "--report-only"]) == 0
+    assert ("not publish a 3DGS model" in (made.out / "private" / "report.html").read_text()) != standard

@@ -11,8 +11,7 @@ from hypothesis.extra import numpy as arrays
 
 from channels.low_bits.trained_like import trained_like
 from keyss.core import Gaussians, InputError
-from keyss.methods.records.quantise import Codec, Line, outliers
-from keyss.methods.records.table import Table
+from keyss.methods import Codec, Line, Table, outliers
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 

@@ -12,26 +12,26 @@ from channels.codes.published import model_of
 from keyss.core import InputError
 from keyss.core.colour import OPPONENT
 from keyss.core.scene import Scene, View
+from keyss.methods import Table
 from keyss.methods.records import whole
 from keyss.methods.records.precision import fitted, good_enough, pruned
-from keyss.methods.records.table import Table
-from keyss.rendering.difference import Viewpoints, cost
+from keyss.rendering import Viewpoints, psnr_between
 from keyss.rendering.orbit import orbit
 
 
 def test_a_whole_model_comes_back_as_its_records_would() -> None:
     model = model_of(3000, sh_degree=2)
-    sizes, costs = [], []
-    for bits in (97, whole.USUAL_BITS, 123, whole.MOST_BITS):
+    sizes, psnrs = [], []
+    for bits in (97, whole.USUAL_BITS, 123, whole.MAX_BITS):
         data = whole.encode(model, whole.Precision.of_size(bits))
         opened = whole.decode(data)
-        assert opened.count == len(opened.gaussians) == 3000
+        assert len(opened) == 3000
         sizes.append(len(data))
-        costs.append(cost(model, opened.gaussians))
+        psnrs.append(psnr_between(model, opened))
     assert sizes == sorted(sizes)
-    assert costs == sorted(costs)
-    assert costs[0] > 34
-    assert costs[1] > 40
+    assert psnrs == sorted(psnrs)
+    assert psnrs[0] > 34
+    assert psnrs[1] > 40
     assert sizes[1] * 8 < 3000 * Table.floor(2).total
 
 
@@ -48,10 +48,19 @@ def test_damaged_encodings_end_in_an_input_error() -> None:
         at = int(torch.randint(len(data), (), generator=generator))
         changed[at] ^= 1 << int(torch.randint(8, (), generator=generator))
         try:
-            found = whole.decode(bytes(changed)).gaussians
+            found = whole.decode(bytes(changed))
         except InputError:
             continue
         assert all(bool(getattr(found, name).isfinite().all()) for name in ("means", "quats", "sh"))
+
+
+def test_a_few_bytes_that_announce_many_gaussians_are_refused_before_they_are_unpacked() -> None:
+    data = whole.encode(model_of(500))
+    with pytest.raises(InputError, match="more than"):
+        whole.decode((1 << 20).to_bytes(4, "little") + data[4:])
+    block = bytes([0b011 | 0xF8, 0xFF, 0xFF, 7])  # 2 MiB of one byte
+    with pytest.raises(InputError, match="damaged"):
+        whole.decode((1 << 17).to_bytes(4, "little") + data[4 : -len(block)] + 1000 * block)
 
 
 def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() -> None:
@@ -61,7 +70,7 @@ def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() ->
     model = replace(model, log_scales=scales)
     step = 0.03
     found = whole.decode(whole.encode(model, whole.Precision(whole.Precision.of_size(110).table, step)))
-    error = (found.gaussians.sh - model.sh)[:, 1:].double().numpy() @ OPPONENT.T
+    error = (found.sh - model.sh)[:, 1:].double().numpy() @ OPPONENT.T
     largest = np.abs(error).reshape(2000, -1).max(axis=1)
     seen = (scales.sort(dim=1).values[:, 1:].sum(1) + 2 * model.opacity_logits.clamp(max=0)).double().numpy()
     octaves = (seen - np.median(seen)) / np.log(2)
@@ -80,8 +89,8 @@ def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     assert 4 <= len(viewpoints.cameras) <= 8
     assert torch.equal(viewpoints.background, torch.ones(3))
     found = good_enough(model, viewpoints)
-    opened = whole.decode(whole.encode(model, found)).gaussians
-    assert 44 <= cost(model, opened, viewpoints) < 48
+    opened = whole.decode(whole.encode(model, found))
+    assert 44 <= psnr_between(model, opened, viewpoints) < 48
     kept, data = fitted(model, 1 << 20, prune=False, short=True, viewpoints=viewpoints)
     assert kept is model
     assert data == whole.encode(model, found)

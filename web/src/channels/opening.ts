@@ -14,25 +14,16 @@ import type { Content, Reader } from './content.ts';
 import { LowBitsReader } from './low_bits/reader.ts';
 
 /** A model's channels, prepared for any number of keys; with `colours`, as soon as that is asked for, these too. */
-export function preparedFor(model: ReadModel): (colours: boolean) => Reader {
-  const quick = quickReadersOf(model);
+export function preparedFor(model: ReadModel): (colours: boolean) => Channels {
+  const exact = model.codes ? CodesReader.of(model.codes) : LowBitsReader.of(model);
+  const quick = [exact, AppendedReader.of(model)].filter((each) => each !== null);
   let all: Reader[] | null = null;
   return (colours) => new Channels(colours ? (all ??= [...quick, ColoursReader.of(model)]) : quick);
 }
 
-/** One for each channel that a model has, those that come first counting most. */
-export function readersOf(model: ReadModel): Reader[] {
-  return [...quickReadersOf(model), ColoursReader.of(model)];
-}
-
-function quickReadersOf(model: ReadModel): Reader[] {
-  const exact = model.codes ? CodesReader.of(model.codes) : LowBitsReader.of(model);
-  return [exact, AppendedReader.of(model)].filter((each) => each !== null);
-}
-
 /** Several channels, of which the first one that opens counts. */
 export class Channels implements Reader {
-  constructor(private readonly readers: readonly Reader[]) {}
+  constructor(readonly readers: readonly Reader[]) {}
 
   get derivations(): number {
     return this.readers.reduce((sum, each) => sum + each.derivations, 0);

@@ -33,3 +33,18 @@ export function halfFloat(bits: number): number {
   if (exponent === 31) return fraction ? NaN : sign * Infinity;
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : (2 ** -14 * fraction) / 1024);
 }
+
+/** 0 of no values. */
+export function median(values: Float64Array): number {
+  if (!values.length) return 0;
+  const sorted = Float64Array.from(values).sort();
+  const middle = sorted.length >> 1;
+  return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
+}
+
+/** The value that occurs most, the first of several, and how often; undefined of none. */
+export function mostFrequent<T>(values: Iterable<T>): [T, number] | undefined {
+  const votes = new Map<T, number>();
+  for (const each of values) votes.set(each, (votes.get(each) ?? 0) + 1);
+  return [...votes].reduce<[T, number] | undefined>((best, each) => (best && best[1] >= each[1] ? best : each), undefined);
+}

@@ -1,4 +1,16 @@
-/** Something about a file that a person can be told in one sentence. */
+/** An error in a file, said to a person in one sentence. */
 export class InputError extends Error {
   override name = 'InputError';
+}
+
+export function damaged(): InputError {
+  return new InputError('This file is damaged.');
+}
+
+export function otherVersion(): InputError {
+  return new InputError('What this key opens was hidden by another version of keyss.');
+}
+
+export function tooMuchLost(): InputError {
+  return new InputError('The key is right, but too much of the model was lost or changed.');
 }

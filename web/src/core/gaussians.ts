@@ -9,6 +9,10 @@ export interface Gaussians {
   readonly sh: Float32Array; // [N, K, 3], K = (shDegree + 1)^2
 }
 
+/** The columns as wide in every model; harmonics are not. */
+const FIXED = ['means', 'quats', 'logScales', 'opacityLogits'] as const;
+export const COLUMNS = [...FIXED, 'sh'] as const;
+
 export function coefficients(shDegree: number): number {
   return (shDegree + 1) ** 2;
 }
@@ -28,15 +32,24 @@ export function emptyGaussians(count: number, shDegree: number): Gaussians {
 
 /** The buffers, to be moved between threads instead of copied. */
 export function buffersOf(gaussians: Gaussians): ArrayBuffer[] {
-  const { means, quats, logScales, opacityLogits, sh } = gaussians;
-  return [means, quats, logScales, opacityLogits, sh].map((each) => each.buffer as ArrayBuffer);
+  return COLUMNS.map((column) => gaussians[column].buffer as ArrayBuffer);
+}
+
+/** A copy with harmonics of another degree: cut off, or filled up with zeros. */
+export function withDegree(gaussians: Gaussians, shDegree: number): Gaussians {
+  const found = emptyGaussians(gaussians.count, shDegree);
+  for (const column of FIXED) found[column].set(gaussians[column]);
+  const [from, to] = [3 * coefficients(gaussians.shDegree), 3 * coefficients(shDegree)];
+  for (let row = 0; row < gaussians.count; row++) {
+    found.sh.set(gaussians.sh.subarray(row * from, row * from + Math.min(from, to)), row * to);
+  }
+  return found;
 }
 
 /** The Gaussians of these rows, in this order. */
 export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussians {
   const found = emptyGaussians(rows.length, gaussians.shDegree);
-  const columns = ['means', 'quats', 'logScales', 'opacityLogits', 'sh'] as const;
-  for (const column of columns) {
+  for (const column of COLUMNS) {
     const width = gaussians[column].length / Math.max(1, gaussians.count);
     for (let to = 0; to < rows.length; to++) {
       const from = rows[to] * width;

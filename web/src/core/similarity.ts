@@ -23,6 +23,11 @@ export function isSimilarity({ scale, rotation: r, translation }: Similarity): b
   return [scale, ...r, ...translation].every(Number.isFinite) && scale > 0 && Math.max(...off) <= 1e-6 && turn > 0;
 }
 
+/** Where it takes a point [3]. */
+export function movedPoint({ scale, rotation, translation }: Similarity, point: ArrayLike<number>): number[] {
+  return times(rotation, point).map((each, axis) => scale * each + translation[axis]);
+}
+
 /** The Gaussians moved along with the world, their view-dependent colour included. */
 export function moved(by: Similarity, model: Gaussians): Gaussians {
   const [w, x, y, z] = quaternion(by.rotation);
@@ -30,8 +35,7 @@ export function moved(by: Similarity, model: Gaussians): Gaussians {
   const k = coefficients(model.shDegree);
   const [means, quats, sh] = [model.means.slice(), model.quats.slice(), model.sh.slice()];
   for (let row = 0; row < model.count; row++) {
-    const place = times(by.rotation, model.means.subarray(3 * row, 3 * row + 3));
-    place.forEach((each, axis) => (means[3 * row + axis] = by.scale * each + by.translation[axis]));
+    means.set(movedPoint(by, model.means.subarray(3 * row, 3 * row + 3)), 3 * row);
     const [a, b, c, d] = model.quats.subarray(4 * row, 4 * row + 4);
     quats.set([
       w * a - x * b - y * c - z * d, x * a + w * b - z * c + y * d,
@@ -60,6 +64,15 @@ function dot(a: readonly number[], b: readonly number[]): number {
   return a.reduce((sum, each, at) => sum + each * b[at], 0);
 }
 
+/** [9] by rows, of a quaternion wxyz of length 1. */
+export function rotationOf([w, x, y, z]: readonly number[]): number[] {
+  return [
+    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+  ];
+}
+
 /** wxyz, of length 1, of a rotation matrix (Shepperd 1978). */
 function quaternion(r: readonly number[]): number[] {
   const squares = [
@@ -76,41 +89,23 @@ function quaternion(r: readonly number[]): number[] {
   return found.map((each) => each / length);
 }
 
-/**
- * [2 band + 1]^2: what turns the coefficients of one degree of harmonics. The basis at as many directions as there are
- * coefficients, times it, is the basis at the directions turned back.
- */
+// [32, 4] directions and weights whose sums are integrals over the sphere, exact up to degree 7 (Gauss, and even steps).
+const GAUSS = [[0.3399810435848563, 0.6521451548625461], [0.8611363115940526, 0.3478548451374538]];
+const SPHERE = GAUSS.flatMap(([z, weight]) => [z, -z].flatMap((height) =>
+  Array.from({ length: 8 }, (_, step) => {
+    const [radius, angle] = [Math.sqrt(1 - z * z), (step * Math.PI) / 4];
+    return [radius * Math.cos(angle), radius * Math.sin(angle), height, (weight * Math.PI) / 4];
+  })));
+
+/** [2 band + 1]^2: what turns the coefficients of one degree of harmonics, whose basis is orthonormal. */
 function rotatedBand(r: readonly number[], band: number): number[][] {
-  const size = 2 * band + 1;
-  const directions = Array.from({ length: 3 * size }, (_, index) => spiral(index, 3 * size));
-  const basis = directions.map((each) => harmonics(each, band));
+  const found = Array.from({ length: 2 * band + 1 }, () => new Array<number>(2 * band + 1).fill(0));
   const back = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
-  const turned = directions.map((each) => harmonics(times(back, each), band));
-  const product = (a: number[][], b: number[][]): number[][] =>
-    a[0].map((_, i) => b[0].map((__, j) => a.reduce((sum, row, at) => sum + row[i] * b[at][j], 0)));
-  return solved(product(basis, basis), product(basis, turned));
-}
-
-/** Directions about evenly spread over the sphere. */
-function spiral(index: number, count: number): number[] {
-  const z = 1 - (2 * index + 1) / count;
-  const [radius, angle] = [Math.sqrt(1 - z * z), index * Math.PI * (3 - Math.sqrt(5))];
-  return [radius * Math.cos(angle), radius * Math.sin(angle), z];
-}
-
-/** The solution of a symmetric positive system, by Gaussian elimination. */
-function solved(matrix: number[][], right: number[][]): number[][] {
-  const rows = matrix.map((row, at) => [...row, ...right[at]]);
-  for (let column = 0; column < rows.length; column++) {
-    const pivot = rows[column];
-    const inverse = 1 / pivot[column];
-    pivot.forEach((each, at) => (pivot[at] = each * inverse));
-    for (const row of rows) {
-      const factor = row[column];
-      if (row !== pivot) row.forEach((each, at) => (row[at] = each - factor * pivot[at]));
-    }
+  for (const [x, y, z, weight] of SPHERE) {
+    const [there, here] = [harmonics([x, y, z], band), harmonics(times(back, [x, y, z]), band)];
+    there.forEach((a, i) => here.forEach((b, j) => (found[i][j] += weight * a * b)));
   }
-  return rows.map((row) => row.slice(rows.length));
+  return found;
 }
 
 /** The real basis of one degree, with the signs of 3DGS. */

@@ -1,8 +1,6 @@
-import { sortingOrderOfPairs } from './sorting.ts';
-
 /**
- * Numbers of 64 bits, as their low and their high 32 bits beside each other in a Uint32Array [2 N]: as the bytes of a
- * stream are read on every machine that has a browser, and many times faster than BigInt.
+ * Numbers of 64 bits, as their low and their high 32 bits beside each other in a Uint32Array [2 N]: the layout of
+ * little-endian bytes, and many times faster than BigInt.
  */
 export type Words = Uint32Array;
 
@@ -11,18 +9,77 @@ export function wordsOf(bytes: Uint8Array): Words {
   return new Uint32Array(bytes.buffer, bytes.byteOffset, bytes.length >> 2);
 }
 
+/**
+ * The rows [N] of `words` [N, width] in ascending order, equal ones in their order; the last number of a row counts most.
+ * A radix sort, 16 bits at a time.
+ */
+export function sortingOrder(words: Uint32Array, width = 2): Uint32Array {
+  const count = words.length / width;
+  let [rows, next] = [new Uint32Array(count), new Uint32Array(count)];
+  for (let row = 0; row < count; row++) rows[row] = row;
+  for (let bits = 0; bits < 32 * width; bits += 16) {
+    const [column, shift] = [bits >> 5, bits & 31];
+    const starts = new Uint32Array(65537);
+    for (let row = 0; row < count; row++) starts[((words[row * width + column] >>> shift) & 0xffff) + 1]++;
+    for (let digit = 0; digit < 65536; digit++) starts[digit + 1] += starts[digit];
+    for (let at = 0; at < count; at++) {
+      const row = rows[at];
+      next[starts[(words[row * width + column] >>> shift) & 0xffff]++] = row;
+    }
+    [rows, next] = [next, rows];
+  }
+  return rows;
+}
+
+/** [R + 1] where each run of equal words begins in a sorted `order` of them, and where the last one ends. */
+export function runs(words: Words, order: Uint32Array): Uint32Array {
+  const starts = new Uint32Array(order.length + 1);
+  let size = 0;
+  for (let at = 0; at < order.length; at++) {
+    const [own, before] = [2 * order[at], 2 * order[at - 1]];
+    if (at === 0 || words[own] !== words[before] || words[own + 1] !== words[before + 1]) starts[size++] = at;
+  }
+  starts[size] = order.length;
+  return starts.subarray(0, size + 1);
+}
+
 /** [N] how many of the words are equal to each, itself included. */
 export function namesakes(words: Words): Uint32Array {
-  const order = sortingOrderOfPairs(words);
+  const order = sortingOrder(words);
+  const starts = runs(words, order);
   const found = new Uint32Array(order.length);
-  for (let first = 0, end = 0; first < order.length; first = end) {
-    while (end < order.length && same(words, order[first], order[end])) end++;
-    for (let at = first; at < end; at++) found[order[at]] = end - first;
+  for (let run = 0; run < starts.length - 1; run++) {
+    for (let at = starts[run]; at < starts[run + 1]; at++) found[order[at]] = starts[run + 1] - starts[run];
   }
   return found;
 }
 
-/** Whether two of the words are equal. */
-export function same(words: Words, a: number, b: number): boolean {
-  return words[2 * a] === words[2 * b] && words[2 * a + 1] === words[2 * b + 1];
+/** Replaces the word at `at` by its hash, the finaliser of splitmix64 (Steele et al. 2014), which anybody can compute. */
+export function mixAt(words: Words, at: number): void {
+  let low = words[2 * at] + 0x7f4a7c15;
+  let high = (words[2 * at + 1] + 0x9e3779b9 + (low > 0xffffffff ? 1 : 0)) >>> 0;
+  low >>>= 0;
+  for (let round = 0; round < 2; round++) {
+    const shift = round ? 27 : 30;
+    low ^= (low >>> shift) | (high << (32 - shift));
+    high ^= high >>> shift;
+    const [byLow, byHigh] = round ? [0x133111eb, 0x94d049bb] : [0x1ce4e5b9, 0xbf58476d];
+    high = Math.imul(high, byLow) + Math.imul(low, byHigh) + highProduct(low >>> 0, byLow);
+    low = Math.imul(low, byLow);
+  }
+  words[2 * at] = low ^ ((low >>> 31) | (high << 1));
+  words[2 * at + 1] = high ^ (high >>> 31);
+}
+
+/** The same for all of them, which are replaced; returns them. */
+export function mixed(words: Words): Words {
+  for (let at = 0; at < words.length >> 1; at++) mixAt(words, at);
+  return words;
+}
+
+/** The high 32 bits of the product of two numbers of 32 bits. */
+export function highProduct(a: number, b: number): number {
+  const [a0, a1, b0, b1] = [a & 0xffff, a >>> 16, b & 0xffff, b >>> 16];
+  const middle = a1 * b0 + ((a0 * b0) >>> 16);
+  return a1 * b1 + Math.floor(middle / 0x10000) + ((a0 * b1 + (middle & 0xffff)) >>> 16);
 }

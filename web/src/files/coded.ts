@@ -1,24 +1,18 @@
 /** What formats of few bits share; `keyss.files.formats.common` on the other side. */
-import { InputError } from '../core/errors.ts';
 
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
 const LEAST_SCALE = 2 ** -126;
 const SMALL_COUNT = 1 << 18; // more Gaussians than this have to take a byte each
 
-/** Raises InputError where a packed file of `size` bytes cannot hold `count` Gaussians, or holds none. */
-export function checkCount(count: number, size: number): void {
-  if (!Number.isInteger(count) || count < 1 || count > Math.max(SMALL_COUNT, size)) throw damagedFile();
+/** Whether `size` packed bytes can hold `count` Gaussians, at least one. */
+export function holds(size: number, count: number): boolean {
+  return Number.isInteger(count) && count >= 1 && count <= Math.max(SMALL_COUNT, size);
 }
 
-/** Of an opacity of `byte` 255ths. */
+/** Of an opacity of `byte` 255ths; 0 and 255 have finite ones as well. */
 export function logit(byte: number): number {
-  return logitOf(byte / 255);
-}
-
-/** Of an opacity from 0 to 1, both of which have finite ones as well. */
-export function logitOf(opacity: number): number {
-  const found = Math.log(opacity) - Math.log1p(-opacity);
+  const found = Math.log(byte / 255) - Math.log1p(-byte / 255);
   return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, found));
 }
 
@@ -46,37 +40,3 @@ export function fromSmallestThree(largest: number, others: readonly number[]): n
   return quat;
 }
 
-export function damagedFile(): InputError {
-  return new InputError('This file is damaged, or not whole.');
-}
-
-/** The bytes that a stream becomes, at most so many. Raises InputError for more and for damage. */
-export async function unpacked(
-  bytes: Uint8Array, format: 'gzip' | 'deflate-raw', most: number,
-): Promise<Uint8Array> {
-  const parts: Uint8Array[] = [];
-  let size = 0;
-  try {
-    const stream = new Blob([bytes as BlobPart]).stream().pipeThrough(new DecompressionStream(format));
-    const reader = stream.getReader();
-    for (;;) {
-      const { done, value } = await reader.read();
-      if (done) break;
-      size += value.length;
-      if (size > most) {
-        await reader.cancel();
-        throw damagedFile();
-      }
-      parts.push(value);
-    }
-  } catch {
-    throw damagedFile();
-  }
-  const whole = new Uint8Array(size);
-  let at = 0;
-  for (const part of parts) {
-    whole.set(part, at);
-    at += part.length;
-  }
-  return whole;
-}

@@ -1,6 +1,7 @@
 /** Reader of PlayCanvas's compressed .ply; `keyss.files.formats.compressed_ply` on the other side. */
+import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { damagedFile, fromSmallestThree, logit, SH_C0 } from './coded.ts';
+import { fromSmallestThree, logit, SH_C0 } from './coded.ts';
 import { checkedFinite, column, type PlyHeader } from './ply.ts';
 
 export const CHUNK = 256; // Gaussians
@@ -39,20 +40,20 @@ export function readCompressedPly(
 ): Gaussians & { readonly codes: CompressedPlyCodes } {
   const element = (name: string) => header.elements.find((each) => each.name === name);
   const [vertex, chunk, sh] = [element('vertex'), element('chunk'), element('sh')];
-  if (!vertex?.count || !chunk || chunk.count !== Math.ceil(vertex.count / CHUNK)) throw damagedFile();
+  if (!vertex?.count || !chunk || chunk.count !== Math.ceil(vertex.count / CHUNK)) throw damaged();
   const shDegree = [0, 9, 24, 45].indexOf(sh?.properties.length ?? 0);
-  if (shDegree < 0 || (sh && sh.count !== vertex.count)) throw damagedFile();
+  if (shDegree < 0 || (sh && sh.count !== vertex.count)) throw damaged();
   const ends = (names: string[][], missing?: number[]): Float64Array[][] =>
     names.map((pair) => pair.map((name, end) => {
       const values = column(bytes, header, chunk, name);
-      if (values === null && !missing) throw damagedFile();
+      if (values === null && !missing) throw damaged();
       return values ?? new Float64Array(chunk.count).fill(missing![end]);
     }));
   const hasColours = chunk.properties.some(({ name }) => name === 'min_r');
   const [places, sizes, colours] = [ends(AXES), ends(SCALES), ends(COLOURS, hasColours ? undefined : [0, 1])];
   const [position, rotation, scale, colour] = ['position', 'rotation', 'scale', 'color'].map((name) => {
     const values = column(bytes, header, vertex, `packed_${name}`);
-    if (values === null) throw damagedFile();
+    if (values === null) throw damaged();
     return values;
   });
   const model = emptyGaussians(vertex.count, shDegree);
@@ -76,7 +77,7 @@ export function readCompressedPly(
   }
   for (let index = 0; sh && index < 3 * (k - 1); index++) {
     const values = column(bytes, header, sh, `f_rest_${index}`);
-    if (values === null) throw damagedFile();
+    if (values === null) throw damaged();
     const [channel, each] = [Math.floor(index / (k - 1)), (index % (k - 1)) + 1];
     values.forEach((code, row) => {
       const level = code === 0 ? 0 : code === 255 ? 256 : code + 0.5;

@@ -2,8 +2,6 @@
 import { InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
-import { readGlb } from './glb.ts';
-import { readKsplat } from './ksplat.ts';
 import { plyHeader, readPly } from './ply.ts';
 import { readSog, type SogCodes } from './sog.ts';
 import { readSplat } from './splat.ts';
@@ -26,8 +24,6 @@ export async function readModel(bytes: Uint8Array, name = ''): Promise<ReadModel
   }
   if (start === 'NGSP' || start.startsWith('\x1f\x8b')) return readSpz(bytes);
   if (start === 'PK\x03\x04') return readSog(bytes);
-  if (start === 'glTF') return readGlb(bytes);
-  if (/\.ksplat$/i.test(name)) return readKsplat(bytes);
   if (/\.splat$/i.test(name)) return readSplat(bytes);
   throw new InputError('This is not a file of a 3D Gaussian Splatting model that this page can read.');
 }

@@ -1,7 +1,7 @@
 /** Reader and writer of models in the Inria .ply layout; hostile files end in an InputError. */
 import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
-import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+import { coefficients, COLUMNS, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
 const OPACITY_LOGIT_BOUND = 16; // in the place of infinities
@@ -93,21 +93,11 @@ export function readPly(bytes: Uint8Array): Gaussians {
   const shDegree = [0, 9, 24, 45].indexOf(rest);
   if (vertex === undefined || vertex.count === 0 || shDegree < 0) throw noModel();
   const found = emptyGaussians(vertex.count, shDegree);
-  const k = coefficients(shDegree);
-  const put = (name: string, to: Float32Array, width: number, offset: number): void => {
+  for (const { name, to, offset } of plyColumns(shDegree)) {
     const values = column(bytes, header, vertex, name);
     if (values === null) throw noModel();
-    for (let row = 0; row < values.length; row++) to[row * width + offset] = values[row];
-  };
-  ['x', 'y', 'z'].forEach((name, axis) => put(name, found.means, 3, axis));
-  for (let axis = 0; axis < 3; axis++) put(`scale_${axis}`, found.logScales, 3, axis);
-  for (let part = 0; part < 4; part++) put(`rot_${part}`, found.quats, 4, part);
-  put('opacity', found.opacityLogits, 1, 0);
-  for (let colour = 0; colour < 3; colour++) {
-    put(`f_dc_${colour}`, found.sh, 3 * k, colour);
-    for (let each = 1; each < k; each++) {
-      put(`f_rest_${colour * (k - 1) + each - 1}`, found.sh, 3 * k, 3 * each + colour);
-    }
+    const width = found[to].length / found.count;
+    for (let row = 0; row < values.length; row++) found[to][row * width + offset] = values[row];
   }
   for (const [row, logit] of found.opacityLogits.entries()) {
     if (Math.abs(logit) === Infinity) found.opacityLogits[row] = Math.sign(logit) * OPACITY_LOGIT_BOUND;
@@ -117,44 +107,42 @@ export function readPly(bytes: Uint8Array): Gaussians {
 
 /** Raises InputError for numbers that are none. */
 export function checkedFinite(gaussians: Gaussians): Gaussians {
-  const { means, quats, logScales, opacityLogits, sh } = gaussians;
-  for (const values of [means, quats, logScales, opacityLogits, sh]) {
-    for (const value of values) {
-      if (!Number.isFinite(value)) throw new InputError('This file holds numbers that are not finite.');
-    }
-  }
-  return gaussians;
+  if (COLUMNS.every((each) => gaussians[each].every(Number.isFinite))) return gaussians;
+  throw new InputError('This file holds numbers that are not finite.');
+}
+
+/** The properties of a .ply in the order in which keyss writes them: where each lies in a row of which column. */
+export function plyColumns(shDegree: number): { name: string; to: (typeof COLUMNS)[number]; offset: number }[] {
+  const rest = coefficients(shDegree) - 1;
+  const numbers = (prefix: string, count: number): string[] => Array.from({ length: count }, (_, at) => `${prefix}_${at}`);
+  const columns = (to: (typeof COLUMNS)[number], names: string[], first = 0) =>
+    names.map((name, at) => ({ name, to, offset: first + at }));
+  const harmonics = numbers('f_rest', 3 * rest).map((name, at) => {
+    return { name, to: 'sh' as const, offset: 3 * ((at % rest) + 1) + Math.floor(at / rest) };
+  });
+  return [
+    ...columns('means', ['x', 'y', 'z']), ...columns('sh', numbers('f_dc', 3)), ...harmonics,
+    ...columns('opacityLogits', ['opacity']), ...columns('logScales', numbers('scale', 3)), ...columns('quats', numbers('rot', 4)),
+  ];
 }
 
 /** A model as keyss writes it: little-endian float32, normals zero. */
 export function writePly(gaussians: Gaussians): Uint8Array {
-  const { count, shDegree, means, quats, logScales, opacityLogits, sh } = gaussians;
-  const k = coefficients(shDegree);
-  const numbers = (prefix: string, many: number): string[] =>
-    Array.from({ length: many }, (_, index) => `${prefix}_${index}`);
-  const names = [
-    'x', 'y', 'z', 'nx', 'ny', 'nz', ...numbers('f_dc', 3), ...numbers('f_rest', 3 * (k - 1)),
-    'opacity', ...numbers('scale', 3), ...numbers('rot', 4),
-  ];
+  const { count, shDegree } = gaussians;
+  const columns = plyColumns(shDegree).map(({ name, to, offset }) => {
+    return { name, values: gaussians[to], width: gaussians[to].length / count, offset };
+  });
+  const zeros = { values: new Float32Array(count), width: 1, offset: 0 };
+  columns.splice(3, 0, ...['nx', 'ny', 'nz'].map((name) => ({ ...zeros, name })));
   const lines = ['ply', 'format binary_little_endian 1.0', `element vertex ${count}`];
-  const header = ascii([...lines, ...names.map((name) => `property float ${name}`), 'end_header\n'].join('\n'));
-  const data = new Uint8Array(4 * names.length * count);
+  const header = ascii([...lines, ...columns.map(({ name }) => `property float ${name}`), 'end_header\n'].join('\n'));
+  const data = new Uint8Array(4 * columns.length * count);
   const view = viewOf(data);
-  let at = 0;
-  const put = (value: number): void => {
-    view.setFloat32(at, value, true);
-    at += 4;
-  };
-  for (let row = 0; row < count; row++) {
-    for (let axis = 0; axis < 3; axis++) put(means[3 * row + axis]);
-    for (let axis = 0; axis < 3; axis++) put(0);
-    for (let colour = 0; colour < 3; colour++) put(sh[3 * k * row + colour]);
-    for (let colour = 0; colour < 3; colour++) {
-      for (let each = 1; each < k; each++) put(sh[3 * (k * row + each) + colour]);
+  for (let row = 0, at = 0; row < count; row++) {
+    for (const { values, width, offset } of columns) {
+      view.setFloat32(at, values[row * width + offset], true);
+      at += 4;
     }
-    put(opacityLogits[row]);
-    for (let axis = 0; axis < 3; axis++) put(logScales[3 * row + axis]);
-    for (let part = 0; part < 4; part++) put(quats[4 * row + part]);
   }
   return joined(header, data);
 }

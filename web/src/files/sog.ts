@@ -1,7 +1,7 @@
 /** Reader of SOG, version 2; `keyss.files.formats.sog` on the other side. */
-import { InputError } from '../core/errors.ts';
+import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { checkCount, damagedFile, fromSmallestThree, logit } from './coded.ts';
+import { fromSmallestThree, holds, logit } from './coded.ts';
 import { checkedFinite } from './ply.ts';
 import { browserPixels, type Pixels } from './webp.ts';
 import { openZip } from './zip.ts';
@@ -61,7 +61,7 @@ async function parsed(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
   if (shN && rest) {
     const pairs = await image(shN.files[1]);
     labels = labels.map((_, row) => pairs[4 * row] | (pairs[4 * row + 1] << 8));
-    if (labels.some((label) => label >= shN.count)) throw damagedFile();
+    if (labels.some((label) => label >= shN.count)) throw damaged();
     palette = await pixels(await file(shN.files[0]), Math.ceil(shN.count / ROW) * ROW * rest, ROW * rest);
   }
   return {
@@ -78,7 +78,7 @@ function dequantised(codes: SogCodes): Gaussians {
   const k = coefficients(shDegree);
   for (let row = 0; row < count; row++) {
     const largest = quats[4 * row + 3] - LARGEST;
-    if (largest < 0) throw damagedFile();
+    if (largest < 0) throw damaged();
     const others = [0, 1, 2].map((part) => ((quats[4 * row + part] / 255) * 2 - 1) * Math.sqrt(0.5));
     model.quats.set(fromSmallestThree(largest, others), 4 * row);
     for (let axis = 0; axis < 3; axis++) {
@@ -108,19 +108,19 @@ function checkedMeta(bytes: Uint8Array, size: number): Meta {
     const images = [[means.files, 2], [scales.files, 1], [quats.files, 1], [sh0.files, 1]] as [string[], number][];
     if (shN) images.push([shN.files, 2]);
     const named = images.every(([names, count]) => Array.isArray(names) && names.length >= count);
-    if (!named || means.mins.length !== 3 || means.maxs.length !== 3) throw damagedFile();
+    if (!named || means.mins.length !== 3 || means.maxs.length !== 3) throw damaged();
     for (const book of [scales, sh0, ...(shN ? [shN] : [])]) book.codebook = checkedBook(book.codebook);
     const bands = shN?.bands ?? 0;
-    if (shN && !(bands in [0, 1, 2, 3] && shN.count > 0 && shN.count <= MOST_LABELS)) throw damagedFile();
+    if (shN && !(bands in [0, 1, 2, 3] && shN.count > 0 && shN.count <= MOST_LABELS)) throw damaged();
   } catch (error) {
-    throw error instanceof InputError ? error : damagedFile();
+    throw error instanceof InputError ? error : damaged();
   }
-  checkCount(meta.count, size);
+  if (!holds(size, meta.count)) throw damaged();
   return meta;
 }
 
 function checkedBook(book: number[]): number[] {
   const fine = Array.isArray(book) && book.length <= BOOK && book.every((each) => Number.isFinite(each));
-  if (!fine) throw damagedFile();
+  if (!fine) throw damaged();
   return [...book, ...new Array<number>(BOOK - book.length).fill(0)];
 }

@@ -1,14 +1,15 @@
 /** Reader of .splat, 32 bytes for each Gaussian; `keyss.files.formats.splat` on the other side. */
 import { viewOf } from '../core/bytes.ts';
+import { damaged } from '../core/errors.ts';
 import { emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { constantHarmonic, damagedFile, logit, logScale, unitQuat } from './coded.ts';
+import { constantHarmonic, logit, logScale, unitQuat } from './coded.ts';
 import { checkedFinite } from './ply.ts';
 
 const ROW = 32; // bytes: mean and scale in floats, red, green, blue, opacity and the quaternion in bytes
 
 /** Raises InputError. */
 export function readSplat(bytes: Uint8Array): Gaussians {
-  if (bytes.length === 0 || bytes.length % ROW) throw damagedFile();
+  if (bytes.length === 0 || bytes.length % ROW) throw damaged();
   const view = viewOf(bytes);
   const model = emptyGaussians(bytes.length / ROW, 0);
   for (let row = 0, at = 0; row < model.count; row++, at += ROW) {

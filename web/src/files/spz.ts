@@ -1,9 +1,10 @@
 /** Reader of SPZ, versions 2 to 4; `keyss.files.formats.spz` on the other side. */
 import { decompress } from 'fzstd';
 import { viewOf } from '../core/bytes.ts';
-import { InputError } from '../core/errors.ts';
+import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { checkCount, damagedFile, fromSmallestThree, logit, unpacked } from './coded.ts';
+import { unpacked } from '../core/unpacking.ts';
+import { fromSmallestThree, holds, logit } from './coded.ts';
 
 const LEGACY_BYTES = 16;
 const HEADER_BYTES = 32;
@@ -56,15 +57,14 @@ export function rotationPart(word: number, part: number): number {
 
 function header(bytes: Uint8Array, versions: number[], size: number): Header & { sizes: number[] } {
   const view = viewOf(bytes);
-  if (bytes.length < LEGACY_BYTES || view.getUint32(0, true) !== 0x5053474e) throw damagedFile(); // NGSP
+  if (bytes.length < LEGACY_BYTES || view.getUint32(0, true) !== 0x5053474e) throw damaged(); // NGSP
   const [version, count] = [view.getUint32(4, true), view.getUint32(8, true)];
   const [shDegree, fractionalBits] = [bytes[12], bytes[13]];
   if (!versions.includes(version)) throw new InputError('This SPZ is of a version that cannot be read.');
-  checkCount(count, size);
-  if (shDegree > 3 || fractionalBits > 24) throw damagedFile();
+  if (!holds(size, count) || shDegree > 3 || fractionalBits > 24) throw damaged();
   const rotation = version === 2 ? 3 : 4;
   const sizes = [9, 1, 3, 3, rotation, 3 * (coefficients(shDegree) - 1)].map((each) => each * count);
-  if (sizes.reduce((sum, each) => sum + each, 0) > MOST_UNPACKED) throw damagedFile();
+  if (sizes.reduce((sum, each) => sum + each, 0) > MOST_UNPACKED) throw damaged();
   return { version, count, shDegree, fractionalBits, sizes };
 }
 
@@ -82,7 +82,7 @@ async function legacy(bytes: Uint8Array): Promise<SpzCodes> {
   const parts: Uint8Array[] = [];
   let at = LEGACY_BYTES;
   for (const size of found.sizes) {
-    if (at + size > data.length) throw damagedFile();
+    if (at + size > data.length) throw damaged();
     parts.push(data.subarray(at, at + size));
     at += size;
   }
@@ -91,25 +91,25 @@ async function legacy(bytes: Uint8Array): Promise<SpzCodes> {
 
 function version4(bytes: Uint8Array): SpzCodes {
   const found = header(bytes, [4], bytes.length);
-  if (bytes.length < HEADER_BYTES) throw damagedFile();
+  if (bytes.length < HEADER_BYTES) throw damaged();
   const view = viewOf(bytes);
   const [streams, table] = [bytes[15], view.getUint32(16, true)];
   let at = table + 16 * streams;
-  if (streams !== found.sizes.filter(Boolean).length || table < HEADER_BYTES || at > bytes.length) throw damagedFile();
+  if (streams !== found.sizes.filter(Boolean).length || table < HEADER_BYTES || at > bytes.length) throw damaged();
   let entry = table;
   const parts = found.sizes.map((size) => {
     if (!size) return new Uint8Array(0);
     const [packed, whole] = [Number(view.getBigUint64(entry, true)), Number(view.getBigUint64(entry + 8, true))];
     entry += 16;
-    if (whole !== size || at + packed > bytes.length) throw damagedFile();
+    if (whole !== size || at + packed > bytes.length) throw damaged();
     const stream = bytes.subarray(at, at + packed);
     at += packed;
     try {
       const out = decompress(stream, new Uint8Array(size));
-      if (out.length !== size) throw damagedFile();
+      if (out.length !== size) throw damaged();
       return out;
     } catch {
-      throw damagedFile();
+      throw damaged();
     }
   });
   return codesOf(found, parts);

@@ -1,6 +1,6 @@
 /** Pixels of lossless WebP images, by the browser; exact, because they are never multiplied by their alpha. */
 import { viewOf } from '../core/bytes.ts';
-import { damagedFile } from './coded.ts';
+import { damaged } from '../core/errors.ts';
 
 const SMALL_IMAGE = 1 << 16; // pixels; larger ones may have four times the pixels that are needed
 
@@ -10,17 +10,17 @@ export type Pixels = (data: Uint8Array, count: number, width?: number) => Promis
 export const browserPixels: Pixels = async (data, count, width) => {
   const [w, h] = sizeOf(data);
   const fits = w * h >= count && (width === undefined || w === width);
-  if (!fits || w * h > Math.max(SMALL_IMAGE, 4 * count)) throw damagedFile();
+  if (!fits || w * h > Math.max(SMALL_IMAGE, 4 * count)) throw damaged();
   let image: ImageBitmap;
   try {
     image = await createImageBitmap(new Blob([data as BlobPart], { type: 'image/webp' }), {
       premultiplyAlpha: 'none', colorSpaceConversion: 'none',
     });
   } catch {
-    throw damagedFile();
+    throw damaged();
   }
   const gl = new OffscreenCanvas(1, 1).getContext('webgl2');
-  if (gl === null || image.width !== w || image.height !== h) throw damagedFile();
+  if (gl === null || image.width !== w || image.height !== h) throw damaged();
   gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, false);
   gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
@@ -32,19 +32,19 @@ export const browserPixels: Pixels = async (data, count, width) => {
   const failed = gl.getError() !== gl.NO_ERROR;
   image.close();
   gl.getExtension('WEBGL_lose_context')?.loseContext();
-  if (failed) throw damagedFile();
+  if (failed) throw damaged();
   return pixels.subarray(0, 4 * count);
 };
 
 /** Width and height of the header. Raises InputError for what is no lossless WebP. */
 export function sizeOf(data: Uint8Array): [number, number] {
   const text = (at: number): string => String.fromCharCode(...data.subarray(at, at + 4));
-  if (data.length < 30 || text(0) !== 'RIFF' || text(8) !== 'WEBP') throw damagedFile();
+  if (data.length < 30 || text(0) !== 'RIFF' || text(8) !== 'WEBP') throw damaged();
   if (text(12) === 'VP8L') {
     const bits = viewOf(data).getUint32(21, true);
     return [(bits & 0x3fff) + 1, ((bits >>> 14) & 0x3fff) + 1];
   }
   const three = (at: number): number => data[at] | (data[at + 1] << 8) | (data[at + 2] << 16);
   if (text(12) === 'VP8X') return [three(24) + 1, three(27) + 1];
-  throw damagedFile();
+  throw damaged();
 }

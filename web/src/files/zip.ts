@@ -1,6 +1,7 @@
 /** Files of a ZIP archive, stored or deflated, of bounded size. */
 import { viewOf } from '../core/bytes.ts';
-import { damagedFile, unpacked } from './coded.ts';
+import { damaged } from '../core/errors.ts';
+import { unpacked } from '../core/unpacking.ts';
 
 const [END, CENTRAL, LOCAL] = [0x06054b50, 0x02014b50, 0x04034b50];
 const MOST_MEMBERS = 64;
@@ -13,13 +14,13 @@ export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array
   let end = bytes.length - 22;
   const last = Math.max(0, bytes.length - MOST_COMMENT);
   while (end >= last && view.getUint32(end, true) !== END) end--;
-  if (end < last) throw damagedFile();
+  if (end < last) throw damaged();
   const count = view.getUint16(end + 10, true);
-  if (count > MOST_MEMBERS) throw damagedFile();
+  if (count > MOST_MEMBERS) throw damaged();
   const members = new Map<string, { method: number; packed: number; size: number; at: number }>();
   let at = view.getUint32(end + 16, true);
   for (let index = 0; index < count; index++) {
-    if (at + 46 > bytes.length || view.getUint32(at, true) !== CENTRAL) throw damagedFile();
+    if (at + 46 > bytes.length || view.getUint32(at, true) !== CENTRAL) throw damaged();
     const [nameSize, extra, comment] = [28, 30, 32].map((offset) => view.getUint16(at + offset, true));
     const name = new TextDecoder().decode(bytes.subarray(at + 46, at + 46 + nameSize));
     members.set(name, {
@@ -30,12 +31,12 @@ export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array
   }
   return async (name) => {
     const found = members.get(name);
-    if (!found || found.at + 30 > bytes.length || view.getUint32(found.at, true) !== LOCAL) throw damagedFile();
+    if (!found || found.at + 30 > bytes.length || view.getUint32(found.at, true) !== LOCAL) throw damaged();
     const start = found.at + 30 + view.getUint16(found.at + 26, true) + view.getUint16(found.at + 28, true);
     const data = bytes.subarray(start, start + found.packed);
-    if (data.length !== found.packed || found.size > Math.max(SMALL, 2 * bytes.length)) throw damagedFile();
+    if (data.length !== found.packed || found.size > Math.max(SMALL, 2 * bytes.length)) throw damaged();
     if (found.method === 0) return data;
     if (found.method === 8) return unpacked(data, 'deflate-raw', found.size);
-    throw damagedFile();
+    throw damaged();
   };
 }

@@ -10,15 +10,7 @@ import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 
 export const SALT_BYTES = 16;
-export const MAX_KEY_BYTES = 4096;
-
-export interface Costs {
-  readonly passes: number;
-  readonly memoryKib: number;
-  readonly lanes: number;
-}
-
-export const COSTS: Costs = { passes: 3, memoryKib: 65536, lanes: 4 };
+const MAX_KEY_BYTES = 4096;
 
 /** The bytes of a key. Raises InputError for an empty one and one of more than 4,096 bytes. */
 export function keyBytes(key: string): Uint8Array {
@@ -33,23 +25,9 @@ export function keyBytes(key: string): Uint8Array {
 export type Derive = (key: string, salt: Uint8Array) => Promise<Uint8Array>;
 
 /** 32 bytes. Takes some tenths of a second and 64 MiB. */
-export async function master(key: string, salt: Uint8Array, costs: Costs = COSTS): Promise<Uint8Array> {
-  const inRange =
-    salt.length === SALT_BYTES &&
-    costs.passes >= 1 && costs.passes <= 4 &&
-    costs.memoryKib >= 8192 && costs.memoryKib <= 262144 &&
-    costs.lanes >= 1 && costs.lanes <= 16 &&
-    costs.passes * costs.memoryKib <= 786432;
-  if (!inRange) throw new InputError('The parameters of key derivation are out of range.');
-  return argon2id({
-    password: keyBytes(key),
-    salt,
-    iterations: costs.passes,
-    memorySize: costs.memoryKib,
-    parallelism: costs.lanes,
-    hashLength: 32,
-    outputType: 'binary',
-  });
+export function master(key: string, salt: Uint8Array): Promise<Uint8Array> {
+  const password = keyBytes(key);
+  return argon2id({ password, salt, iterations: 3, memorySize: 65536, parallelism: 4, hashLength: 32, outputType: 'binary' });
 }
 
 /** `length` bytes for one use of a uniformly random `secret`. */

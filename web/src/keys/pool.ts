@@ -20,23 +20,18 @@ export function inTurn(derives: readonly Derive[]): Derive {
 /** In this thread. */
 export const here: Derive = oneByOne(master);
 
-/** By whoever answers at the other end of a port, in order. */
-export function derivedBy(port: MessagePort): Derive {
+/** By a worker that answers in order: with 32 bytes, or null. */
+export function derivedBy(worker: Worker): Derive {
   const waiting: ((found: Uint8Array | null) => void)[] = [];
-  port.onmessage = ({ data }: MessageEvent<Uint8Array | null>) => waiting.shift()?.(data);
+  worker.onmessage = ({ data }: MessageEvent<Uint8Array | null>) => waiting.shift()?.(data);
   return (key, salt) =>
     new Promise((resolve, reject) => {
       waiting.push((found) => (found === null ? reject(new Error('no memory')) : resolve(found)));
-      port.postMessage({ key, salt });
+      worker.postMessage({ key, salt });
     });
 }
 
-/** Answers `derivedBy` at the other end. */
-export function answering(port: MessagePort): void {
-  port.onmessage = ({ data }: MessageEvent<{ key: string; salt: Uint8Array }>) => {
-    void here(data.key, data.salt).then(
-      (found) => port.postMessage(found),
-      () => port.postMessage(null),
-    );
-  };
+/** A worker from a blob: a page that is one file and opens from disk can have no other. */
+export function started(source: string): Worker {
+  return new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
 }

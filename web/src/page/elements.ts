@@ -1,38 +1,18 @@
 /** What index.html has, by name. */
 
-function element<T extends HTMLElement>(id: string): T {
-  return document.getElementById(id) as T;
+/** The elements of one kind. */
+function all<T extends HTMLElement>() {
+  return <Name extends string>(...names: Name[]) =>
+    Object.fromEntries(names.map((name) => [name, document.getElementById(name)])) as Record<Name, T>;
 }
 
 export const page = {
-  main: element('main'),
-  canvas: element<HTMLCanvasElement>('picture'),
-  border: element('border'),
-  drop: element('drop'),
-  more: element<HTMLButtonElement>('more'),
-  controls: element('controls'),
-  file: element<HTMLInputElement>('file'),
-  form: element<HTMLFormElement>('key-form'),
-  colours: element<HTMLInputElement>('colours'),
-  key: element<HTMLInputElement>('key'),
-  show: element<HTMLButtonElement>('show'),
-  open: element<HTMLButtonElement>('open'),
-  status: element('status'),
-  progress: element<HTMLProgressElement>('progress'),
-  problem: element('problem'),
-  facts: element('facts'),
-  up: element<HTMLSelectElement>('up'),
-  fly: element<HTMLButtonElement>('fly'),
-  home: element<HTMLButtonElement>('home'),
-  snapshot: element<HTMLButtonElement>('snapshot'),
-  download: element<HTMLButtonElement>('download'),
-  close: element<HTMLButtonElement>('close'),
-  wipe: element<HTMLInputElement>('wipe'),
-  revealed: element('revealed'),
-  threshold: element<HTMLInputElement>('threshold'),
-  thresholdText: element<HTMLOutputElement>('threshold-text'),
-  faint: element<HTMLInputElement>('faint'),
-  opaque: element<HTMLInputElement>('opaque'),
-  colouring: element<HTMLSelectElement>('colouring'),
-  count: element('count'),
+  ...all()('main', 'border', 'drop', 'controls', 'status', 'problem', 'facts', 'revealed', 'count'),
+  ...all<HTMLInputElement>()('file', 'colours', 'key', 'wipe', 'threshold', 'faint', 'opaque'),
+  ...all<HTMLButtonElement>()('more', 'show', 'open', 'fly', 'home', 'snapshot', 'download', 'close'),
+  ...all<HTMLSelectElement>()('up', 'colouring'),
+  ...all<HTMLCanvasElement>()('picture'),
+  ...all<HTMLFormElement>()('form'),
+  ...all<HTMLProgressElement>()('progress'),
+  ...all<HTMLOutputElement>()('shown'),
 };

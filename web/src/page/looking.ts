@@ -1,12 +1,14 @@
-/** The part of the panel that looks without a key: what was chosen there, and how many Gaussians that leaves. */
-import { type Gaussians, opacity } from '../core/gaussians.ts';
-import { type Look, lookedAt } from './attacker.ts';
+/** What anybody sees without a key: the published model, filtered and coloured by its numbers, as the panel says. */
+import { emptyGaussians, type Gaussians, opacity, selected } from '../core/gaussians.ts';
 import { page } from './elements.ts';
 import { count } from './panel.ts';
 
+export const COLOURINGS = ['as it is', 'opacity', 'size', 'elongation', 'rotation', 'low bits'] as const;
+const OPAQUE_LOGIT = 3;
+const SH_C0 = 0.28209479177387814;
 const FAINT = 0.1; // opacity below which Gaussians are called faint, unless another threshold is chosen
 const AFTER = 100; // milliseconds after the last change of a slider
-const LEAST_DRAWN = 1 / 255; // opacity
+const MIN_DRAWN = 1 / 255; // opacity
 
 /** `changed` is called when something else is to be looked at. */
 export function listenToLooks(changed: () => void): void {
@@ -16,23 +18,53 @@ export function listenToLooks(changed: () => void): void {
   });
   for (const input of [page.threshold, page.faint, page.opaque, page.colouring]) {
     input.addEventListener('input', () => {
-      page.thresholdText.value = Number(page.threshold.value).toFixed(3);
+      page.shown.value = Number(page.threshold.value).toFixed(3);
       clearTimeout(timer);
       timer = window.setTimeout(changed, AFTER);
     });
   }
 }
 
-/** What is to be seen of a model; says how many of its Gaussians that are. */
+/** The Gaussians that are to be shown of a model; says how many these are. */
 export function looked(model: Gaussians): Gaussians {
-  const found = lookedAt(model, {
-    threshold: Number(page.threshold.value),
-    faintOnly: page.faint.checked,
-    opaque: page.opaque.checked,
-    colouring: page.colouring.value as Look['colouring'],
-  });
-  const faint = model.opacityLogits.filter((logit) => opacity(logit) < LEAST_DRAWN).length;
+  const [threshold, below] = [Number(page.threshold.value), page.faint.checked];
+  const opacities = model.opacityLogits.map(opacity);
+  const rows = [...opacities.keys()].filter((row) => opacities[row] < threshold === below);
+  let found = rows.length < model.count ? selected(model, rows) : model;
+  if (page.colouring.value !== COLOURINGS[0]) found = coloured(found, page.colouring.value);
+  if (page.opaque.checked) found = { ...found, opacityLogits: found.opacityLogits.map(() => OPAQUE_LOGIT) };
+  const faint = opacities.filter((each) => each < MIN_DRAWN).length;
   page.count.textContent =
     `${count(found.count)} of ${count(model.count)} Gaussians shown; ${count(faint)} are too faint to be drawn`;
   return found;
+}
+
+/** The same Gaussians, from blue over green to yellow by a number of theirs. */
+function coloured(model: Gaussians, by: string): Gaussians {
+  const values = Float64Array.from({ length: model.count }, (_, row) => number(model, by, row));
+  const sorted = Float64Array.from(values).sort();
+  const [low, high] = [0.02, 0.98].map((share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0);
+  const found = { ...emptyGaussians(model.count, 0), ...model, shDegree: 0, sh: new Float32Array(3 * model.count) };
+  for (let row = 0; row < model.count; row++) {
+    const share = Math.min(1, Math.max(0, (values[row] - low) / (high - low || 1)));
+    const colour = [share * share, 0.1 + 0.8 * share, 0.45 + 0.35 * Math.sin(Math.PI * share) - 0.3 * share];
+    colour.forEach((each, channel) => (found.sh[3 * row + channel] = (each - 0.5) / SH_C0));
+  }
+  return found;
+}
+
+const words = new Uint32Array(1);
+const floats = new Float32Array(words.buffer);
+
+function number(model: Gaussians, by: string, row: number): number {
+  const scales = model.logScales.subarray(3 * row, 3 * row + 3);
+  switch (by) {
+    case 'opacity': return opacity(model.opacityLogits[row]);
+    case 'size': return Math.max(...scales);
+    case 'elongation': return Math.max(...scales) - Math.min(...scales);
+    case 'rotation': return Math.abs(model.quats[4 * row]) / (Math.hypot(...model.quats.subarray(4 * row, 4 * row + 4)) || 1);
+    default:
+      floats[0] = model.shDegree > 0 ? model.sh[(row * model.sh.length) / model.count + 3] : scales[0];
+      return (words[0] >>> 1) & 255;
+  }
 }

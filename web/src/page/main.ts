@@ -1,11 +1,10 @@
 /** The page: a published model, a field for a key, and what the key opens. */
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
-import { COLOURINGS } from './attacker.ts';
 import { Controls } from './controls.ts';
 import { page } from './elements.ts';
 import { type TrainedSide, watch } from './live.ts';
-import { listenToLooks, looked } from './looking.ts';
+import { COLOURINGS, listenToLooks, looked } from './looking.ts';
 import { Opener } from './opener.ts';
 import { count, placeBorder, preparePanel, save, showKey } from './panel.ts';
 import { alike, firstPose, type Pose, poseOfHash, poseToHash, UPS, upOf } from './pose.ts';
@@ -29,7 +28,7 @@ class Page {
   private readonly before = new Map<boolean, number>(); // milliseconds that a key took, without and with colours
 
   constructor(private readonly viewer: Viewer) {
-    this.controls = new Controls(page.canvas, this.pose, (pose) => this.moved(pose), () => this.firstPose());
+    this.controls = new Controls(page.picture, this.pose, (pose) => this.moved(pose), () => this.firstPose());
     page.up.value = this.pose.up;
     this.listen();
   }
@@ -213,7 +212,7 @@ class Page {
 
   private firstPose(): Pose {
     const model = this.secret ?? this.published;
-    const aspect = page.canvas.clientWidth / Math.max(1, page.canvas.clientHeight);
+    const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight);
     return model ? firstPose(model, this.pose.up, aspect || 1) : this.pose;
   }
 
@@ -259,7 +258,7 @@ async function main(): Promise<void> {
   for (const up of UPS) page.up.add(new Option(up));
   let viewer: Viewer;
   try {
-    viewer = await Viewer.on(page.canvas);
+    viewer = await Viewer.on(page.picture);
   } catch {
     page.problem.textContent = 'This browser has no WebGL 2, without which nothing can be drawn.';
     return;

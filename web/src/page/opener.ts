@@ -1,10 +1,7 @@
-/** The workers that read files and try keys, as functions. */
-import DERIVE from 'source:../derive.ts';
+/** The worker that reads files and tries keys, as functions. */
 import WORKER from 'source:../worker.ts';
+import { started } from '../keys/pool.ts';
 import type { Answer, Question } from '../protocol.ts';
-
-// That derive keys side by side: each takes 64 MiB, and most of the time that a key takes.
-const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
 
 export class Opener {
   private readonly worker: Worker;
@@ -14,12 +11,6 @@ export class Opener {
   /** `onProgress` is told what share of an attempt is done, 0 to 1: the same for every key. */
   constructor(private readonly onProgress: (share: number) => void) {
     this.worker = started(WORKER);
-    const ports = Array.from({ length: DERIVERS }, () => {
-      const { port1, port2 } = new MessageChannel();
-      started(DERIVE).postMessage(null, [port1]);
-      return port2;
-    });
-    this.worker.postMessage({ id: this.next++, ports }, ports);
     this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
       if (data.progress !== undefined) return this.onProgress(data.progress);
       this.waiting.get(data.id)?.(data);
@@ -52,9 +43,4 @@ export class Opener {
       this.worker.postMessage(question, moved);
     });
   }
-}
-
-/** A worker from a blob, so that a page that is one file and opens from disk has one, too. */
-function started(source: string): Worker {
-  return new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
 }

@@ -3,7 +3,8 @@ import {
   AppBase, AppOptions, CameraComponentSystem, Color, createGraphicsDevice, Entity, GAMMA_SRGB, GSplatComponentSystem,
   GSplatData, GSplatResource, Layer, Mat4, Quat, RESOLUTION_FIXED, TONEMAP_NONE, Vec4,
 } from 'playcanvas';
-import { coefficients, type Gaussians, mostVisible } from '../core/gaussians.ts';
+import { type Gaussians, mostVisible } from '../core/gaussians.ts';
+import { plyColumns } from '../files/ply.ts';
 import { axes, FIELD_OF_VIEW, type Pose } from './pose.ts';
 
 const NEAREST = 1e-3; // of the distance of what the camera looks at
@@ -248,21 +249,11 @@ export class Viewer {
 
 /** A model as PlayCanvas has it: columns by the names of the .ply. */
 function elements(model: Gaussians): GSplatData {
-  const { count, shDegree } = model;
-  const k = coefficients(shDegree);
-  const properties: { name: string; type: string; storage: Float32Array; byteSize: number }[] = [];
-  const put = (name: string, from: Float32Array, width: number, offset: number): void => {
-    const storage = new Float32Array(count);
-    for (let row = 0; row < count; row++) storage[row] = from[row * width + offset];
-    properties.push({ name, type: 'float', storage, byteSize: 4 });
-  };
-  ['x', 'y', 'z'].forEach((name, axis) => put(name, model.means, 3, axis));
-  for (let axis = 0; axis < 3; axis++) put(`scale_${axis}`, model.logScales, 3, axis);
-  for (let part = 0; part < 4; part++) put(`rot_${part}`, model.quats, 4, part);
-  put('opacity', model.opacityLogits, 1, 0);
-  for (let colour = 0; colour < 3; colour++) {
-    put(`f_dc_${colour}`, model.sh, 3 * k, colour);
-    for (let each = 1; each < k; each++) put(`f_rest_${colour * (k - 1) + each - 1}`, model.sh, 3 * k, 3 * each + colour);
-  }
+  const { count } = model;
+  const properties = plyColumns(model.shDegree).map(({ name, to, offset }) => {
+    const width = model[to].length / count;
+    const storage = new Float32Array(count).map((_, row) => model[to][row * width + offset]);
+    return { name, type: 'float', storage, byteSize: 4 };
+  });
   return new GSplatData([{ name: 'vertex', count, properties }] as never);
 }

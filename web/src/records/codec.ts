@@ -1,7 +1,8 @@
 /** From records to Gaussians; see docs/format.md, "Records of Gaussians". */
 import { halfFloat, viewOf } from '../core/bytes.ts';
+import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { damaged } from '../keys/encryption.ts';
+import { fromSmallestThree } from '../files/coded.ts';
 
 const BANDS = [1, 3, 5, 7]; // coefficients of each degree
 const CHROMA_FEWER = 2; // bits of the differences of colours
@@ -138,9 +139,7 @@ export function putColours(to: Float32Array, at: number, brightness: number, fir
 }
 
 function wholeQuat(leftOut: number, three: number[]): number[] {
-  const squares = three[0] * three[0] + three[1] * three[1] + three[2] * three[2];
-  const quat = three.slice();
-  quat.splice(leftOut, 0, Math.sqrt(Math.max(0, 1 - squares)));
+  const quat = fromSmallestThree(leftOut, three);
   const length = Math.max(0.5, Math.sqrt(quat.reduce((sum, each) => sum + each * each, 0)));
   return quat.map((each) => each / length);
 }

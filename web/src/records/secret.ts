@@ -1,15 +1,15 @@
 /** A secret that is a model, as `keyss reveal` gives it. */
+import { damaged } from '../core/errors.ts';
 import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
 import type { Gaussians } from '../core/gaussians.ts';
-import { damaged } from '../keys/encryption.ts';
-import { decodeLearned } from '../learned/secret.ts';
+import { decodeKeyss } from '../keyss/secret.ts';
 import { Codec } from './codec.ts';
 import { compensated } from './compensation.ts';
 import { decodeWhole } from './whole.ts';
 
 const WHOLE = 'carry'; // the method of models that are hidden whole, whoever trained them
-const LEARNED = 'learned';
+const KEYSS = 'keyss';
 
 export interface Secret {
   readonly gaussians: Gaussians;
@@ -19,7 +19,7 @@ export interface Secret {
 /** The Gaussians that are left; null for what is no model. `stego`: where it was. Raises InputError for damage. */
 export function secretOf(content: Content, stego: Gaussians): Secret | null {
   if (content.service === 'payload') {
-    if (content.method === LEARNED) return decodeLearned(content.data, stego);
+    if (content.method === KEYSS) return decodeKeyss(content.data, stego);
     if (content.method !== WHOLE) return null;
     const gaussians = decodeWhole(content.data);
     return { gaussians, hidden: gaussians.count };

@@ -1,29 +1,30 @@
 /** A model as one string of bytes; `keyss.methods.records.whole` on the other side. */
 import { viewOf } from '../core/bytes.ts';
+import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { unpackedLzma2 } from '../core/lzma.ts';
-import { damaged } from '../keys/encryption.ts';
+import { unpackedZstd } from '../core/unpacking.ts';
+import { holds } from '../files/coded.ts';
 import { Codec, type Layout, putColours } from './codec.ts';
 
-const MOST_GAUSSIANS = 1 << 22;
+const MAX_GAUSSIANS = 1 << 22;
 const HEAD_BYTES = 9; // Gaussians (4), SH degree (1), step of harmonics (4)
 const PER_OCTAVE = 0.5 / Math.LN2; // half octaves of the step
 const FINER = 6; // half octaves by which a step is finer or coarser, at most
 const [FIRST_POSITION, AFTER_POSITIONS] = [3, 6]; // among the parts of a layout
 
-/** The model. Raises InputError for damage, before anything is allocated that the data do not hold. */
+/** The model. Raises InputError for damage; above 2^18 Gaussians, each announced one must take at least a byte. */
 export function decodeWhole(data: Uint8Array): Gaussians {
   if (data.length < HEAD_BYTES) throw damaged();
   const view = viewOf(data);
   const [count, shDegree, step] = [view.getUint32(0, true), data[4], view.getFloat32(5, true)];
   const codec = Codec.unpack(data.subarray(HEAD_BYTES));
-  const possible = count > 0 && count <= MOST_GAUSSIANS && shDegree <= 3 && step > 0 && step < 1;
+  const possible = holds(data.length, count) && count <= MAX_GAUSSIANS && shDegree <= 3 && step > 0 && step < 1;
   if (!possible || codec.shDegree !== 0) throw damaged();
   const { layout } = codec;
   const own = layout.reduce((sum, [columns, bits]) => sum + columns * Math.ceil(bits / 8), 0);
   const harmonics = coefficients(shDegree) - 1;
   const packed = data.subarray(HEAD_BYTES + Codec.packedSize(0));
-  const planes = unpackedLzma2(packed, count * (own + 3 * harmonics));
+  const planes = unpackedZstd(packed, count * (own + 3 * harmonics));
   const found = emptyGaussians(count, shDegree);
   const columns = columnsOf(planes, layout, count);
   const codes = new Uint32Array(columns.length);

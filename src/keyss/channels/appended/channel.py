@@ -7,13 +7,10 @@ them give it back. Every packet is a Gaussian. A header tells how many blocks th
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 import torch
@@ -38,61 +35,86 @@ from keyss.channels.appended.lattice import (
     to_gaussians,
 )
 from keyss.channels.appended.packets import NUMBER_BITS, PACKET_BYTES, Bytes
-from keyss.channels.base import METHOD_BYTES, Payload, pack_method, unpack_method
+from keyss.channels.base import METHOD_BYTES, Content, Payload, PayloadChannel, PayloadRoom, PayloadsOnly
+from keyss.channels.packing import frame_payload, unframe_payload
+from keyss.channels.writing import check_keys, randomness
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 _LENGTH_BITS = 8  # of the packets of a block that hold data
-_MOST_DATA = 150  # packets of a block that hold data
-_MOST_BLOCKS = min(1 << NUMBER_BITS - _LENGTH_BITS, (1 << NUMBER_BITS) // reed_solomon.MAX_CHUNKS) - 1
+_MAX_DATA = 150  # packets of a block that hold data
+_MAX_BLOCKS = min(1 << NUMBER_BITS - _LENGTH_BITS, (1 << NUMBER_BITS) // reed_solomon.MAX_CHUNKS) - 1
 # A quarter of the packets may be lost, and of the others what formats garble, with so many deviations more.
 _LEFT, _DEVIATIONS = 0.72, 4.5
-MOST_BYTES = _MOST_BLOCKS * _MOST_DATA * PACKET_BYTES - OVERHEAD - METHOD_BYTES
+MAX_BYTES = _MAX_BLOCKS * _MAX_DATA * PACKET_BYTES - OVERHEAD - METHOD_BYTES
+_OVERHEAD = 128  # bytes of a payload beside its data, at most
 
 # Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
 # more of them than by chance.
 _SAMPLE, _TRIED, _NOT_BY_CHANCE = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
-_OPENS_NOTHING = "this key opens nothing here"
 _NOTICED = (
-    "the number of appended Gaussians tells how much is hidden in all: who holds one of the keys sees that "
-    "there are other secrets"
+    "the number of appended Gaussians tells how much is hidden in all: whoever holds one of the keys sees "
+    "that there are other secrets"
 )
 
 
-def appended_for(size: int) -> int:
-    """Gaussians that a payload of `size` compressed bytes takes, alone in a model."""
-    own = packets.HEADERS + _Blocks.of(size).packets
-    return own + pilots.count_for(own)
+class Appended(PayloadChannel):
+    """The channel; see `keyss.channels.base.Channel`."""
+
+    name = "appended"
+    place = "appended Gaussians"
+    survives = True
+    grows = True
+
+    def prepare(self, cover: Gaussians) -> AppendedCover:
+        return AppendedCover(cover)
+
+    def room(self, gaussians: int, sh_degree: int) -> PayloadRoom:
+        return PayloadRoom(gaussians, MAX_BYTES, _OVERHEAD, True)
+
+    def appended(self, size: int) -> int:
+        """For `size` compressed bytes, alone in a model."""
+        own = packets.HEADERS + _Blocks.of(size).packets
+        return own + pilots.count_for(own)
+
+    def reader(self, stego: Gaussians) -> AppendedReader | None:
+        return AppendedReader.of(stego)
 
 
-def embed(
-    model: Gaussians, secrets: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None
-) -> Gaussians:
-    """The model with one (key, payload) for each secret in Gaussians after its own.
+APPENDED = Appended()
 
-    `entropy`: at least 32 bytes that nobody else can know, by default the system's. Raises UsageError for
-    equal keys, for none, and for more than fits. Warns (KeyssWarning) where there is more than one secret.
-    """
-    mixed = hashlib.sha256(os.urandom(32) if entropy is None else entropy)
-    for _, payload in secrets:
-        mixed.update(hashlib.sha256(_packed(payload)).digest())
-    secret = mixed.digest()
-    salt = expand(secret, "appended/salt", SALT_BYTES)
-    random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
-    derivation = KeyDerivation(salt=salt)
-    keys = [DerivedKey(key, derivation) for key, _ in secrets]
-    if not keys or any(a.equals(b) for a, b in combinations(keys, 2)):
-        raise UsageError("two secrets have the same key: expected at least one secret, each with its own")
-    if len(keys) > 1:
-        warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
-    words = [_words(key, payload, random) for key, (_, payload) in zip(keys, secrets, strict=True)]
-    words.append(pilots.write(salt, pilots.count_for(sum(map(len, words))), random))
-    every = np.concatenate(words)[random.permutation(sum(map(len, words)))]
-    model = model.detach().to("cpu")
-    return Gaussians.cat([model, to_gaussians(every, Cube.around(model), model.sh_degree)])
+
+@dataclass(frozen=True)
+class AppendedCover(PayloadsOnly):
+    """A cover, whichever it is; see `keyss.channels.base.PreparedCover`."""
+
+    cover: Gaussians
+    capacity = MAX_BYTES
+    overhead = _OVERHEAD
+    grows = True
+
+    @property
+    def carriers(self) -> int:
+        return len(self.cover)
+
+    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+        """The cover with Gaussians after its own. Warns where there is more than one secret."""
+        packed = [frame_payload(content) for _, content in contents]
+        secret = randomness(entropy, *packed)
+        salt = expand(secret, "appended/salt", SALT_BYTES)
+        random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
+        keys = [DerivedKey(key, KeyDerivation(salt=salt)) for key, _ in contents]
+        check_keys([key.verifier() for key in keys])
+        if len(keys) > 1:
+            warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
+        words = [_words(*each, random) for each in zip(keys, packed, strict=True)]
+        words.append(pilots.write(salt, pilots.count_for(sum(map(len, words))), random))
+        every = np.concatenate(words)[random.permutation(sum(map(len, words)))]
+        model = self.cover.detach().to("cpu")
+        return Gaussians.cat([model, to_gaussians(every, Cube.around(model), model.sh_degree)])
 
 
 @dataclass(frozen=True)
@@ -106,7 +128,7 @@ class AppendedReader:
     def of(model: Gaussians) -> AppendedReader | None:
         """None where there are none, or where their frame cannot be found."""
         candidates = is_candidate(model)
-        if candidates.sum() < pilots.LEAST // 4:
+        if candidates.sum() < pilots.MIN // 4:
             return None
         faint = model.detach().to("cpu")[torch.from_numpy(candidates)]
         colours, steps = colours_of(faint), scale_steps(faint)
@@ -123,20 +145,24 @@ class AppendedReader:
                 return AppendedReader(found.salt, joined(colours, scales, in_own_frame(faint, found.to_own)))
         return None
 
+    @property
+    def salts(self) -> list[bytes]:
+        return [self.salt]
+
     def open(self, key: str) -> Payload:
         """What `key` opens. Raises WrongKeyError, and InputError where too much was lost or changed."""
         return self.extract(DerivedKey(key, KeyDerivation(salt=self.salt)))
 
-    def extract(self, derived: DerivedKey) -> Payload:
+    def extract(self, key: DerivedKey) -> Payload:
         """`open` after key derivation."""
-        header = packets.read_header(derived.expand("appended/header", 32), self.words)
+        header = packets.read_header(key.expand("appended/header", 32), self.words)
         blocks = header and _Blocks.of_header(header)
         if not blocks:
-            raise WrongKeyError(_OPENS_NOTHING)
-        numbers, data = packets.read(derived.expand("appended/packets", 32), self.words)
+            raise WrongKeyError()
+        numbers, data = packets.read(key.expand("appended/packets", 32), self.words)
         try:
-            plain = decrypt(derived.expand("appended/data", 32), blocks.decode(numbers, data), _ASSOCIATED)
-            return Payload(unpack_method(plain), plain[METHOD_BYTES:])
+            plain = decrypt(key.expand("appended/data", 32), blocks.decode(numbers, data), _ASSOCIATED)
+            return unframe_payload(plain)
         except ValueError as error:
             raise InputError(f"the hidden data are damaged: {error}") from error
 
@@ -152,15 +178,15 @@ class _Blocks:
     def of(size: int) -> _Blocks:
         """For `size` bytes of compressed payload; raises UsageError for more than fit."""
         needed = -(-(size + OVERHEAD) // PACKET_BYTES)
-        count = -(-needed // _MOST_DATA)
-        if count > _MOST_BLOCKS:
-            raise UsageError(f"the secret takes {size:,} bytes, and {MOST_BYTES:,} can be appended")
+        count = -(-needed // _MAX_DATA)
+        if count > _MAX_BLOCKS:
+            raise UsageError(f"the secret takes {size:,} bytes, and {MAX_BYTES:,} can be appended")
         return _Blocks(count, -(-needed // count))
 
     @staticmethod
     def of_header(header: int) -> _Blocks | None:
         count, data = header >> _LENGTH_BITS, header & (1 << _LENGTH_BITS) - 1
-        return _Blocks(count, data) if 0 < count <= _MOST_BLOCKS and 0 < data <= _MOST_DATA else None
+        return _Blocks(count, data) if 0 < count <= _MAX_BLOCKS and 0 < data <= _MAX_DATA else None
 
     @property
     def header(self) -> int:
@@ -221,9 +247,8 @@ def _shifts_with_pilots(steps: Doubles, colours: Points) -> Iterator[float]:
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, payload: Payload, random: np.random.Generator) -> Bits:
+def _words(key: DerivedKey, packed: bytes, random: np.random.Generator) -> Bits:
     """[N, WORD_BITS] header and packets of one secret."""
-    packed = _packed(payload)
     blocks = _Blocks.of(compressed_size(packed))
     encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED, size=blocks.size)
     header = packets.write_header(key.expand("appended/header", 32), blocks.header, random)
@@ -231,7 +256,3 @@ def _words(key: DerivedKey, payload: Payload, random: np.random.Generator) -> Bi
     return np.concatenate(
         [header, packets.write(key.expand("appended/packets", 32), numbers, blocks.encode(encrypted))]
     )
-
-
-def _packed(payload: Payload) -> bytes:
-    return pack_method(payload.method) + payload.data

@@ -1,7 +1,7 @@
 """Words of 84 bits as Gaussians, and back after a format has rounded them.
 
 Every number of such a Gaussian is a point of a lattice that is coarser than what formats do to it
-(docs/appended.md):
+(docs/channels.md):
 
     39 bits  that stay when a model is moved, turned or scaled: three colours of 7 bits, three log scales of 6
     45 bits  in the *own frame*, a cube around the model: three positions of 10 bits, and of the quaternion,
@@ -37,10 +37,10 @@ _LOGIT = math.log(_OPACITY / (1 - _OPACITY))
 _FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # after rounding
 _COLOUR_STEP = 0.0275  # twice what formats move constant colours by, and a little
 _SCALE_STEP = 0.08  # the same for log scales
-_LEAST_LOG_SCALE = -9.9  # of `.spz`, whose least is -10
+_MIN_LOG_SCALE = -9.9  # of `.spz`, whose least is -10
 _SMALL = -9.0  # log scales of the smallest, beside that of the cube
 _TURNS_REACH = 0.5  # x, y and z are below it, so that w is never smaller
-_FARTHEST, _MOST_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
+_FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
 
 
 def is_candidate(model: Gaussians) -> npt.NDArray[np.bool_]:
@@ -86,7 +86,7 @@ class Cube:
     @property
     def least_log_scale(self) -> float:
         """Log scale of the smallest Gaussians in the own frame."""
-        return max(_SMALL, _LEAST_LOG_SCALE - math.log(self.size))
+        return max(_SMALL, _MIN_LOG_SCALE - math.log(self.size))
 
 
 def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
@@ -137,7 +137,7 @@ def likely_shifts(steps: Doubles) -> list[float]:
 def all_shifts(steps: Doubles) -> Doubles:
     """[S] where the lattice may begin if only some of the log scales lie on it."""
     low, high = np.quantile(steps.clip(-_FARTHEST, _FARTHEST), [0.01, 0.99])
-    most = min(high - 2 ** (SCALE_BITS - 2), low + _MOST_SHIFTS)
+    most = min(high - 2 ** (SCALE_BITS - 2), low + _MAX_SHIFTS)
     return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
 
 
@@ -184,7 +184,7 @@ def bits_of(numbers: Words, count: int) -> Bits:
 
 
 def _with_largest_w(quats: Doubles) -> Doubles:
-    """[N, 4] unit quaternions of the same ellipsoids, wxyz, of which w is the largest part.
+    """[N, 4] unit quaternions of the same ellipsoids, wxyz, whose largest part is w.
 
     Half a turn about one of its axes leaves an ellipsoid as it is, and some programs add one.
     """

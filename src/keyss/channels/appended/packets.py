@@ -11,10 +11,9 @@ from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
-from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from keyss.channels.appended.lattice import WORD_BITS, Bits, Words, bits_of, number
-from keyss.channels.mixing import mixed
+from keyss.channels.mixing import encrypted_blocks, mixed
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -42,7 +41,7 @@ def read(key: bytes, words: Bits) -> tuple[Words, Bytes]:
 
 
 def write_header(key: bytes, value: int, random: np.random.Generator) -> Bits:
-    """[HEADERS, WORD_BITS] words that tell a number of NUMBER_BITS to who has the key."""
+    """[HEADERS, WORD_BITS] words that tell a number of NUMBER_BITS to whoever has the key."""
     data = random.integers(0, 256, (HEADERS, PACKET_BYTES), np.uint8)
     return write(key, np.full(HEADERS, value, np.uint64), data)
 
@@ -64,8 +63,6 @@ def _masks(key: bytes, data: Bytes) -> Words:
     """[N] the masks of tags."""
     blocks = np.zeros((len(data), 16), np.uint8)
     blocks[:, :PACKET_BYTES] = data
-    encryptor = Cipher(algorithms.AES256(key), modes.ECB()).encryptor()  # as a pseudorandom function
-    encrypted = np.frombuffer(encryptor.update(blocks.tobytes()), ">u8").reshape(-1, 2)
     shift = np.uint64(64 - NUMBER_BITS - _CHECK_BITS)
-    masks: Words = encrypted[:, 0].astype(np.uint64) >> shift
+    masks: Words = encrypted_blocks(key, blocks).view(">u8")[:, 0].astype(np.uint64) >> shift
     return masks

@@ -30,7 +30,7 @@ from keyss.channels.mixing import mixed
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 
-LEAST = 128  # pilots of a model
+MIN = 128  # pilots of a model
 SHARE = 1 / 16  # of the other appended Gaussians
 _PUBLIC = np.uint64(0x6B65797373_617070)  # what tells this hash from others
 ONE_IN = 64  # words is a pilot by chance
@@ -51,7 +51,7 @@ class Found:
 
 def count_for(others: int) -> int:
     """How many pilots belong to so many other appended Gaussians."""
-    return max(LEAST, round(others * SHARE))
+    return max(MIN, round(others * SHARE))
 
 
 def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
@@ -144,7 +144,7 @@ def _similarity(source: Doubles, target: Doubles) -> Similarity | None:
 
 
 def _salt(invariants: Words) -> bytes | None:
-    """What most pilots say of each part; None where one has nobody left."""
+    """The majority vote of the pilots for each part; None if a part has no pilot left."""
     scales = invariants & np.uint64((1 << 3 * SCALE_BITS) - 1)
     said = (invariants >> np.uint64(3 * SCALE_BITS) ^ _whitening(scales)) >> np.uint64(_RANDOM_BITS)
     votes = [Counter[int]() for _ in range(_PARTS)]

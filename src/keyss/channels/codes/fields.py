@@ -1,4 +1,4 @@
-"""Which numbers of a format's codes carry bits, and how many each: measured, see docs/codes.md.
+"""Which numbers of a format's codes carry bits, and how many each: measured, see docs/channels.md.
 
 A *level* is an integer that grows with what it stands for; a *field* is one coordinate of an attribute of
 all Gaussians. How many bits a level carries follows from what is never written, so that readers know it:
@@ -30,7 +30,7 @@ Levels = npt.NDArray[np.int32]
 Flags = npt.NDArray[np.bool_]
 Doubles = npt.NDArray[np.float64]
 
-MOST_BITS = 10
+MAX_BITS = 10
 _SHARE = -3.0  # 2 to this: the range of what is written, in sizes of the Gaussian
 _LOG_SCALE = -4.0  # 2 to this: the range of what is written in log scales
 _SIGN, _MAGNITUDE = 512, 511  # of SPZ's rotations
@@ -45,7 +45,7 @@ class Field:
     name: str  # of the attribute in the codes
     column: int
     levels: Levels  # [N]
-    bits: Levels  # [N] that each carries, 0 to MOST_BITS
+    bits: Levels  # [N] that each carries, 0 to MAX_BITS
 
     @property
     def room(self) -> int:
@@ -54,18 +54,18 @@ class Field:
 
     def read(self) -> npt.NDArray[np.uint8]:
         """[room] the last bits of all levels, the lowest first."""
-        bits = self.levels[:, None] >> np.arange(MOST_BITS, dtype=np.int32) & 1
+        bits = self.levels[:, None] >> np.arange(MAX_BITS, dtype=np.int32) & 1
         return bits[self._places()].astype(np.uint8)
 
     def residues(self, bits: npt.NDArray[np.uint8]) -> Levels:
         """[N] what the last bits of levels are together that `read` gives as `bits`."""
-        places = np.zeros((len(self.levels), MOST_BITS), np.int32)
+        places = np.zeros((len(self.levels), MAX_BITS), np.int32)
         places[self._places()] = bits
-        found: Levels = (places @ (1 << np.arange(MOST_BITS, dtype=np.int32))).astype(np.int32)
+        found: Levels = (places @ (1 << np.arange(MAX_BITS, dtype=np.int32))).astype(np.int32)
         return found
 
     def _places(self) -> Flags:
-        found: Flags = np.arange(MOST_BITS) < self.bits[:, None]
+        found: Flags = np.arange(MAX_BITS) < self.bits[:, None]
         return found
 
 
@@ -79,12 +79,14 @@ class Format:
     # A level of a rotation stands for (level - first) * second; None: what is not stored need not be largest.
     turns: Callable[[Any], tuple[float, float] | None]
     dequantise: Callable[[Any], Gaussians]
+    quantise: Callable[[Gaussians], Any]
+    sorts: bool = True  # whether its writer sorts models
 
 
 def format_of(codes: Codes) -> Format:
     """How these codes carry. Raises InputError for formats whose codes do not."""
     if type(codes) not in _FORMATS:
-        raise InputError(f"nothing can be carried in the codes of this format: expected {', '.join(NAMES)}")
+        raise InputError(f"nothing can be carried in the codes of this format: expected {', '.join(FORMATS)}")
     return _FORMATS[type(codes)]
 
 
@@ -149,17 +151,20 @@ def _spz_turns(codes: SpzCodes) -> tuple[float, float] | None:
 
 
 _FORMATS: dict[type[Codes], Format] = {
-    SpzCodes: Format("spz", _spz_fields, _spz_with_levels, _spz_turns, spz.dequantise),
-    SogCodes: Format("sog", _sog_fields, _replaced, lambda codes: (127.5, 2**0.5 / 255), sog.dequantise),
+    SpzCodes: Format("spz", _spz_fields, _spz_with_levels, _spz_turns, spz.dequantise, spz.quantise, False),
+    SogCodes: Format(
+        "sog", _sog_fields, _replaced, lambda codes: (127.5, 2**0.5 / 255), sog.dequantise, sog.quantise
+    ),
     CompressedPlyCodes: Format(
         "compressed-ply",
         _compressed_ply_fields,
         _replaced,
         lambda codes: (511.5, 2**0.5 / 1023),
         compressed_ply.dequantise,
+        compressed_ply.quantise,
     ),
 }
-NAMES = tuple(each.name for each in _FORMATS.values())
+FORMATS = {each.name: each for each in _FORMATS.values()}
 
 
 def _middle(values: npt.NDArray[Any]) -> Doubles:
@@ -176,7 +181,7 @@ def _log2(values: Doubles) -> Doubles:
 
 def _fitting(logs: Doubles) -> Levels:
     """How many bits of levels span 2 to the `logs` at most."""
-    return np.floor(np.nan_to_num(logs)).clip(0, MOST_BITS).astype(np.int32)
+    return np.floor(np.nan_to_num(logs)).clip(0, MAX_BITS).astype(np.int32)
 
 
 def _fields(name: str, levels: npt.NDArray[Any], bits: Levels | int) -> list[Field]:

@@ -1,7 +1,7 @@
-"""What is left as it is because a change would show. Only whoever writes looks at this: see `syndromes`.
+"""Levels that writers leave as they are because a change would show; readers need not know (`syndromes`).
 
 Near a limit that levels may not cross, fewer and fewer of them change, at random: with a sharp border they
-would pile up behind it. The randomness is of the cover itself, which nobody else has.
+would pile up behind it. The randomness follows from the cover, which only the writer has.
 """
 
 from __future__ import annotations
@@ -10,29 +10,35 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from keyss.channels.codes.fields import Doubles, Field, Flags, format_of, sog_distances
+from keyss.channels.codes.fields import Doubles, Field, Flags, Levels, format_of, sog_distances
 from keyss.channels.codes.matching import reach
-from keyss.channels.codes.natural import is_natural
+from keyss.channels.mixing import random_fractions
 from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
-from keyss.keys.derivation import stream
 
 # In sizes of the Gaussian: at this distance from its nearest neighbour half of them are left alone. Clones
 # lie nearer to each other, and more of them than there would be by chance.
 _CLONES = 1 / 8
 _NEIGHBOURS = 4  # of a Gaussian, among which its clones are
 _RAMP = 3  # ranges of what is written
+_NEAR = 8  # levels away, whose frequencies are compared
+_ROUGH = 0.25  # by how much more often levels may be equal than near each other
+_EQUAL = 0.02  # as a share of the Gaussians
+_DEVIATIONS = 6
+_LEANING = 0.02  # of the last bits to 0 or to 1
+
+Integers = npt.NDArray[np.int64]
 
 
 def changeable(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:
-    """Of each field the levels [N] that may be changed. `secret`: 32 bytes of what nobody else has."""
+    """Of each field the levels [N] that may be changed. `secret`: 32 secret bytes."""
     count = len(fields[0].levels)
-    alone = _alone(codes, fields, _random(secret, "kept/clones", count))
-    turnable = _turnable(codes, fields, _random(secret, "kept/turns", count))
+    alone = _alone(codes, fields, random_fractions(secret, "kept/clones", count))
+    turnable = _turnable(codes, fields, random_fractions(secret, "kept/turns", count))
     found = []
     for field in fields:
-        random = _random(secret, f"kept/{field.name}/{field.column}", count)
+        random = random_fractions(secret, f"kept/{field.name}/{field.column}", count)
         own = alone & (_room(codes, field) > random * _RAMP * (1 << field.bits)) & (field.bits > 0)
         if field.name == "rotations":
             own &= turnable
@@ -109,8 +115,26 @@ def _turnable(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     return found
 
 
-def _random(secret: bytes, label: str, count: int) -> npt.NDArray[np.float64]:
-    """[count] random numbers from 0 to 1."""
-    words = np.frombuffer(stream(secret, label, 8 * count), "<u8")
-    found: Doubles = (words >> np.uint64(11)).astype(np.float64) / 2.0**53
-    return found
+def is_natural(levels: Levels) -> bool:
+    """Whether matching would not show: levels are not shared by many Gaussians, and not on a lattice.
+
+    Equal levels are not much more frequent than neighbouring ones, nor even more than odd ones.
+    """
+    if len(levels) < 2:
+        return True
+    values, found = np.unique(levels.astype(np.int64), return_counts=True)
+    counts = found.astype(np.int64)
+    equal = float((counts * (counts - 1)).sum())
+    near = [_pairs(values, counts, distance) for distance in range(1, _NEAR + 1)]
+    expected = float(np.mean(near))
+    if equal - expected > max(_ROUGH * expected, _EQUAL * len(levels), _DEVIATIONS * expected**0.5):
+        return False
+    odd = float((levels & 1).mean())
+    return bool(abs(odd - 0.5) < _LEANING + _DEVIATIONS / 2 / len(levels) ** 0.5)
+
+
+def _pairs(values: Integers, counts: Integers, distance: int) -> float:
+    """How many ordered pairs of levels differ by `distance`, upwards."""
+    at = np.searchsorted(values, values + distance).clip(max=len(values) - 1)
+    there = values[at] == values + distance
+    return float((counts[there] * counts[at[there]]).sum())

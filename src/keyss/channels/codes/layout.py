@@ -1,12 +1,12 @@
-"""Where what lies, among the last bits of all levels in order of fields, Gaussians, and the lowest first.
+"""The layout of the last bits of all levels, in order of fields, Gaussians, and the lowest first.
 
     in a fixed random order, in blocks of ZONE_RATE bits: salt (16 bytes), slots (28 bytes each)
     the others, in an order that follows from the salt, in blocks of as many as a header says: data
 
 What blocks hold is in `syndromes`. A *slot* is a header encrypted under what a key becomes with the salt, or
 noise. The header says where the key's data begin, how long they are, and how much blocks hold. Data are a
-range that may go on at the start; all that is no data is noise. The number of slots follows from the room. So
-all that a key tells is where its own data lie.
+range that may go on at the start; everything else is noise. The number of slots follows from the room. So
+a key tells where its own data lie, and nothing else.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from keyss.core.errors import InputError
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, stream
 
 VERSION = 1
-LEAST_SLOTS, MOST_SLOTS = 4, 256
+MIN_SLOTS, MAX_SLOTS = 4, 256
 ZONE_RATE = 384  # bits that a block of salt and slots holds: more than half of its bits may have to stay
-_LEAST_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits that the least slots, and more of them, may take
+_MIN_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits that the least slots, and more of them, may take
 _HEADER = struct.Struct("<BHIIx")  # version, bits that a block holds, first bit, bytes of data
 SLOT_BYTES = _HEADER.size + 16
 _ASSOCIATED = b"keyss/v1/codes"
@@ -51,22 +51,22 @@ class Header:
 
 
 @dataclass(frozen=True)
-class Room:
+class Zones:
     """What fits into a number of bits."""
 
     bits: int
 
     @staticmethod
-    def of(fields: list[Field]) -> Room:
-        return Room(sum(each.room for each in fields))
+    def of(fields: list[Field]) -> Zones:
+        return Zones(sum(each.room for each in fields))
 
     @property
     def slots(self) -> int:
         """A power of two; 0 where there is no room for what is needed at least."""
-        if _zone_blocks(LEAST_SLOTS) * BLOCK > self.bits * _LEAST_SHARE:
+        if _zone_blocks(MIN_SLOTS) * BLOCK > self.bits * _MIN_SHARE:
             return 0
-        found = LEAST_SLOTS
-        while found < MOST_SLOTS and _zone_blocks(2 * found) * BLOCK <= self.bits * _SHARE:
+        found = MIN_SLOTS
+        while found < MAX_SLOTS and _zone_blocks(2 * found) * BLOCK <= self.bits * _SHARE:
             found *= 2
         return found
 
@@ -88,7 +88,7 @@ def _zone_blocks(slots: int) -> int:
     return -(-8 * (SALT_BYTES + slots * SLOT_BYTES) // ZONE_RATE)
 
 
-def find_header(zone: bytes, key: DerivedKey, room: Room) -> Header | None:
+def find_header(zone: bytes, key: DerivedKey, room: Zones) -> Header | None:
     """The header that `key` opens; all slots are tried. Raises InputError for one that makes no sense."""
     cipher, found = _cipher(key), None
     for slot in range(room.slots):

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from keyss.channels.codes.fields import Field, Flags, format_of, sog_distances
+from keyss.channels.mixing import row_hashes
 from keyss.files.formats.common import Codes, Floats, morton_order
 from keyss.files.formats.sog import SogCodes, positions_of
 
@@ -62,26 +63,14 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
 
 
 def _sog_order(codes: SogCodes) -> tuple[Rows, Flags]:
-    """Gaussians [N] by hashes of what is not written, and which of them, in that order, share one."""
-    names = _hashed(
-        codes.scales,
-        codes.colors,
-        codes.alphas,
-        codes.labels,
-        codes.largest,
-        sog_distances(codes, codes.positions),
-    )
+    """Gaussians [N] by hashes of what is not written, and which of them, in that order, share one.
+
+    Where two are equal by chance, a little room is lost.
+    """
+    parts = (codes.scales, codes.colors, codes.alphas, codes.labels, codes.largest)
+    levels = sog_distances(codes, codes.positions)
+    names = row_hashes(np.concatenate([each.reshape(len(levels), -1) for each in (*parts, levels)], axis=1))
     rows = np.argsort(names, kind="stable")
     same = np.diff(names[rows]) == 0
     alike: Flags = np.append(same, False) | np.append(False, same)
     return rows, alike
-
-
-def _hashed(*arrays: npt.NDArray[Any]) -> npt.NDArray[np.uint64]:
-    """[N] a hash of each row of arrays [N, ...]; where two are equal by chance, a little room is lost."""
-    found = np.zeros(len(arrays[0]), np.uint64)
-    for each in arrays:
-        for column in each.reshape(len(each), -1).T:
-            found = (found ^ column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-            found ^= found >> np.uint64(29)
-    return found

@@ -24,7 +24,7 @@ Words = npt.NDArray[np.uint64]
 
 
 def rate_of(dry: float) -> int:
-    """How many bits blocks hold, of which on average the share `dry` may change; 0: none."""
+    """How many bits a block holds if the share `dry` of its bits may change on average; 0: none."""
     deviation = (BLOCK * dry * (1 - dry)) ** 0.5
     return max(0, int(BLOCK * dry - _DEVIATIONS * deviation - _SPARE))
 

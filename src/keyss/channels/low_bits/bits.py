@@ -15,31 +15,32 @@ order. Sign and exponent never change. Which Gaussians can be written: `usable`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
+from hashlib import blake2b
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.low_bits import hashing, kernels
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
 
 FIELDS = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
-GEOMETRY = kernels.GEOMETRY  # fields of a Gaussian before the spherical harmonics
+GEOMETRY = len(FIELDS)  # fields of a Gaussian before the spherical harmonics
 QUATS = slice(3, 7)  # of these
 GEOMETRY_BITS, SH_BITS = 8, 12
 UNUSED_BITS = 1  # below them
 UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5 on average
 
-KERNEL_BLOCK = 1 << 14  # Gaussians that a thread takes at a time
-_BLOCK = 1 << 16  # Gaussians at a time
-_WRITTEN = 1 << 11  # the same where they should stay in the cache
+IDENTITY_BYTES = 16
+_PERSON = b"keyss/identity"
+BLOCK = 1 << 13  # Gaussians that a thread takes at a time
 
 Words = npt.NDArray[np.uint32]
 Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,9 @@ class Layout:
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
         """Without quaternions where half of them or more have unit length."""
-        quats, deviation = _words(gaussians.quats), np.empty(len(gaussians))
-
-        def measure(start: int, stop: int) -> None:
-            deviation[start:stop] = np.abs(coarse_lengths(quats[start:stop]) - 1)
-
-        in_blocks(measure, len(gaussians), KERNEL_BLOCK)
-        return Layout(gaussians.sh_degree, not len(deviation) or float(np.median(deviation)) > UNIT_TOLERANCE)
+        lengths = coarse_lengths(_words(gaussians.quats))
+        away = float(np.median(np.abs(lengths - 1))) if len(lengths) else 1.0
+        return Layout(gaussians.sh_degree, away > UNIT_TOLERANCE)
 
     @property
     def width(self) -> int:
@@ -102,67 +99,84 @@ def coarse_lengths(quats: Words) -> npt.NDArray[np.float64]:
 
 def identities(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] for each Gaussian a public hash (BLAKE2b) of all that embedding leaves as it is."""
-    words, mask = words_of(gaussians), (layout or Layout.of(gaussians)).mask
-    hashes = np.empty((len(gaussians), 2), np.uint64)
-    in_blocks(
-        lambda start, stop: hashing.identify(start, stop, *words, mask, hashes), len(gaussians), KERNEL_BLOCK
-    )
-    return hashes.view(np.uint8)
+    stays, hashes = ~(layout or Layout.of(gaussians)).mask, []
+    size = 4 * (3 + len(stays))
+    for start in range(0, len(gaussians), BLOCK):
+        own = gaussians[start : start + BLOCK]
+        data = np.concatenate([_words(own.means), used_words(own) & stays], axis=1).astype("<u4").tobytes()
+        hashes += [
+            blake2b(data[at : at + size], digest_size=IDENTITY_BYTES, person=_PERSON).digest()
+            for at in range(0, len(data), size)
+        ]
+    return np.frombuffer(b"".join(hashes), np.uint8).reshape(-1, IDENTITY_BYTES)
 
 
 def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
-    """[N, B] the low bits of each Gaussian as bytes, as many as its `Layout` is wide."""
+    """[N, B] the low bits of each Gaussian as bytes, as many as its `Layout` is wide.
+
+    8 bits of each field before the harmonics are a byte; two times 12 bits of harmonics are three.
+    """
     layout = layout or Layout.of(gaussians)
-    _, *fields = words_of(gaussians)
-    low = np.empty((len(gaussians), layout.width), np.uint8)
-    in_blocks(
-        lambda start, stop: kernels.pack(start, stop, *fields, layout.quats, low),
-        len(gaussians),
-        KERNEL_BLOCK,
-    )
-    return low
+    columns, harmonics = layout.columns, _sh_count(layout.sh_degree)
+    before = len(columns) - harmonics
+    packed = np.empty((len(gaussians), layout.width), np.uint8)
+
+    def pack(start: int, stop: int) -> None:
+        low = (used_words(gaussians[start:stop])[:, columns] & layout.mask[columns]) >> np.uint32(UNUSED_BITS)
+        first, second = low[:, before::2], low[:, before + 1 :: 2]
+        packed[start:stop, :before] = low[:, :before]
+        packed[start:stop, before::3] = first >> 4
+        whole = second.shape[1]
+        packed[start:stop, before + 1 :: 3] = (first[:, :whole] & 15) << 4 | second >> 8
+        packed[start:stop, before + 2 :: 3] = second & 255
+
+    in_blocks(pack, len(gaussians), BLOCK)
+    return packed
 
 
-def write_low_bits(gaussians: Gaussians, rows: npt.NDArray[np.int64], data: Bytes) -> Gaussians:
-    """The same Gaussians with other low bits [R, B] in the `rows` [R], which are different ones.
+def write_low_bits(gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[Rows, Bytes]]) -> Gaussians:
+    """The same Gaussians with other low bits: for each part [R, B] in the rows [R], which are different ones.
 
     Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
     """
-    return with_low_bits(gaussians, Layout.of(gaussians), [(rows, data)])
+    written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
+    *geometry, _ = _used_fields(written)
+    fields, mask = [*map(_words, geometry), _words(written.sh)[:, 3:]], layout.mask
+    if _sh_count(layout.sh_degree) % 2:
+        mask[-1] &= ~np.uint32(15 << UNUSED_BITS)
 
+    for rows, data in parts:
 
-def with_low_bits(
-    gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[npt.NDArray[np.int64], Bytes]]
-) -> Gaussians:
-    """`write_low_bits` for several (rows, data)."""
-    source = gaussians.detach().to("cpu").map(torch.Tensor.contiguous)
-    written = replace(source.map(torch.empty_like), means=source.means)
-    before, after = words_of(source)[1:], words_of(written)[1:]
-    choices = []
-    for rows, data in parts:  # each Gaussian has more lines in the cache than its bits
-        chosen = np.full(len(gaussians), -1, np.int64)
-        chosen[rows] = np.arange(len(rows))
-        choices.append((chosen, data))
+        def write(start: int, stop: int, rows: Rows = rows, data: Bytes = data) -> None:
+            own, new, first = rows[start:stop], _unpacked(data[start:stop], layout), 0
+            for field in fields:
+                columns = slice(first, first := first + field.shape[1])
+                field[own] = field[own] & ~mask[columns] | new[:, columns] & mask[columns]
 
-    def write(start: int, stop: int) -> None:
-        for old, new in zip(before, after, strict=True):
-            new[start:stop] = old[start:stop]
-        for chosen, data in choices:
-            kernels.unpack(start, stop, chosen, data, *after, layout.quats)
-
-    in_blocks(write, len(gaussians), _WRITTEN)
+        in_blocks(write, len(rows), BLOCK)
     return written.to(gaussians.device)
-
-
-def blocks(gaussians: Gaussians) -> Iterator[Gaussians]:
-    """The model in parts; one that is empty for a model that is."""
-    return (gaussians[start : start + _BLOCK] for start in range(0, max(len(gaussians), 1), _BLOCK))
 
 
 def used_words(gaussians: Gaussians) -> Words:
     """[N, F] bit patterns of scales, quaternions, opacity and harmonics above the constant ones; a copy."""
-    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
-    return np.concatenate([_words(values) for values in fields], axis=1)
+    return np.concatenate([_words(values) for values in _used_fields(gaussians)], axis=1)
+
+
+def _used_fields(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
+    return gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
+
+
+def _unpacked(data: Bytes, layout: Layout) -> Words:
+    """[N, F] the words whose low bits are bytes [N, B], zeros where a byte or a field is not in use."""
+    count = _sh_count(layout.sh_degree)
+    before = len(layout.columns) - count
+    padded = np.zeros((len(data), -(-count // 2) * 3), np.uint32)
+    padded[:, : data.shape[1] - before] = data[:, before:]
+    a, b, c = padded[:, 0::3], padded[:, 1::3], padded[:, 2::3]
+    harmonics = np.stack([a << 4 | b >> 4, (b & 15) << 8 | c], axis=2).reshape(len(data), -1)[:, :count]
+    words = np.zeros((len(data), GEOMETRY + count), np.uint32)
+    words[:, layout.columns] = np.concatenate([data[:, :before], harmonics], axis=1) << np.uint32(UNUSED_BITS)
+    return words
 
 
 def _sh_count(sh_degree: int) -> int:
@@ -170,20 +184,8 @@ def _sh_count(sh_degree: int) -> int:
     return 3 * ((sh_degree + 1) ** 2 - 1)
 
 
-def words_of(gaussians: Gaussians) -> tuple[Words, Words, Words, Words, Words]:
-    """Bit patterns of means [N, 3], log scales [N, 3], quaternions [N, 4], opacity logits [N], and harmonics
-    [N, 3 K], for `kernels`: the model's own memory where it is contiguous and on the CPU.
-    """
-    return (
-        _words(gaussians.means),
-        _words(gaussians.log_scales),
-        _words(gaussians.quats),
-        _words(gaussians.opacity_logits)[:, 0],
-        _words(gaussians.sh),
-    )
-
-
 def _words(values: torch.Tensor) -> Words:
+    """[N, C] bit patterns: the tensor's own memory where it is contiguous and on the CPU."""
     width = math.prod(values.shape[1:])
     flat = values.detach().to("cpu", torch.float32).reshape(len(values), width).contiguous()
     return flat.numpy().view(np.uint32)

@@ -22,11 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from cryptography.hazmat.primitives.ciphers import Cipher
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.ciphers.modes import ECB
 
-from keyss.channels.low_bits import cell_kernels as kernels
+from keyss.channels.mixing import encrypted_blocks
 from keyss.keys.derivation import expand
 from keyss.rendering.cpu.parallel import in_blocks
 
@@ -60,64 +57,47 @@ class CellCipher:
         """
         if data.shape != (len(identities), self.size):
             raise ValueError(f"expected data of shape {(len(identities), self.size)}, got {data.shape}")
-        numbers = np.atleast_1d(np.asarray(slots, np.uint8))
+        numbers = np.broadcast_to(np.asarray(slots, np.uint8), len(data))
         cells = np.empty((len(data), self.cell_bytes), np.uint8)
 
         def work(start: int, stop: int) -> None:
-            names, own, out = identities[start:stop], data[start:stop], cells[start:stop]
-            which = numbers[start:stop] if len(numbers) > 1 else numbers
-            messages = self._messages(len(own))
-            kernels.begin(which, own, messages)
-            tags = self._tags(names, messages)
-            out[:, : self._tag] = tags[:, : self._tag]
-            kernels.cover(own, 0, self._stream(names, which, tags), out, self._tag)
+            names, own, which = identities[start:stop], data[start:stop], numbers[start:stop]
+            tags = self._tags(names, own, which)
+            cells[start:stop, : self._tag] = tags
+            cells[start:stop, self._tag :] = own ^ self._stream(names, which, tags)
 
         in_blocks(work, len(data), _CELLS)
         return cells
 
     def decrypt(self, identities: Bytes, cells: Bytes, slot: int = 0) -> tuple[Flags, Bytes]:
         """[N] which of the cells [N, cell_bytes or more] fit this secret, and the data [M, size] of these."""
-        fits, which = np.zeros(len(cells), bool), np.array([slot], np.uint8)
+        fits = np.zeros(len(cells), bool)
 
         def work(start: int, stop: int) -> Bytes:
-            names = identities[start:stop]
-            hidden = np.ascontiguousarray(cells[start:stop, : self.cell_bytes])
-            messages = self._messages(len(names))
-            messages[:, 0], messages[:, 1 + self.size :] = slot, 0
-            kernels.cover(hidden, self._tag, self._stream(names, which, hidden), messages, 1)
-            rows, opened = np.empty(len(names), np.int64), np.empty((len(names), self.size), np.uint8)
-            tags = self._tags(names, messages)
-            count = kernels.fit(tags, hidden, self._tag, messages, self.size, rows, opened)
-            fits[start + rows[:count]] = True
-            return opened[:count].copy()
+            names, own = identities[start:stop], cells[start:stop, : self.cell_bytes]
+            which, tags = np.full(len(names), slot, np.uint8), own[:, : self._tag]
+            data = own[:, self._tag :] ^ self._stream(names, which, tags)
+            fits[start:stop] = (self._tags(names, data, which) == tags).all(axis=1)
+            return data[fits[start:stop]]
 
-        return fits, np.concatenate(
-            [np.zeros((0, self.size), np.uint8), *in_blocks(work, len(cells), _CELLS)]
-        )
+        every = in_blocks(work, len(cells), _CELLS)
+        return fits, np.concatenate([np.zeros((0, self.size), np.uint8), *every])
 
-    def _messages(self, count: int) -> Bytes:
-        return np.empty((count, -(-(1 + self.size) // _BLOCK) * _BLOCK), np.uint8)
-
-    def _tags(self, identities: Bytes, messages: Bytes) -> Bytes:
-        """[N, 16] of which a tag is the first bytes."""
-        states = _encrypt(self._tag_key, identities)
-        for block in range(messages.shape[1] // _BLOCK):
-            kernels.chain(states, messages, block)
-            states = _encrypt(self._tag_key, states)
-        return states
+    def _tags(self, identities: Bytes, data: Bytes, slots: Bytes) -> Bytes:
+        """[N, tag bytes] of data [N, size] in the `slots` [N]."""
+        messages = np.zeros((len(data), -(-(1 + self.size) // _BLOCK), _BLOCK), np.uint8)
+        flat = messages.reshape(len(data), -1)
+        flat[:, 0], flat[:, 1 : 1 + self.size] = slots, data
+        states = encrypted_blocks(self._tag_key, identities)
+        for block in range(messages.shape[1]):
+            states = encrypted_blocks(self._tag_key, states ^ messages[:, block])
+        return states[:, : self._tag]
 
     def _stream(self, identities: Bytes, slots: Bytes, tags: Bytes) -> Bytes:
-        """[N, size or more] the key streams; `tags` [N, tag bytes or more]."""
-        seeds = np.empty((len(identities), _BLOCK), np.uint8)
-        kernels.seed(identities, slots, tags, self._tag, seeds)
-        counted = np.empty((len(seeds), -(-self.size // _BLOCK), _BLOCK), np.uint8)
-        kernels.count(_encrypt(self._seed_key, seeds), counted)
-        return _encrypt(self._stream_key, counted).reshape(len(seeds), -1)
-
-
-def _encrypt(key: bytes, blocks: Bytes) -> Bytes:
-    """Every 16 bytes of `blocks` through AES-256: a permutation of blocks, not a mode of operation."""
-    plain = np.ascontiguousarray(blocks)
-    encrypted = np.empty(plain.size + _BLOCK - 1, np.uint8)  # the library wants room for one more block
-    Cipher(AES(key), ECB()).encryptor().update_into(plain.reshape(-1).data, encrypted.data)
-    return encrypted[: plain.size].reshape(blocks.shape)
+        """[N, size] the key streams; `tags` [N, tag bytes]."""
+        seeds = identities.copy()
+        seeds[:, : self._tag] ^= tags
+        seeds[:, self._tag] ^= slots
+        counted = np.repeat(encrypted_blocks(self._seed_key, seeds)[:, None], -(-self.size // _BLOCK), axis=1)
+        counted[:, :, -1] ^= np.arange(counted.shape[1], dtype=np.uint8)
+        return encrypted_blocks(self._stream_key, counted).reshape(len(seeds), -1)[:, : self.size]

@@ -8,24 +8,22 @@ every Gaussian's cell and keeping those whose tag fits.
 - *Key cells*, encrypted under what the key becomes with a salt, hold the secret's data key.
 - *Parameter cells*, encrypted under the data key, tell how the rest is read (see `parameters`).
 - *Content cells* are encrypted under the data key too: the chunks of an encrypted payload (see `spread`), or
-  records. Records need no number: shuffling and cropping are harmless, and who removes a carrier removes its
-  record and no more. *Copies* of some records have another label; they count where the record is gone.
+  records. Records need no number: shuffling and cropping are harmless, and a removed carrier takes only its
+  own record with it. *Copies* of some records have another label; they count where the record is gone.
 
 Which carrier gets what is drawn at random (see `layout`), and every usable one gets new low bits, noise if
-nothing else: cells of other secrets and of none look alike. All randomness comes from `entropy`, which nobody
-else may know: if it followed from the cover and one secret, the holder of that secret's key could compute
+nothing else: cells of other secrets and of none look alike. All randomness comes from `entropy`, which must
+be secret: if it followed from the cover and one secret, the holder of that secret's key could compute
 what the file would be without the others. No key stream is used twice: data keys depend on entropy and on all
 contents, and the key stream of a cell on the data in it (see `cells`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -39,64 +37,68 @@ from keyss.channels.low_bits.bits import (
     bytes_per_gaussian,
     identities,
     read_low_bits,
-    with_low_bits,
+    write_low_bits,
 )
-from keyss.channels.low_bits.layout import Room
+from keyss.channels.low_bits.layout import Carriers
 from keyss.channels.low_bits.reading import LowBitsReader
 from keyss.channels.low_bits.salts import salt, salt_rows
+from keyss.channels.low_bits.spread import payload_capacity
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
 from keyss.channels.low_bits.writing import Writer, digest
-from keyss.core.errors import UsageError
+from keyss.channels.writing import check_keys, randomness
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation, stream
+from keyss.keys.encryption import SMALLEST_BUCKET
 from keyss.rendering.cpu.parallel import in_blocks
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What preparing a cover found, as long as the cover lives and nobody changes it."""
-
-    cover: weakref.ref[Gaussians]
-    versions: tuple[int, ...]
-    usable: Flags
-    names: Bytes
-
-    def of(self, cover: Gaussians) -> bool:
-        return self.cover() is cover and self.versions == _versions(cover)
-
-
-def _versions(model: Gaussians) -> tuple[int, ...]:
-    """How often each tensor was changed in place."""
-    tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
-    return tuple(0 if each.is_inference() else each._version for each in tensors)
 
 
 class LowBits:
     """The channel; see `keyss.channels.base.Channel`."""
 
-    def __init__(self) -> None:
-        self._found: dict[int, _Found] = {}  # by the identity of covers that live
+    name = "low_bits"
+    place = "low bits"
+    survives = False
+    grows = False
+    records = True
 
-    def largest_record(self, sh_degree: int) -> int:
-        return Room(0, bytes_per_gaussian(sh_degree)).record_bytes(1)
+    def __init__(self) -> None:
+        # By cover, while it lives and does not change: (versions, usable, names).
+        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes]] = WeakKeyDictionary()
 
     def prepare(self, cover: Gaussians) -> LowBitsCover:
-        layout, found = Layout.of(cover), self._found.get(id(cover))
-        if found is None or not found.of(cover):  # whoever hides in a cover asked before whether it will do
+        layout, versions = Layout.of(cover), _versions(cover)
+        if (found := self._found.get(cover)) is None or found[0] != versions:
             names = identities(cover, layout)
             usable = usable_carriers(cover, names, layout)
             check_usable(cover, usable, layout)
-            number = id(cover)
-            gone = weakref.ref(cover, lambda _: self._found.pop(number, None))
-            found = self._found[number] = _Found(gone, _versions(cover), usable, names)
-        return LowBitsCover(cover, layout, found.usable, found.names)
+            found = self._found[cover] = versions, usable, names
+        return LowBitsCover(cover, layout, *found[1:])
 
-    def extract(self, stego: Gaussians, key: str) -> Content:
-        """See `Channel` and `LowBitsReader.open`."""
-        return LowBitsReader.of(stego).open(key)
+    def room(self, gaussians: int, sh_degree: int) -> LowBitsRoom:
+        return LowBitsRoom(gaussians, bytes_per_gaussian(sh_degree))
+
+    def largest_record(self, sh_degree: int) -> int:
+        return self.room(0, sh_degree).record_bytes(1)
+
+    def appended(self, size: int) -> int:
+        return 0
+
+    def reader(self, stego: Gaussians) -> LowBitsReader:
+        return LowBitsReader.of(stego)
 
 
 LOW_BITS = LowBits()
+
+
+@dataclass(frozen=True)
+class LowBitsRoom(Carriers):
+    """What fits into so many carriers; see `keyss.channels.base.Room`."""
+
+    overhead = SMALLEST_BUCKET
+
+    @property
+    def capacity(self) -> int:
+        return payload_capacity(self.carriers, 1, self.width)
 
 
 @dataclass(frozen=True)
@@ -107,10 +109,15 @@ class LowBitsCover:
     layout: Layout
     usable: Flags  # [N]
     names: Bytes  # [N, 16] identities
+    overhead, grows = LowBitsRoom.overhead, LowBitsRoom.grows
 
     @property
     def carriers(self) -> int:
         return len(self._rows)
+
+    @property
+    def capacity(self) -> int:
+        return self._room.capacity
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         return self._room.record_capacity(requests)
@@ -120,7 +127,7 @@ class LowBitsCover:
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
-        mixed = _mixed(entropy, [content for _, content in contents])
+        mixed = randomness(entropy, *(digest(content) for _, content in contents))
         derivations = [KeyDerivation(salt=each) for each in self._salts(mixed)[1]]
         derived = [(_derived(key, derivations), content) for key, content in contents]
         return self._embed(derived, mixed)
@@ -129,24 +136,23 @@ class LowBitsCover:
         self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], *, entropy: bytes | None = None
     ) -> Gaussians:
         """`embed` after key derivation: for each secret its key under each of the salts."""
-        return self._embed(contents, _mixed(entropy, [content for _, content in contents]))
+        return self._embed(contents, randomness(entropy, *(digest(content) for _, content in contents)))
 
     def _embed(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes) -> Gaussians:
-        if len({keys[0].verifier() for keys, _ in contents}) != len(contents) or not contents:
-            raise UsageError("two secrets have the same key: expected at least one secret, each with its own")
+        check_keys([keys[0].verifier() for keys, _ in contents])
         payloads = [(keys, each) for keys, each in contents if isinstance(each, Payload)]
         records = [(keys, each) for keys, each in contents if isinstance(each, Records)]
         if payloads and records:
             raise ValueError("expected payloads or records in one model, got both")
-        fresh, salts = self._salts(entropy)
+        fresh, _ = self._salts(entropy)
         room, names = self._room, self.names[self._rows]
-        writer = Writer(names, room.width, entropy, salts)
+        writer = Writer(names, room.width, entropy)
         if payloads:
             writer.payloads(payloads, len(self.cover))
         else:
             writer.records(records)
         parts = [(self._fresh_rows, fresh), (self._rows[writer.order], writer.table)]
-        return with_low_bits(self.cover, self.layout, parts)
+        return write_low_bits(self.cover, self.layout, parts)
 
     @cached_property
     def _salt_rows(self) -> npt.NDArray[np.int64]:
@@ -166,8 +172,8 @@ class LowBitsCover:
         return np.flatnonzero(carriers)
 
     @property
-    def _room(self) -> Room:
-        return Room(self.carriers, self.layout.width)
+    def _room(self) -> LowBitsRoom:
+        return LowBitsRoom(self.carriers, self.layout.width)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
         """New low bits [F, B] of `_fresh_rows`, and all salts with them."""
@@ -178,14 +184,12 @@ class LowBitsCover:
         return fresh, [salt(*each) for each in zip(self.names[self._salt_rows], low, strict=True)]
 
 
+def _versions(model: Gaussians) -> list[int]:
+    """How often each tensor was changed in place."""
+    tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
+    return [0 if each.is_inference() else each._version for each in tensors]
+
+
 def _derived(key: str, derivations: Sequence[KeyDerivation]) -> list[DerivedKey]:
     """What `key` becomes under each, several at a time."""
     return in_blocks(lambda index, _: DerivedKey(key, derivations[index]), len(derivations), 1)
-
-
-def _mixed(entropy: bytes | None, contents: Sequence[Content]) -> bytes:
-    """32 bytes from what nobody else knows and from all that is hidden."""
-    state = hashlib.sha256(os.urandom(32) if entropy is None else entropy)
-    for content in contents:
-        state.update(digest(content))
-    return state.digest()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from keyss.channels.low_bits.cells import CellCipher
-from keyss.channels.low_bits.layout import DATA_KEY_BYTES, Room
+from keyss.channels.low_bits.layout import DATA_KEY_BYTES, Carriers
 from keyss.channels.low_bits.spread import NUMBER_BYTES, TAG_BYTES, chunk_bytes
 from keyss.keys.derivation import DerivedKey, expand
 
@@ -17,7 +17,7 @@ def key_cipher(key: DerivedKey) -> CellCipher:
 
 def parameter_cipher(data_key: bytes, width: int) -> CellCipher:
     """Of parts of the parameters, each with its number."""
-    return CellCipher(data_key, "parameters", 1 + Room(0, width).part_bytes)
+    return CellCipher(data_key, "parameters", 1 + Carriers(0, width).part_bytes)
 
 
 def chunk_cipher(data_key: bytes, width: int) -> CellCipher:

@@ -1,4 +1,4 @@
-"""Which carriers hold what: headers, the shares of payloads, and how many records divide a carrier.
+"""Where headers, payloads and records lie among the carriers, and how many records share one.
 
 Every secret has a *header* in a few whole carriers: its data key for each salt, and parameters that tell how
 the rest is read. Beside it come a payload's chunks, or records.
@@ -24,7 +24,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from keyss.channels.base import RecordPlan, RecordRequest
-from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.cells import TAG_BYTES
 from keyss.core.errors import UsageError
 
@@ -33,29 +32,31 @@ SALTS = 12  # Gaussians that may serve as the salt: random pruning of a quarter 
 KEY_COPIES = 12  # of the data key, for each salt
 PARAMETER_COPIES = 24  # of each part: all are removed with a quarter of the model with p = 4e-15
 PREFIX_BYTES = 40  # of the parameters before a method's own header (see `parameters`)
-MOST_CELLS = 4  # of a carrier
-MOST_COPIES = 0.25  # of a secret's records
+MAX_CELLS = 4  # of a carrier
+MAX_COPIES = 0.25  # of a secret's records
 UNNOTICED = 4  # secrets that fit beside each other, if they are small enough, as each would alone
 
 _TYPICAL_HEADER = 168  # bytes that the methods' own headers take at most
-_MOST_SET_ASIDE = 1 / 3  # of the carriers, for headers of secrets that there may not be
+_MAX_SET_ASIDE = 1 / 3  # of the carriers, for headers of secrets that there may not be
 _DEVIATIONS = 6  # by which carriers that are left untouched may be fewer than expected
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How records are placed; see `Room.arrangement`."""
+    """How records are placed; see `Carriers.arrangement`."""
 
     header_carriers: int  # set aside for all headers together
     as_alone: bool  # whether each secret has what it would have if it were the only one
 
 
 @dataclass(frozen=True)
-class Room:
+class Carriers:
     """So many carriers, each of `width` bytes."""
 
     carriers: int
     width: int
+
+    grows = False
 
     @property
     def part_bytes(self) -> int:
@@ -92,7 +93,7 @@ class Room:
         """Records of the smallest useful size that fit for all requests together; 0 if none."""
         left = self.carriers - self._headers(requests)
         least = max(request.least_bytes for request in requests)
-        cells = [each for each in range(1, MOST_CELLS + 1) if self.record_bytes(each) >= least]
+        cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least]
         return max(0, left) * max(cells, default=0)
 
     def unnoticed_records(self, least_bytes: int, secrets: int) -> int:
@@ -100,8 +101,8 @@ class Room:
 
         `least_bytes`: of a record.
         """
-        cells = [each for each in range(1, MOST_CELLS + 1) if self.record_bytes(each) >= least_bytes]
-        if not cells or secrets > UNNOTICED or self._set_aside > _MOST_SET_ASIDE * self.carriers:
+        cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least_bytes]
+        if not cells or secrets > UNNOTICED or self._set_aside > _MAX_SET_ASIDE * self.carriers:
             return 0
         return cells[-1] * (self.carriers - self._set_aside) // (1 << (secrets - 1).bit_length())
 
@@ -122,14 +123,14 @@ class Room:
     def _alone(self, request: RecordRequest) -> RecordPlan | None:
         """What suits a secret for itself; None where it needs what is set aside for others."""
         most = self.carriers - self._set_aside
-        if self._set_aside > _MOST_SET_ASIDE * self.carriers or request.header_bytes > _TYPICAL_HEADER:
+        if self._set_aside > _MAX_SET_ASIDE * self.carriers or request.header_bytes > _TYPICAL_HEADER:
             return None
-        for cells in range(1, MOST_CELLS + 1):
+        for cells in range(1, MAX_CELLS + 1):
             size = self.record_bytes(cells)
             classes = [most // 5] if cells == 1 else [cells * most // 4, cells * most // 2, cells * most]
             enough = [each for each in classes if each >= request.count]
             if enough and size >= request.least_bytes:
-                copies = min(int(MOST_COPIES * request.count), enough[0] - request.count)
+                copies = min(int(MAX_COPIES * request.count), enough[0] - request.count)
                 return RecordPlan(size, copies, cells)
         return None
 
@@ -154,30 +155,20 @@ class Room:
     def _tight(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
         """All that there is for these secrets: whole carriers, then fewer copies, then smaller cells."""
         left = self.carriers - self._headers(requests)
-        for cells in range(1, MOST_CELLS + 1):
+        for cells in range(1, MAX_CELLS + 1):
             size = self.record_bytes(cells)
             if size < max(request.least_bytes for request in requests):
                 break
             count = sum(request.count for request in requests)
             if count <= cells * left:
                 spare = (cells * left - count) / max(1, count)
-                copies = min(MOST_COPIES, spare)
+                copies = min(MAX_COPIES, spare)
                 return [RecordPlan(size, int(copies * request.count), cells) for request in requests]
         raise UsageError(
             f"{sum(request.count for request in requests):,} Gaussians are too many for this cover: "
             f"{self.carriers:,} of its Gaussians can carry something, and "
             f"{self.record_capacity(requests):,} would fit"
         )
-
-
-def plan_records(requests: Sequence[RecordRequest], carriers: int, sh_degree: int) -> list[RecordPlan]:
-    """The plans for a cover of which only this is known; see `Room.plan_records`."""
-    return Room(carriers, bytes_per_gaussian(sh_degree)).plan_records(requests)
-
-
-def record_capacity(requests: Sequence[RecordRequest], carriers: int, sh_degree: int) -> int:
-    """The records that fit into a cover of which only this is known; see `Room.record_capacity`."""
-    return Room(carriers, bytes_per_gaussian(sh_degree)).record_capacity(requests)
 
 
 def payload_parts(alone: Sequence[int]) -> tuple[list[int], bool]:

@@ -1,7 +1,7 @@
 """The parameters of a hidden secret: how what its key decrypts is to be read.
 
-    version (1 byte), service (1), method (15, padded with zeros), the first byte of each salt (12),
-    numbers of the service, zeros up to 40 bytes; then what the method adds
+    version (1 byte), service (1), method (15, padded with zeros), zeros (12), numbers of the service, zeros
+    up to 40 bytes; then what the method adds
 
 They lie in *parameter cells*: one part each, with its number, PARAMETER_COPIES times. Numbers are
 little-endian.
@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from keyss.channels.base import Bytes, pack_method, unpack_method
-from keyss.channels.low_bits.layout import MOST_CELLS, PARAMETER_COPIES, PREFIX_BYTES, SALTS, Room
+from keyss.channels.low_bits.layout import MAX_CELLS, PARAMETER_COPIES, PREFIX_BYTES, Carriers
 from keyss.channels.low_bits.spread import Spread
 from keyss.core.errors import InputError
 
 VERSION = 2
 MAX_HEADER_BYTES = 4096
-_PREFIX = struct.Struct(f"<BB15s{SALTS}s")
+_PREFIX = struct.Struct("<BB15s12x")
 _PAYLOAD = struct.Struct("<II2B")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
 _RECORDS = struct.Struct("<BHH")  # cells of a carrier, bytes of a record, bytes of the method's header
 _PAYLOAD_SERVICE, _RECORD_SERVICE = 1, 2
@@ -33,13 +33,12 @@ class PayloadParameters:
     """Of a payload of `size` encrypted bytes."""
 
     method: str
-    salts: bytes  # the first byte of each
     size: int
     spread: Spread
 
     def pack(self) -> bytes:
         numbers = _PAYLOAD.pack(self.size, self.spread.blocks, self.spread.n, self.spread.k)
-        return _prefix(_PAYLOAD_SERVICE, self.method, self.salts, numbers)
+        return _prefix(_PAYLOAD_SERVICE, self.method, numbers)
 
 
 @dataclass(frozen=True)
@@ -47,19 +46,18 @@ class RecordParameters:
     """Of records of `record_bytes`, `cells` of which divide a carrier."""
 
     method: str
-    salts: bytes  # the first byte of each
     cells: int
     record_bytes: int
     header: bytes
 
     def pack(self) -> bytes:
         numbers = _RECORDS.pack(self.cells, self.record_bytes, len(self.header))
-        return _prefix(_RECORD_SERVICE, self.method, self.salts, numbers) + self.header
+        return _prefix(_RECORD_SERVICE, self.method, numbers) + self.header
 
 
 def parts_of(packed: bytes, width: int) -> Bytes:
     """[P, 1 + part] numbered parts of packed parameters, every one PARAMETER_COPIES times."""
-    size = Room(0, width).part_bytes
+    size = Carriers(0, width).part_bytes
     count = -(-len(packed) // size)
     parts = np.frombuffer(packed.ljust(count * size, b"\0"), np.uint8).reshape(count, size)
     numbered = np.concatenate([np.arange(count, dtype=np.uint8)[:, None], parts], axis=1)
@@ -76,7 +74,7 @@ def unpack(parts: Bytes, chunk_bytes: int) -> PayloadParameters | RecordParamete
         votes.setdefault(int(row[0]), Counter())[row[1:].tobytes()] += 1
     best = {number: counter.most_common(1)[0][0] for number, counter in votes.items()}
     prefix = _joined(best, PREFIX_BYTES)
-    version, service, name, salts = _PREFIX.unpack_from(prefix)
+    version, service, name = _PREFIX.unpack_from(prefix)
     if version != VERSION:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
     try:
@@ -86,18 +84,18 @@ def unpack(parts: Bytes, chunk_bytes: int) -> PayloadParameters | RecordParamete
             spread = Spread(blocks, n, k, chunk_bytes)
             if not 0 < size <= spread.capacity:
                 raise ValueError(f"{size} bytes in {spread}")
-            return PayloadParameters(method, salts, size, spread)
+            return PayloadParameters(method, size, spread)
         cells, record_bytes, length = _RECORDS.unpack_from(prefix, _PREFIX.size)
-        if service != _RECORD_SERVICE or not 1 <= cells <= MOST_CELLS or length > MAX_HEADER_BYTES:
+        if service != _RECORD_SERVICE or not 1 <= cells <= MAX_CELLS or length > MAX_HEADER_BYTES:
             raise ValueError(f"service {service}, {cells} cells of a carrier, {length} bytes of header")
     except ValueError as error:  # of decoding text too
         raise InputError(f"the hidden parameters are damaged: {error}") from error
     header = _joined(best, PREFIX_BYTES + length)[PREFIX_BYTES:]
-    return RecordParameters(method, salts, cells, record_bytes, header)
+    return RecordParameters(method, cells, record_bytes, header)
 
 
-def _prefix(service: int, method: str, salts: bytes, numbers: bytes) -> bytes:
-    return (_PREFIX.pack(VERSION, service, pack_method(method), salts) + numbers).ljust(PREFIX_BYTES, b"\0")
+def _prefix(service: int, method: str, numbers: bytes) -> bytes:
+    return (_PREFIX.pack(VERSION, service, pack_method(method)) + numbers).ljust(PREFIX_BYTES, b"\0")
 
 
 def _joined(parts: dict[int, bytes], length: int) -> bytes:

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-MOST_ZEROS = 12  # that are counted: more are rare, or a short number
+MAX_ZEROS = 12  # that are counted: more are rare, or a short number
 EXPONENTS = 256
 # Of the log-likelihood below its maximum, at the confidence limit: one-sided, one in 200 at worst.
 _DROP = 3.3
@@ -35,13 +35,13 @@ Numbers = npt.NDArray[np.float64]
 
 
 def count_trailing_zeros(words: npt.NDArray[np.uint32]) -> Counts:
-    """[EXPONENTS, MOST_ZEROS + 1] how many of the numbers [...] have which exponent and trailing zeros."""
-    stopped = words.ravel() | np.uint32(1 << MOST_ZEROS)
+    """[EXPONENTS, MAX_ZEROS + 1] how many of the numbers [...] have which exponent and trailing zeros."""
+    stopped = words.ravel() | np.uint32(1 << MAX_ZEROS)
     lowest = (stopped & (~stopped + np.uint32(1))).astype(np.float32)  # a power of two
     zeros = (lowest.view(np.uint32) >> np.uint32(23)).astype(np.int64) - 127
     exponents = (words.ravel() >> np.uint32(23) & np.uint32(255)).astype(np.int64)
-    flat = np.bincount(exponents * (MOST_ZEROS + 1) + zeros, minlength=EXPONENTS * (MOST_ZEROS + 1))
-    return flat.reshape(EXPONENTS, MOST_ZEROS + 1)
+    flat = np.bincount(exponents * (MAX_ZEROS + 1) + zeros, minlength=EXPONENTS * (MAX_ZEROS + 1))
+    return flat.reshape(EXPONENTS, MAX_ZEROS + 1)
 
 
 def least_exponent(counts: Counts, share: float) -> int:
@@ -62,7 +62,7 @@ def least_exponent(counts: Counts, share: float) -> int:
 
 
 def _confidence_limit(counts: Numbers, exponents: npt.NDArray[np.int64]) -> float:
-    """Of s, from above, for counts [E, MOST_ZEROS + 1] of the numbers of `exponents` [E].
+    """Of s, from above, for counts [E, MAX_ZEROS + 1] of the numbers of `exponents` [E].
 
     Where too few small numbers are there to tell, s is no larger than steps can be.
     """
@@ -80,8 +80,8 @@ def _confidence_limit(counts: Numbers, exponents: npt.NDArray[np.int64]) -> floa
 
 
 def _forced(exponents: npt.NDArray[np.int64], scale: float) -> Numbers:
-    """[E, MOST_ZEROS + 1] F(z): the probability that z zeros or more are forced."""
-    zeros = np.arange(MOST_ZEROS + 1)
+    """[E, MAX_ZEROS + 1] F(z): the probability that z zeros or more are forced."""
+    zeros = np.arange(MAX_ZEROS + 1)
     steps = exponents[:, None] + zeros - 1.0 - scale
     forced: Numbers = np.exp(-(2.0 ** steps.clip(-60, 10)))
     forced[:, 0] = 1
@@ -89,7 +89,7 @@ def _forced(exponents: npt.NDArray[np.int64], scale: float) -> Numbers:
 
 
 def _zeros(forced: Numbers) -> Numbers:
-    """[E, MOST_ZEROS + 1] how likely z trailing zeros are where F(z) are forced; the last: or more."""
+    """[E, MAX_ZEROS + 1] how likely z trailing zeros are where F(z) are forced; the last: or more."""
     exactly = forced - np.append(forced[:, 1:], np.zeros((len(forced), 1)), axis=1)
     at_least = np.zeros_like(forced)
     at_least[:, 0] = 1
@@ -102,7 +102,7 @@ def _zeros(forced: Numbers) -> Numbers:
 
 
 def _log_likelihood(counts: Numbers, exponents: npt.NDArray[np.int64], scale: float) -> float:
-    """Of counts [E, MOST_ZEROS + 1], with the best probability of rounding to even."""
+    """Of counts [E, MAX_ZEROS + 1], with the best probability of rounding to even."""
     chances = _zeros(_forced(exponents, scale)).clip(1e-12)
     even = 1 - chances[:, 0]
     inside = float((counts[:, 1:] * np.log(chances[:, 1:] / even[:, None])).sum())
@@ -117,7 +117,7 @@ def _distance(exponents: npt.NDArray[np.int64], scale: float) -> Numbers:
     """[E] chi-square distance of the other bits of an even number from uniform ones."""
     chances = _zeros(_forced(exponents, scale))[:, 1:]
     given = chances / chances.sum(axis=1, keepdims=True)
-    uniform = 0.5 ** np.arange(1, MOST_ZEROS + 1)
+    uniform = 0.5 ** np.arange(1, MAX_ZEROS + 1)
     uniform[-1] *= 2
     result: Numbers = ((given - uniform) ** 2 / uniform).sum(axis=1)
     return result

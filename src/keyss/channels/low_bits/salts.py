@@ -14,15 +14,26 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.low_bits import kernels
-from keyss.channels.low_bits.bits import KERNEL_BLOCK, UNIT_TOLERANCE, Bytes, Layout, read_low_bits, words_of
+from keyss.channels.low_bits.bits import (
+    BLOCK,
+    GEOMETRY,
+    QUATS,
+    UNIT_TOLERANCE,
+    Bytes,
+    Layout,
+    coarse_lengths,
+    read_low_bits,
+    used_words,
+)
 from keyss.channels.low_bits.layout import SALTS
+from keyss.channels.low_bits.usable import exponents, near_equal
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES
 from keyss.rendering.cpu.parallel import in_blocks
 
 _LABEL = b"keyss/v2/salt"
 _LOOKED_AT = 4096  # Gaussians that are looked at closely
+_MANTISSA = np.uint32((1 << 23) - 1)
 
 
 def salt_rows(
@@ -62,11 +73,24 @@ def _keys(
 
 
 def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> npt.NDArray[np.uint64]:
-    """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is."""
-    _, *fields = words_of(gaussians)
-    ranks = np.empty(len(gaussians), np.uint64)
-    of_fields = (layout.mask, layout.shifts, layout.quats, UNIT_TOLERANCE, coincidences, ranks)
-    in_blocks(
-        lambda start, stop: kernels.ranks(start, stop, *fields, *of_fields), len(gaussians), KERNEL_BLOCK
-    )
-    return ranks
+    """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is.
+
+    Without `coincidences` what nearly equal numbers tell is left out.
+    """
+    columns = layout.columns
+    stays = layout.mask[columns] | np.uint32(1)
+
+    def ranked(start: int, stop: int) -> npt.NDArray[np.uint64]:
+        used = used_words(gaussians[start:stop])
+        chosen = used[:, columns]
+        large = exponents(chosen)
+        doubtful = ((large == 0) | (chosen & _MANTISSA & ~stays == 0)).any(axis=1)
+        if coincidences:
+            doubtful |= near_equal(used, layout)
+        if layout.quats:
+            doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
+        harmonics = exponents(used[:, GEOMETRY:]) if used.shape[1] > GEOMETRY else large
+        rank: npt.NDArray[np.uint64] = (255 - harmonics.min(axis=1) + 256 * doubtful).astype(np.uint64)
+        return rank
+
+    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(ranked, len(gaussians), BLOCK)])

@@ -14,11 +14,10 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import bdtrc
 
 from keyss.channels import reed_solomon
 from keyss.channels.low_bits.bits import bytes_per_gaussian
-from keyss.channels.low_bits.layout import Room, shares
+from keyss.channels.low_bits.layout import Carriers, shares
 from keyss.core.errors import InputError, UsageError
 from keyss.keys.encryption import encrypted_size
 
@@ -94,13 +93,13 @@ def _numbers(chunks: Bytes) -> npt.NDArray[np.int64]:
 
 def chunk_bytes(width: int) -> int:
     """Bytes of payload in one cell of a Gaussian of `width`: 0, 12, 35 and 66 at SH degrees 0 to 3."""
-    return max(0, width - TAG_BYTES - NUMBER_BYTES) if Room(0, width).part_bytes else 0
+    return max(0, width - TAG_BYTES - NUMBER_BYTES) if Carriers(0, width).part_bytes else 0
 
 
 def plan_spread(carriers: int, parts: int, width: int, size: int) -> Spread | None:
     """The most redundant way to spread `size` bytes over one of `parts` of the carriers; None: not safe."""
     chunk = chunk_bytes(width)
-    left = carriers // parts - Room(carriers, width).header_carriers(0)
+    left = carriers // parts - Carriers(carriers, width).header_carriers(0)
     if chunk < 1 or left < 1:
         return None
     blocks = min(-(-left // reed_solomon.MAX_CHUNKS), MAX_BLOCKS)
@@ -146,7 +145,7 @@ def check_payload_fits(
 
 
 def too_small(gaussians: int, usable: float, size: int, secrets: int, width: int) -> str:
-    """What to tell the owner of a model of which a share `usable` can be used."""
+    """The error message for a model whose usable share of Gaussians is `usable`."""
     if chunk_bytes(width) == 0:
         return (
             f"a model whose Gaussians hold {width} bytes has no room for anything in its low bits: there are "
@@ -165,5 +164,7 @@ def too_small(gaussians: int, usable: float, size: int, secrets: int, width: int
 @lru_cache(maxsize=1024)
 def _most_data(n: int, blocks: int) -> int:
     """The largest k with which all blocks survive removal with probability 1 - FAILURE; 0 if none."""
+    from scipy.special import bdtrc  # takes long to load
+
     data = np.arange(1, n + 1)
     return int(data[bdtrc(n - data, n, REMOVAL) * blocks < FAILURE].max(initial=0))

@@ -1,6 +1,6 @@
 """Which Gaussians of a model can get new low bits without anybody noticing.
 
-In a trained model the low bits are uniformly random for everybody who does not know how it was trained, but
+In a trained model most low bits are uniformly random to anybody who does not know how it was trained, but
 not all of them. A Gaussian is left alone, as a whole, so that none contradicts itself, for one of these:
 
 - *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
@@ -20,18 +20,17 @@ twice as many as expected would be seen.
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.special import bdtr
 
-from keyss.channels.low_bits import kernels
 from keyss.channels.low_bits.bits import (
+    BLOCK,
     FIELDS,
     GEOMETRY,
-    KERNEL_BLOCK,
     QUATS,
     UNIT_TOLERANCE,
     UNUSED_BITS,
@@ -39,17 +38,17 @@ from keyss.channels.low_bits.bits import (
     Flags,
     Layout,
     Words,
+    coarse_lengths,
     identities,
     used_words,
-    words_of,
 )
-from keyss.channels.low_bits.multiples import crowded, repeated
-from keyss.channels.low_bits.predictability import EXPONENTS, MOST_ZEROS, Counts, least_exponent
+from keyss.channels.low_bits.predictability import Counts, count_trailing_zeros, least_exponent
+from keyss.channels.mixing import row_hashes
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
 
-LEAST_USABLE = 0.5  # share of the Gaussians of a cover
+MIN_USABLE = 0.5  # share of the Gaussians of a cover
 # What small numbers may give away: squared separation (d') of a plain file and one with new bits, to somebody
 # who knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
 GIVEN_AWAY = 0.03
@@ -60,8 +59,10 @@ _GROUP_NAMES = ("log scales", "quaternions", "opacity logits", "harmonics")
 # A value is not random, but a short number, when at least this many low bits of its mantissa are zero. By
 # chance that happens to one value in a million; where there are no more of them than that, it is chance.
 _SHORT_BITS = 20
+_SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # Nor is a Gaussian, when so many of its values have 12 zeros; by chance one in three million is that.
-_ZERO_FIELDS = 3
+_ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
+_EQUAL_HARMONICS = 2
 
 _EXACT = 1e-6  # of the length of a unit quaternion in single precision
 # Sets of equal values that there may be by chance: those are left alone, and embedding makes as many again.
@@ -77,31 +78,32 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
 
     `names` [N, 16]: their identities, where they are known.
     """
-    layout = layout or Layout.of(gaussians)
-    fields, count = words_of(gaussians)[1:], len(gaussians)
+    layout, count = layout or Layout.of(gaussians), len(gaussians)
     usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
     frequent = _frequent_values(gaussians)
-    ends = np.cumsum([0, *map(len, frequent)])
-    values, groups = np.concatenate(frequent), _group_of_fields(len(layout.mask))
-    mask, shifts, quats = layout.mask, layout.shifts, layout.quats
+    used_groups = [each for each in range(len(_GROUPS)) if layout.quats or _GROUPS[each] != QUATS]
 
     def judge(start: int, stop: int) -> Counts:
-        counts = np.zeros((len(_GROUPS), EXPONENTS, MOST_ZEROS + 1), np.int64)
-        of_fields = (mask, shifts, groups, quats, short, values, ends)
-        limits = (_ZERO_FIELDS, UNIT_TOLERANCE, _EXACT)
-        kernels.judge(start, stop, *fields, *of_fields, *limits, usable, counts)
-        return counts
+        used, own = used_words(gaussians[start:stop]), usable[start:stop]
+        own &= _are_measured(used, layout, frequent, short) & ~near_equal(used, layout)
+        if layout.quats:
+            own &= ~_have_unit_length(used)
+        return np.stack([count_trailing_zeros(used[own][:, group]) for group in _GROUPS])
 
-    parts = in_blocks(judge, count, KERNEL_BLOCK)
+    parts = in_blocks(judge, count, BLOCK)
     if not parts:
         return usable
     counts = np.sum(parts, axis=0)
-    least = np.array([least_exponent(each, GIVEN_AWAY / len(_GROUPS)) for each in counts])
-    in_blocks(
-        lambda start, stop: kernels.leave_small(start, stop, *fields, groups, quats, least, usable),
-        count,
-        KERNEL_BLOCK,
-    )
+    least = [least_exponent(each, GIVEN_AWAY / len(_GROUPS)) for each in counts]
+
+    def leave_small(start: int, stop: int) -> None:
+        used = used_words(gaussians[start:stop])
+        for index in used_groups:
+            values = used[:, _GROUPS[index]]
+            small = (exponents(values) < least[index]) & (values & 1 == 0)
+            usable[start:stop] &= ~small.any(axis=1)
+
+    in_blocks(leave_small, count, BLOCK)
     return usable
 
 
@@ -111,7 +113,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
     Uniform: chi-square of the frequencies of two overlapping bytes, and every bit given the field's exponent,
     the last bit and the bit below; over at most 20,000 Gaussians.
     """
-    if not len(usable) or usable.mean() < LEAST_USABLE:
+    if not len(usable) or usable.mean() < MIN_USABLE:
         share = usable.mean() if len(usable) else 0.0
         raise InputError(
             f"only {share:.0%} of the Gaussians have random low bits; the others hold short, repeated or "
@@ -127,7 +129,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
             name = FIELDS[column] if column < GEOMETRY else "f_rest"
             raise InputError(
                 f"the low bits of {name} are not random in this model (chi-square "
-                f"{ratio:.1f} per degree of freedom, 1 expected), so that nothing can be hidden in them: "
+                f"{ratio:.1f} per degree of freedom, 1 expected), and nothing can be hidden in them: "
                 "it was quantised, scaled or moved after its training"
             )
     for name, group in zip(_GROUP_NAMES, _GROUPS, strict=True):
@@ -136,7 +138,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
             if used[:, group].size and (chance := chance_of_bits(used[:, group], bits)) < _CHANCE:
                 raise InputError(
                     f"the low bits of {name} are not random in this model: they depend on the size of the "
-                    f"numbers or on each other (by chance that happens with p = {chance:.0e}), so that "
+                    f"numbers or on each other (by chance that happens with p = {chance:.0e}), and "
                     "nothing can be hidden in them"
                 )
 
@@ -152,6 +154,8 @@ def chance_of_bits(words: Words, bits: int) -> float:
 
     Exactly, of the most unlikely one given exponent, last bit and the bit below it; times how many there are.
     """
+    from scipy.special import bdtr  # takes long to load
+
     flat = words.ravel()
     context = exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
     chances: list[npt.NDArray[np.float64]] = []
@@ -171,44 +175,91 @@ def exponents(words: Words) -> npt.NDArray[np.uint8]:
     return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
 
 
+def near_equal(used: Words, layout: Layout) -> Flags:
+    """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
+
+    Or two pairs of one colour's harmonics, next to each other by size, equal. Decided by the bits that
+    embedding leaves, which by chance are so in some 4 % of all Gaussians. `used` [N, F]: of `used_words`.
+    """
+    high = ((used & np.uint32(0x7FFFFFFF)) >> layout.shifts).astype(np.int32)
+    harmonics = high[:, GEOMETRY:].reshape(len(used), -1, 3)
+    found = np.zeros(len(used), bool)
+    for values in (high[:, None, 0:3], harmonics, *([high[:, None, QUATS]] if layout.quats else [])):
+        for a, b in combinations(range(values.shape[2]), 2):
+            found |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
+    ordered = np.sort(harmonics.transpose(0, 2, 1), axis=2)
+    found |= (ordered[:, :, 1:] == ordered[:, :, :-1]).sum(axis=(1, 2)) >= _EQUAL_HARMONICS
+    return found
+
+
+def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: bool) -> Flags:
+    """[N] whether no number in use is subnormal or frequent, and few have many zeros; if `short`, none is."""
+    large = exponents(used)
+    fine = (large > 0) & (large < 254)
+    if short:
+        fine &= (used & _SHORT) != 0
+    for group, values in zip(_GROUPS, frequent, strict=True):
+        if len(values):
+            fine[:, group] &= ~np.isin(used[:, group], values)
+    zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
+    measured: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
+    return measured
+
+
+def _have_unit_length(used: Words) -> Flags:
+    """[N] whether a quaternion has it, and whatever its low bits are could have it."""
+    words = np.ascontiguousarray(used[:, QUATS])
+    near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
+    lengths = np.linalg.norm(np.where(near[:, None], words.view(np.float32).astype(np.float64), 0), axis=1)
+    unit: Flags = near & (np.abs(lengths - 1) < _EXACT)
+    return unit
+
+
 def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, bool]:
     """[N] whether neither the Gaussian, its scales, its quaternion nor two harmonics in a row occur twice.
 
     Of harmonics, those with numbers 1 and 2, 3 and 4 and so on, of all colours. Decided by the bits that
     embedding leaves. Then whether there are more short values than by chance.
     """
-    fields, count = words_of(gaussians)[1:], len(gaussians)
-    keys = np.empty((2 + layout.quats + (len(layout.mask) - GEOMETRY) // 6, count), np.uint64)
+    together = [slice(0, 3), *([QUATS] if layout.quats else [])]
+    together += [slice(first, first + 6) for first in range(GEOMETRY, len(layout.mask) - 5, 6)]
+    keys = np.empty((len(together) + 1, len(gaussians)), np.uint64)
     keys[-1] = names.view("<u8")[:, 0]
-    short = in_blocks(
-        lambda start, stop: kernels.triples(start, stop, *fields, layout.mask, layout.quats, keys[:-1]),
-        count,
-        KERNEL_BLOCK,
-    )
+
+    def hash_some(start: int, stop: int) -> int:
+        used = used_words(gaussians[start:stop])
+        high = used & ~layout.mask & ~np.uint32(1)
+        for key, columns in zip(keys, together, strict=False):
+            key[start:stop] = row_hashes(high[:, columns])
+        return int(((used & _SHORT == 0) & (exponents(used) > 0))[:, layout.columns].sum())
+
+    short = sum(in_blocks(hash_some, len(gaussians), BLOCK))
     apart = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
-    expected = count * len(layout.columns) / 2.0**_SHORT_BITS
-    return apart, bool(sum(short) > expected + 5 * (expected + 1) ** 0.5)
+    expected = len(gaussians) * len(layout.columns) / 2.0**_SHORT_BITS
+    return apart, short > expected + 5 * (expected + 1) ** 0.5
+
+
+def repeated(values: npt.NDArray[np.uint64]) -> Flags:
+    """[N] which of the values [N] occur at least twice."""
+    equal = _frequent(values, 2)
+    found = np.zeros(len(values), bool)
+    if len(equal):
+        found = equal[np.searchsorted(equal, values).clip(max=len(equal) - 1)] == values
+    return found
 
 
 def _frequent_values(gaussians: Gaussians) -> list[Words]:
     """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
-    scales, quats, opacities, sh = words_of(gaussians)[1:]
-    found = []
-    for words, first in ((scales, 0), (quats, 0), (opacities[:, None], 0), (sh, 3)):
-        copies = _unlikely_copies(words[:, first:].size)
-        flat = np.sort(crowded(words, first, copies))
-        found.append(
-            np.unique(flat[copies - 1 :][flat[copies - 1 :] == flat[: max(0, len(flat) - copies + 1)]])
-        )
-    return found
+    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
+    words = [each.detach().to("cpu", torch.float32).numpy().view(np.uint32) for each in fields]
+    return [_frequent(each.ravel(), _unlikely_copies(each.size)) for each in words]
 
 
-def _group_of_fields(count: int) -> npt.NDArray[np.int64]:
-    """[count] the group of each field."""
-    groups = np.zeros(count, np.int64)
-    for number, each in enumerate(_GROUPS):
-        groups[each] = number
-    return groups
+def _frequent(values: npt.NDArray[Any], copies: int) -> npt.NDArray[Any]:
+    """[V] those of the values [N] that occur so often or more, in ascending order."""
+    ordered = np.sort(values)
+    more = copies - 1
+    return np.unique(ordered[more:][ordered[more:] == ordered[: max(0, len(ordered) - more)]])
 
 
 def _unlikely_copies(count: int) -> int:

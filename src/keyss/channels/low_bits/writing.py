@@ -12,7 +12,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import as_strided
 
 from keyss.channels.base import Bytes, Content, Payload, RecordRequest, Records
-from keyss.channels.low_bits import kernels, parameters, spread
+from keyss.channels.low_bits import parameters, spread
 from keyss.channels.low_bits.cells import CellCipher
 from keyss.channels.low_bits.ciphers import (
     ASSOCIATED,
@@ -21,31 +21,30 @@ from keyss.channels.low_bits.ciphers import (
     parameter_cipher,
     payload_key,
 )
-from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, SALTS, Room, payload_parts
+from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, Carriers, payload_parts
 from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
+from keyss.channels.mixing import random_order
+from keyss.channels.writing import NOTICED
 from keyss.core.errors import KeyssWarning, UsageError
-from keyss.keys.derivation import DerivedKey, expand, fill, stream
+from keyss.keys.derivation import DerivedKey, expand, fill
 from keyss.keys.encryption import compressed_size, encrypt, encrypted_size
 from keyss.rendering.cpu.parallel import in_blocks
 
 _BLOCK = 1 << 13  # records at a time
-_NOTICED = (
-    "the secrets are too large, or too many, to lie in this cover as each would alone: who holds one of the "
-    "keys can notice that there are other secrets"
-)
 
 
 class Writer:
     """The low bits of carriers with identities `names` [C, 16], each of `width` bytes.
 
-    `entropy`: 32 bytes that nobody else knows. `salts`: of the model, which keys are derived with.
+    `entropy`: 32 bytes that nobody else knows.
     """
 
-    def __init__(self, names: Bytes, width: int, entropy: bytes, salts: list[bytes]) -> None:
+    def __init__(self, names: Bytes, width: int, entropy: bytes) -> None:
         self._entropy = entropy
-        self._salts = bytes(each[0] for each in salts).ljust(SALTS, b"\0")
-        self._room = Room(len(names), width)
-        self.order = self._shuffled("order", len(names))  # [C] carriers; what follows is in this order
+        self._room = Carriers(len(names), width)
+        self.order = random_order(
+            entropy, "low-bits/order", len(names)
+        )  # [C] carriers; what follows is in this order
         self._names = names[self.order]
         self.table = np.empty((len(names), width), np.uint8)
         fill(entropy, "low-bits/noise", self.table)
@@ -65,13 +64,13 @@ class Writer:
                 raise UsageError(spread.too_small(gaussians, usable, sizes[index], len(contents), width))
             self._next, end = start, start + carriers // parts[index]
             data_key = self._data_key(index)
-            packed = PayloadParameters(content.method, self._salts, sizes[index], plan).pack()
+            packed = PayloadParameters(content.method, sizes[index], plan).pack()
             self._header(keys, data_key, packed)
             encrypted = encrypt(payload_key(data_key), content.data, ASSOCIATED, size=sizes[index])
             self._whole(chunk_cipher(data_key, width), plan.encode(encrypted, end - self._next))
             start = end
         if not as_alone:
-            warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
+            warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
 
     def records(self, contents: Sequence[tuple[Sequence[DerivedKey], Records]]) -> None:
         """Headers in the first carriers, records in the others; see `layout`."""
@@ -83,7 +82,7 @@ class Writer:
         arrangement = self._room.arrangement(plans, requests)
         for index, (keys, content) in enumerate(contents):
             cells, size = content.plan.cells_per_carrier, content.records.shape[1]
-            packed = RecordParameters(content.method, self._salts, cells, size, content.header).pack()
+            packed = RecordParameters(content.method, cells, size, content.header).pack()
             self._header(keys, self._data_key(index), packed)
         carriers = np.arange(arrangement.header_carriers, self._room.carriers)
         divided = [i for i, plan in enumerate(plans) if plan.cells_per_carrier > 1]
@@ -92,7 +91,7 @@ class Writer:
         # untouched is random too.
         if divided:
             cells = plans[divided[0]].cells_per_carrier
-            free = self._shuffled("cells", cells * len(carriers))
+            free = random_order(self._entropy, "low-bits/cells", cells * len(carriers))
             touched = np.zeros(len(carriers), bool)
             for index in divided:
                 count = len(contents[index][1].records) + len(contents[index][1].copied)
@@ -106,7 +105,7 @@ class Writer:
             own, carriers = carriers[:count], carriers[count:]
             self._place(index, contents[index][1], own, np.zeros(count, np.int64))
         if not arrangement.as_alone:
-            warnings.warn(_NOTICED, KeyssWarning, stacklevel=4)
+            warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
 
     def _place(
         self, index: int, content: Records, rows: npt.NDArray[np.int64], slots: npt.NDArray[np.int64]
@@ -139,12 +138,6 @@ class Writer:
         own, which = rows[start:stop], slots[start:stop]
         encrypted = cipher.encrypt(self._names[own], records[chosen[start:stop]], which)
         cells[own, which, : cipher.cell_bytes] = encrypted
-
-    def _shuffled(self, label: str, count: int) -> npt.NDArray[np.int64]:
-        """[count] the numbers from 0 on in random order."""
-        rows = np.empty(count, np.int64)
-        kernels.order(np.frombuffer(stream(self._entropy, f"low-bits/{label}", 8 * count), "<u8"), rows)
-        return rows
 
     def _data_key(self, index: int) -> bytes:
         return expand(self._entropy, f"low-bits/data-key/{index}", DATA_KEY_BYTES)

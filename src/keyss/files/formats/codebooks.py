@@ -14,7 +14,7 @@ from keyss.files.formats.common import Bytes, Floats, Shorts
 SIZE = 256  # numbers of a codebook
 _ROUNDS = 50
 _BINS = 1024  # of as many values each, in which densities are measured
-_LEAST_WIDTH = 1e-6  # of such a bin, as a share of the whole: values may be equal
+_MIN_WIDTH = 1e-6  # of such a bin, as a share of the whole: values may be equal
 _AXES = 12  # of the largest spread, by which groups are split
 _SAMPLE = 50_000  # vectors that tell which they are
 
@@ -31,7 +31,7 @@ def codebook_of(values: Floats) -> Floats:
         padded: Floats = np.pad(distinct, (0, SIZE - len(distinct)), mode="edge").astype(np.float32)
         return padded
     at = np.unique(np.linspace(0, len(ordered) - 1, _BINS + 1).astype(int))
-    width = np.maximum(np.diff(ordered[at]), _LEAST_WIDTH * (distinct[-1] - distinct[0]))
+    width = np.maximum(np.diff(ordered[at]), _MIN_WIDTH * (distinct[-1] - distinct[0]))
     density = np.diff(at) / width
     # The best density of numbers is the third root of the density that counts (Panter and Dite 1951).
     share = np.concatenate([[0.0], np.cumsum(width * density ** (1 / 6))])

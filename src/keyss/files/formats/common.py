@@ -13,7 +13,7 @@ import torch
 from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
-from keyss.files.streams import MOST_BYTES, StandardInput
+from keyss.files.streams import MAX_BYTES, StandardInput
 
 Bytes = npt.NDArray[np.uint8]
 Shorts = npt.NDArray[np.uint16]
@@ -75,9 +75,9 @@ def reason(error: Exception) -> str:
 def read_whole(source: Path | StandardInput) -> bytes:
     """All bytes of a model's file. Raises InputError for more than 4 GiB, and OSError."""
     with source.open("rb") as file:
-        data = file.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
-        raise InputError(f"{source}: expected at most {MOST_BYTES:,} bytes, found more")
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise InputError(f"{source}: expected at most {MAX_BYTES:,} bytes, found more")
     return data
 
 

@@ -40,9 +40,9 @@ _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _FLOAT, _BYTE, _ARRAY = 5126, 5121, 34962
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
 _COUNTS = (1, 3, 5, 7)  # coefficients of each degree
-_MOST_DEPTH = 64  # of nodes in nodes
-_MOST_PARTS = 64  # that show Gaussians
-_LEAST_BYTES = 16  # that a Gaussian takes
+_MAX_DEPTH = 64  # of nodes in nodes
+_MAX_PARTS = 64  # that show Gaussians
+_MIN_BYTES = 16  # that a Gaussian takes
 
 
 def read_glb(data: bytes) -> Gaussians:
@@ -52,14 +52,14 @@ def read_glb(data: bytes) -> Gaussians:
     """
     document, binary = _chunks(data)
     parts: list[Gaussians] = []
-    room = len(data) // _LEAST_BYTES  # Gaussians; one that is shown twice counts twice
+    room = len(data) // _MIN_BYTES  # Gaussians; one that is shown twice counts twice
     for placed, mesh in _placed(document):
         for primitive in mesh.primitives:
             if EXTENSION not in primitive.extensions:
                 continue
             model = _gaussians(document, primitive, binary)
             room -= len(model)
-            if room < 0 or len(parts) == _MOST_PARTS:
+            if room < 0 or len(parts) == _MAX_PARTS:
                 raise InputError("damaged glTF: the same Gaussians over and over")
             parts.append(_moved(model, placed))
     if not parts:
@@ -152,7 +152,7 @@ def _placed(document: Document) -> Iterable[tuple[Doubles, Mesh]]:
         seen: set[int] = set()
         while left:
             index, above, depth = left.pop()
-            if index in seen or depth > _MOST_DEPTH or index < 0:
+            if index in seen or depth > _MAX_DEPTH or index < 0:
                 raise InputError("damaged glTF: its nodes are no tree")
             seen.add(index)
             node = document.nodes[index]

@@ -44,7 +44,7 @@ from keyss.files.streams import StandardInput
 _FINEST = 65535  # a position's largest code
 _LARGEST = 252  # of the fourth byte of a quaternion: w, x, y or z is not stored
 _ROW = 64  # vectors of the palette in a row of pixels
-_MOST_LABELS = 65536
+_MAX_LABELS = 65536
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def parse_files(file: Callable[[str], bytes], size: int) -> SogCodes:
         sh_codebook = _codebook(meta.shN.codebook)
         pair = image(meta.shN.files, 1)
         labels = _joined(pair[:, 0], pair[:, 1])
-        if not int(labels.max()) < meta.shN.count <= _MOST_LABELS:
+        if not int(labels.max()) < meta.shN.count <= _MAX_LABELS:
             raise InputError("damaged SOG: labels beyond the end of its palette")
         size = -(-meta.shN.count // _ROW) * _ROW
         rows = bundle.pixels(file(meta.shN.files[0]), size * k, width=_ROW * k)
@@ -194,7 +194,7 @@ def quantise(model: Gaussians) -> SogCodes:
         np.zeros(n, np.uint16),
     )
     if k:
-        size = min(_MOST_LABELS, 2 ** int(math.log2(n)))
+        size = min(_MAX_LABELS, 2 ** int(math.log2(n)))
         vectors, labels = palette_of(rest.reshape(n, 3 * k), size)
         sh_codebook = codebook_of(vectors)
         palette = nearest(sh_codebook, vectors).reshape(-1, k, 3)

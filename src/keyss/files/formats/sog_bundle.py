@@ -17,10 +17,10 @@ from PIL import Image
 from keyss.core.errors import InputError
 from keyss.files.formats.common import Bytes, reason
 from keyss.files.reading import read_file
-from keyss.files.streams import MOST_BYTES
+from keyss.files.streams import MAX_BYTES
 
-_MOST_META_BYTES = 1 << 20
-_MOST_MEMBERS = 64
+_MAX_META_BYTES = 1 << 20
+_MAX_MEMBERS = 64
 _SMALL_IMAGE = 1 << 16  # pixels; larger ones may have four times the pixels that are needed
 _DATE = (1980, 1, 1, 0, 0, 0)  # so that equal models make equal files
 
@@ -102,10 +102,8 @@ def opened(data: bytes) -> zipfile.ZipFile:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except _BROKEN as error:
         raise InputError(f"not a whole SOG: {reason(error)}") from error
-    if len(archive.infolist()) > _MOST_MEMBERS:
-        raise InputError(
-            f"expected a SOG of at most {_MOST_MEMBERS} files, found {len(archive.infolist()):,}"
-        )
+    if len(archive.infolist()) > _MAX_MEMBERS:
+        raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(archive.infolist()):,}")
     return archive
 
 
@@ -116,7 +114,7 @@ def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
     def read(name: str) -> bytes:
         try:
             info = archive.getinfo(name)
-            most = max(_MOST_META_BYTES, 2 * size)
+            most = max(_MAX_META_BYTES, 2 * size)
             if info.file_size > most:
                 raise InputError(f"damaged SOG: {name[:80]!r} unpacks to {info.file_size:,} bytes")
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -142,7 +140,7 @@ def beside(meta: Path) -> Callable[[str], bytes]:
         path = meta if name == "meta.json" else meta.parent / name
         if Path(name).name != name or "\0" in name or not path.is_file():
             raise InputError(f"not a whole SOG: there is no {name[:80]!r} beside it")
-        return read_file(path, _MOST_META_BYTES if path is meta else MOST_BYTES)
+        return read_file(path, _MAX_META_BYTES if path is meta else MAX_BYTES)
 
     return read
 

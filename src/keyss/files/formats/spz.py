@@ -34,7 +34,7 @@ from keyss.files.formats.spz_container import Header, pack, unpack
 
 VERSION = 3  # with 10-bit rotations, and read by more programs than the newer 4
 _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as the format's own library writes
-_MOST = 2**23 - 1  # of a position's code
+_MAX = 2**23 - 1  # of a position's code
 _COLOR_SCALE = 0.15  # f_dc times this, plus 0.5, is 0 to 1
 _MAGNITUDE = 2**9 - 1  # a part of a rotation has a sign and 9 bits
 
@@ -173,11 +173,11 @@ def write_spz(model: Gaussians) -> bytes:
 def _fractional_bits(means: Floats) -> int:
     """The usual number of them, or as many as positions leave room for."""
     extent = float(np.abs(means).max())
-    if not extent < _MOST:
+    if not extent < _MAX:
         raise OutputError(
-            f"SPZ holds positions up to {_MOST:,} world units, and this model reaches {extent:.3g}"
+            f"SPZ holds positions up to {_MAX:,} world units, and this model reaches {extent:.3g}"
         )
-    return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < _MOST)
+    return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < _MAX)
 
 
 def _quantised_harmonics(rest: Floats, sh1_bits: int, sh_rest_bits: int) -> Bytes:

@@ -17,8 +17,8 @@ from keyss.files.formats.common import Bytes, check_count, check_sh_degree, reas
 
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
 EXTENSIONS = 2  # the flag that there are some
-_MOST_EXTENSION_BYTES = 1 << 20
-_MOST_FRACTIONAL_BITS = 24
+_MAX_EXTENSION_BYTES = 1 << 20
+_MAX_FRACTIONAL_BITS = 24
 _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
 _ENTRY = struct.Struct("<QQ")  # of the table: bytes packed and unpacked
@@ -78,7 +78,7 @@ def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
         if version not in (2, 3):
             raise InputError(f"expected SPZ of version 2 or 3 in gzip data, found {version}")
         header = _checked(Header(version, count, degree, bits, flags, b""), len(data))
-        most = sum(header.sizes) + _MOST_EXTENSION_BYTES
+        most = sum(header.sizes) + _MAX_EXTENSION_BYTES
         body = stream.decompress(stream.unconsumed_tail, most)
         if not stream.eof:  # gzip's checksum comes last, and is looked at then
             body += stream.decompress(stream.unconsumed_tail, 1)
@@ -133,9 +133,9 @@ def _zstd(packed: bytes, size: int) -> Bytes:
 def _checked(header: Header, size: int) -> Header:
     check_sh_degree(header.sh_degree)
     check_count(header.count, size)
-    if header.fractional_bits > _MOST_FRACTIONAL_BITS:
+    if header.fractional_bits > _MAX_FRACTIONAL_BITS:
         raise InputError(
-            f"expected positions of at most {_MOST_FRACTIONAL_BITS} fractional bits, "
+            f"expected positions of at most {_MAX_FRACTIONAL_BITS} fractional bits, "
             f"found {header.fractional_bits}"
         )
     return header

@@ -1,1 +1,1 @@
-"""What is to be seen of a secret without its key: attacks, beside the same attacks on plain models."""
+"""Attacks without the key, and the same attacks on plain models."""

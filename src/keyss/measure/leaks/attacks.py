@@ -1,4 +1,4 @@
-"""The attacks, by name: everything that somebody without the key would look at, of any model."""
+"""Attacks by name: changes of a model that may show a secret without its key."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from keyss.channels.appended import is_appended
+from keyss.channels import is_appended
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
 from keyss.fitting.image_metrics import subsample_views
@@ -20,11 +20,11 @@ from keyss.keys import random_embeddings
 from keyss.measure.leaks import views
 from keyss.rendering.contributions import contributions
 
-THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures have 0.05
+THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures use 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing
 DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
-SEARCH_SAMPLE = 1000  # Gaussians that embeddings are searched on; more find no other
+SEARCH_SAMPLE = 1000  # Gaussians used to search embeddings; more do not change the result
 
 Shown = Iterator[tuple[str, Gaussians]]
 Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.base.Opened.decode`
@@ -33,20 +33,17 @@ Parameter = str | int | float | list[float]
 
 @dataclass(frozen=True)
 class Attack:
-    """Something to try on a model: it gives models to render, the same labels for every model."""
+    """One attack: makes models to render, with the same labels for every model."""
 
     name: str
     sentence: str
     parameters: dict[str, Parameter]
-    show: Callable[[Gaussians], Shown]  # labels and what is rendered, as many as somebody would try
-    with_key: bool = False  # no attack: shows what there is to find
+    show: Callable[[Gaussians], Shown]  # labelled models to render, one per variant
+    with_key: bool = False  # not an attack, but the reference: the revealed secret
 
 
 def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[Attack]:
-    """The attacks of somebody who has the published file, and photos of the cover.
-
-    Of its training views at most `cover_views` are used, evenly spread.
-    """
+    """Attacks with the published file and photos of the cover: at most `cover_views` training views."""
     cameras = [view.camera for view in subsample_views(cover.train, cover_views)]
     return [
         Attack(
@@ -90,16 +87,15 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
 
 
 def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed: int = 0) -> Attack:
-    """What somebody sees who got a secret's decoder and all that is encrypted with it, but not the key.
+    """The attack with a secret's decoder and everything encrypted with it, but without the key.
 
-    `decode`: see `keyss.methods.base.Opened`. Where embeddings get no gradient, the search shows no more than
-    random embeddings do.
+    `decode`: see `keyss.methods.base.Opened`. Without a gradient in the embedding, the search is random.
     """
 
     def show(model: Gaussians) -> Shown:
         found = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
-            search = partial(search_embeddings, decode, model, most=SEARCH_SAMPLE, balance=balance)
+            search = partial(search_embeddings, decode, model, limit=SEARCH_SAMPLE, balance=balance)
             found[name] = search(restarts=restarts, steps=steps, seed=seed)
         for name, embeddings in found.items():
             for index, embedding in enumerate(embeddings, start=1):
@@ -120,26 +116,25 @@ def search_embeddings(
     *,
     restarts: int = 8,
     steps: int = 150,
-    most: int = 4000,
+    limit: int = 4000,
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
-    """[restarts, 64] unit vectors under which the decoder seems to show another scene, the best first.
+    """[restarts, 64] unit vectors for which the decoder seems to show another scene, the best first.
 
     In the published scheme the key is a vector that enters the decoder's first layers. Whoever has the
-    network can look for the vector under which it exchanges most, without any idea of the secret.
-    Gradient ascent from random starts on the mean change of the opacities, less `balance` times the change of
-    their mean: what makes some visible and as much of others invisible is a scene in place of a scene, while
-    what only adds or only removes is not. With 0 all change counts, which finds a secret that needs more
-    Gaussians than the cover. Of larger models a random subset of `most` Gaussians is decoded: a decoder that
-    divides opacities by their norm over the model sees larger ones then, which are small all the same. What
-    was appended to the model, no decoder changes: it is left out. Where the decoded opacities have no
-    gradient in the embedding, the random starts come back.
+    network can search for the vector that exchanges most, without knowing the secret: gradient ascent from
+    random starts on the mean change of the opacities, less `balance` times the change of their mean. Making
+    some Gaussians visible and as many others invisible replaces one scene by another; only adding or removing
+    does not. `balance=0` counts all change, which finds a secret that needs more Gaussians than the cover.
+
+    A random subset of `limit` Gaussians is decoded; appended Gaussians, which no decoder changes, are
+    ignored. Returns the random starts if the decoded opacities have no gradient in the embedding.
     """
     generator = torch.Generator().manual_seed(seed)
     part = stego.detach()[~is_appended(stego)]
-    if len(part) > most:
-        part = part[torch.randperm(len(part), generator=generator)[:most].to(stego.device)]
+    if len(part) > limit:
+        part = part[torch.randperm(len(part), generator=generator)[:limit].to(stego.device)]
 
     def exchanged(direction: Tensor) -> Tensor:
         change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities
@@ -164,10 +159,10 @@ def search_embeddings(
 
 
 def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
-    """What there is to find: the secret in the cover's frame, as its key reveals it in a model."""
+    """The reference: the secret in the cover's frame, as its key reveals it."""
     return Attack(
         "with the key",
-        "No attack: what there is to find.",
+        "Not an attack: what there is to find.",
         {},
         lambda model: iter([("revealed", reveal(model))]),
         with_key=True,
@@ -177,7 +172,7 @@ def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
 def _of_faint(
     change: Callable[[Gaussians], Gaussians], *, also_of_all: bool = False
 ) -> Callable[[Gaussians], Shown]:
-    """A change of the Gaussians below each opacity alone, and of all."""
+    """Applies a change to the Gaussians below each threshold, and optionally to all."""
 
     def show(model: Gaussians) -> Shown:
         for threshold in THRESHOLDS:

@@ -1,4 +1,4 @@
-"""Looking for a secret without its key, and how much of what is seen is the secret's."""
+"""Attacks on a stego model and on plain models, and how much of the secret they show."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _GAP = 4  # pixels between the parts of a picture
 
 @dataclass(frozen=True)
 class AttackResult:
-    """What an attack shows of a secret, beside what it shows of control models.
+    """What an attack shows of a secret in the stego model and in control models.
 
-    An attack has variants: thresholds, shares, clusters. Scores are each the largest over them, for the
-    attacker knows when he sees it; `best` is the one variant that shows most of the secret's shapes.
+    An attack has variants: thresholds, shares, clusters. Each score is the maximum over them, since an
+    attacker recognises the secret; `best` is the variant that shows most of its shapes.
     """
 
     attack: str
     sentence: str
     parameters: dict[str, Parameter]
-    with_key: bool  # no attack: shows what there is to find
-    views: int  # variants that the attacker looks at
-    best: str  # the variant with the largest `LeakScores.evidence`: it is pictured, and gets the verdict
+    with_key: bool  # not an attack, but the revealed secret
+    views: int  # number of variants
+    best: str  # the variant with the largest `LeakScores.evidence`, which is pictured and judged
     best_leak: LeakScores  # its scores less `control`
     scores: LeakScores
-    control: LeakScores  # the same on the control models, their mean
-    control_max: LeakScores  # the largest on any of them
-    leak: LeakScores  # `scores` less `control`: more views are thus no more leak
+    control: LeakScores  # the mean over the control models
+    control_max: LeakScores  # the maximum over them
+    leak: LeakScores  # `scores` less `control`, which cancels the number of variants
     picture: str | None = None  # name of a file, in an audit
 
 
@@ -53,13 +53,13 @@ def look_for_secret(
     *,
     test_views: int = 8,
 ) -> tuple[list[AttackResult], dict[str, Tensor]]:
-    """How well attacks show the secret, seen from its own test cameras where it lies, against its photos.
+    """How well attacks show the secret, from its own test cameras, against its photos.
 
-    `stego` and `controls`, one or more plain models of the cover, are in the cover's frame, `secret` in its
-    own, and `frame` leads from there into the cover's. Of the test views at most `test_views` are used. The
-    strictest assumption: the attacker stands where the secret was photographed. Pictures are uint8
-    [H, W, 3], by the attack's name: its best variant, from the first test camera, of stego and of the first
-    control, and the photo. Raises UsageError for no control and for a secret without test views.
+    The strictest assumption: the attacker looks from where the secret was photographed. `stego` and
+    `controls`, plain models of the cover, are in the cover's frame; `frame` leads from the frame of `secret`
+    into it. At most `test_views` test views are used. Images are uint8 [H, W, 3] by the attack's name: its
+    best variant on the stego model and on the first control, from the first test camera, and the photo.
+    Raises UsageError without a control or without test views.
     """
     if not controls:
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
@@ -98,7 +98,7 @@ def look_for_secret(
 
 @dataclass(frozen=True)
 class _Variant:
-    """One of the things that an attack makes of a model."""
+    """One variant of an attack on a model."""
 
     label: str
     scores: LeakScores
@@ -107,7 +107,7 @@ class _Variant:
 
 @torch.no_grad()
 def _look(attack: Attack, model: Gaussians, views: Sequence[View], background: Tensor) -> list[_Variant]:
-    """All that the attack shows of a model."""
+    """All variants of an attack on a model."""
     found = []
     for label, shown in attack.show(model):
         image = render(shown, views[0].camera, background).clamp(0, 1)
@@ -117,5 +117,5 @@ def _look(attack: Attack, model: Gaussians, views: Sequence[View], background: T
 
 
 def _beside(images: Sequence[Tensor]) -> Tensor:
-    """The images [H, W, 3] in a row, with white between."""
+    """The images [H, W, 3] side by side, with white gaps."""
     return torch.cat([F.pad(image.cpu(), (0, 0, 0, _GAP), value=255) for image in images], dim=1)[:, :-_GAP]

@@ -1,4 +1,4 @@
-"""How much of a photo a picture shows, also to somebody who may set exposure and colours as he likes."""
+"""How much of a photo an image shows, also after the best adjustment of exposure and colours."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from keyss.fitting.image_metrics import psnr
 from keyss.fitting.losses import Target, ssim
 from keyss.rendering import render
 
-# What a leak may come to before the secret's shapes show, and not haze: those after the fit of colours.
-PSNR_LIMIT = 1.0  # dB nearer to the secret's photos than a control comes
+# Limits of a leak, in scores that respond to the secret's shapes and not to haze.
+PSNR_LIMIT = 1.0  # dB closer to the secret's photos than a control
 SSIM_LIMIT = 0.05
 GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above a control's
 
-COARSE = 64  # pixels of the longer side, at which shapes that are slightly out of place still count
+COARSE = 64  # pixels of the longer side: shapes that are slightly misplaced still match
 
 
 @dataclass(frozen=True)
 class LeakScores:
-    """How well pictures show photos: means over views, or differences of such.
+    """How well images show photos: means over views, or differences of such means.
 
-    Without the fit of colours any light cloud is nearer to a photo than black: plain PSNR and SSIM tell that
-    something is seen, not that it is the secret.
+    Without the colour fit any bright cloud is closer to a photo than black: plain PSNR and SSIM show that
+    something is visible, not that it is the secret.
     """
 
     psnr: float  # dB
@@ -41,14 +41,14 @@ class LeakScores:
 
     @staticmethod
     def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
-        """Each score by a function of that of all rows."""
+        """A function of each score over all rows."""
         return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
 
     def evidence(self) -> float:
-        """Of a leak, how much of the limits it takes: above 1 the secret's shapes show.
+        """A leak relative to its limits: above 1 the secret's shapes show.
 
-        The largest share of PSNR and SSIM after the fit of colours, and of the coarse gradients. What haze
-        alone makes larger does not count.
+        The largest of PSNR and SSIM after the colour fit and of the coarse gradients, which haze alone does
+        not increase.
         """
         return max(
             self.psnr_fitted / PSNR_LIMIT,
@@ -63,9 +63,9 @@ class LeakScores:
 def gradient_correlation(image: Tensor, reference: Tensor) -> float:
     """Normalised cross-correlation of the brightness gradients of two [H, W, 3] images, -1 to 1.
 
-    Central differences of the mean of the channels; sum of g . h over the pixels within, divided by the root
-    of the product of the sums of |g|^2 and |h|^2. Blind to brightness and contrast; 1 for an image itself,
-    -1 for its negative, 0 for one that is constant.
+    Of central differences of the mean channel: the sum of g . h over inner pixels, divided by the root of the
+    product of the sums of |g|^2 and |h|^2. Invariant to brightness and contrast; 1 for equal images, -1 for
+    the negative, 0 for a constant image.
     """
     first, second = _gradients(image), _gradients(reference)
     size = (first.square().sum() * second.square().sum()).sqrt()
@@ -73,7 +73,7 @@ def gradient_correlation(image: Tensor, reference: Tensor) -> float:
 
 
 def coarse(image: Tensor) -> Tensor:
-    """[h, w, 3] the image shrunk to COARSE pixels on its longer side, each a mean; a small one as it is."""
+    """[h, w, 3] the image shrunk to COARSE pixels on its longer side by averaging; never enlarged."""
     height, width = image.shape[:2]
     scale = min(1.0, COARSE / max(height, width))
     size = (max(1, round(scale * height)), max(1, round(scale * width)))
@@ -81,9 +81,9 @@ def coarse(image: Tensor) -> Tensor:
 
 
 def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
-    """[H, W, 3] an image with the best exposure: a factor, of either sign, and an offset for each channel.
+    """[H, W, 3] the image with the factor, of either sign, and offset per channel that fit best.
 
-    Least squares. A channel that is constant becomes the mean of the reference's.
+    Least squares. A constant channel becomes the mean of the reference's.
     """
     centred, target = image - image.mean(dim=(0, 1)), reference - reference.mean(dim=(0, 1))
     variance = centred.square().sum(dim=(0, 1))
@@ -93,7 +93,7 @@ def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
 
 @torch.no_grad()
 def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> LeakScores:
-    """How well a model shows the views' photos."""
+    """How well a model shows the photos of views."""
     rows = []
     for view in views:
         photo = view.image.to(model.device).float() / 255

@@ -1,9 +1,8 @@
-"""What somebody renders who changes a model to find transparent or unusual Gaussians in it.
+"""Changes of a model that make transparent or unusual Gaussians visible.
 
-Transparent Gaussians may be those of a secret; figures 2 and 6 of the KeySS paper show this attack. And
-whatever keeps a second scene in attributes that do not render (lengths of quaternions, harmonics of
-transparent Gaussians), or trains it otherwise than the first, may have left a group of its own among them.
-Functions change nothing in place.
+Transparent Gaussians may belong to a secret (KeySS, figures 2 and 6). A second scene that is stored in
+attributes that do not render (lengths of quaternions, harmonics of transparent Gaussians), or trained
+differently, may form a group of its own. Functions change nothing in place.
 """
 
 from __future__ import annotations
@@ -17,18 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import Gaussians
+from keyss.core import Gaussians, import_extra
 
 Attribute = Literal["quaternion length", "scale", "SH energy"]
 Side = Literal["low", "high"]
 
-OPAQUE = 0.99  # as much as one Gaussian covers in 3DGS
-_BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, so that no outlier sets the scale
+OPAQUE = 0.99  # the maximum alpha of a Gaussian in 3DGS
+_BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, robust to outliers
 _TO_SIGMA = 1.4826  # from a median absolute deviation to the standard deviation of a normal distribution
-_LEAST_SPREAD = 1e-3  # of a logarithm: attributes that are equal but for rounding have no outliers
-_LEAST_SIZE = 1e-12
-_CLUSTER_SAMPLE = 5000  # Gaussians that clusters are found on
-_LEAST_CLUSTERED = 10
+_MIN_SPREAD = 1e-3  # of a logarithm: attributes that differ by rounding have no outliers
+_MIN_LENGTH = 1e-12
+_CLUSTER_SAMPLE = 5000  # Gaussians used to find clusters
+_MIN_CLUSTERED = 10
 
 
 def opaque(model: Gaussians) -> Gaussians:
@@ -38,12 +37,12 @@ def opaque(model: Gaussians) -> Gaussians:
 
 
 def faint(model: Gaussians, below: float) -> Gaussians:
-    """The Gaussians with opacities under `below` alone, as they are."""
+    """Only the Gaussians with opacities under `below`, unchanged."""
     return model[model.opacities < below]
 
 
 def rescaled(model: Gaussians) -> Gaussians:
-    """Opacities multiplied by one factor that makes the largest ones OPAQUE."""
+    """Opacities times the factor that makes the largest ones OPAQUE."""
     if len(model) == 0:
         return model
     opacities = model.opacity_logits.double().sigmoid()
@@ -53,9 +52,9 @@ def rescaled(model: Gaussians) -> Gaussians:
 
 
 def matched(model: Gaussians, below: float) -> Gaussians:
-    """The Gaussians with opacities under `below`, with those of the others: the least opaque gets the least.
+    """The Gaussians with opacities under `below`, with the opacities of the others by rank.
 
-    It undoes whatever made opacities small without changing their order.
+    Undoes any monotone reduction of opacities.
     """
     chosen = model.opacities < below
     part, others = model[chosen], model.opacity_logits[~chosen].sort().values
@@ -72,7 +71,7 @@ def inverted(model: Gaussians) -> Gaussians:
 
 
 def least_contributing(model: Gaussians, weights: Tensor, share: float) -> Gaussians:
-    """The `share` of the Gaussians that add least to what is seen: `weights` [N] of `contributions`."""
+    """The `share` of the Gaussians that contribute least: `weights` [N] of `contributions`."""
     return model[weights.argsort(stable=True)[: round(share * len(model))]]
 
 
@@ -84,44 +83,42 @@ def measured(model: Gaussians, attribute: Attribute) -> Tensor:
     size = (
         model.quats.norm(dim=1) if attribute == "quaternion length" else model.sh[:, 1:].square().sum((1, 2))
     )
-    logarithm: Tensor = size.clamp_min(_LEAST_SIZE).log()
+    logarithm: Tensor = size.clamp_min(_MIN_LENGTH).log()
     return logarithm
 
 
 def outliers(model: Gaussians, attribute: Attribute, side: Side, threshold: float) -> Gaussians:
-    """Made opaque, the Gaussians alone whose robust z-score in an attribute is beyond the threshold.
+    """Only the Gaussians whose robust z-score in an attribute is beyond the threshold, made opaque.
 
-    The score is the distance from the model's own median, in standard deviations as its median absolute
-    deviation tells them; on the low side it is negated.
+    The score is the distance from the model's median over the standard deviation estimated by the median
+    absolute deviation, negated on the low side.
     """
     if len(model) == 0:
         return model
     values = measured(model, attribute)
     middle = values.median()
     spread = _TO_SIGMA * (values - middle).abs().median()
-    score = (values - middle) / spread.clamp_min(_LEAST_SPREAD)
+    score = (values - middle) / spread.clamp_min(_MIN_SPREAD)
     return opaque(model[(score if side == "high" else -score) > threshold])
 
 
 def clusters(model: Gaussians, count: int, seed: int = 0) -> list[Gaussians]:
-    """Made opaque, each of `count` groups of like Gaussians alone, the largest first.
+    """`count` groups of similar Gaussians, each alone and made opaque, the largest first.
 
-    A mixture of normal distributions of opacity logit, sorted log scales, constant colour, and the logarithms
-    of quaternion length and SH energy, all standardised. Positions are left out: they would cut the scene in
-    pieces. A model of fewer than ten Gaussians is one group, and the others are empty.
+    A Gaussian mixture of opacity logit, sorted log scales, constant colour, and the logarithms of quaternion
+    length and SH energy, all standardised. Without positions, which would cut the scene into pieces. A model
+    of fewer than ten Gaussians is one group, and the others are empty.
     """
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.mixture import GaussianMixture
-    from threadpoolctl import threadpool_limits
-
-    if len(model) < _LEAST_CLUSTERED:
+    if len(model) < _MIN_CLUSTERED:
         return [opaque(model)] + [model[:0]] * (count - 1)
     rows = _standardised(model).cpu().double().numpy()
     some = np.random.default_rng(seed).permutation(len(rows))[:_CLUSTER_SAMPLE]
-    mixture = GaussianMixture(count, reg_covar=1e-3, random_state=seed)
-    # The matrices are 9 by 9: waking threads for each takes a hundred times as long as the work.
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # an unsettled one tells groups apart as well
+    mixtures = import_extra("sklearn.mixture", "audit", "find clusters")
+    threadpoolctl = import_extra("threadpoolctl", "audit", "find clusters")
+    mixture = mixtures.GaussianMixture(count, reg_covar=1e-3, random_state=seed)
+    # For matrices of 9 x 9, starting threads takes a hundred times as long as the work.
+    with threadpoolctl.threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a mixture that has not converged is good enough
         mixture.fit(rows[some])
     labels = torch.from_numpy(mixture.predict(rows)).to(model.device)
     order = torch.bincount(labels, minlength=count).argsort(descending=True, stable=True)
@@ -138,5 +135,5 @@ def _standardised(model: Gaussians) -> Tensor:
         measured(model, "SH energy")[:, None],
     ]
     features = torch.cat(columns, dim=1)
-    spread = features.std(dim=0, correction=0).clamp_min(_LEAST_SPREAD)
+    spread = features.std(dim=0, correction=0).clamp_min(_MIN_SPREAD)
     return (features - features.mean(dim=0)) / spread

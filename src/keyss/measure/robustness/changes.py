@@ -1,7 +1,6 @@
-"""Changes of a published model: what happens to files, and what somebody does who has photos of the cover.
+"""Changes of a published model: what happens to files, and attacks with photos of the cover.
 
-Each is a pure function from `Gaussians` to `Gaussians`: the same change of the same model gives the same
-numbers, for whatever is random follows from its seed.
+Each is a pure function from `Gaussians` to `Gaussians`; all randomness follows from its seed.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ from keyss.rendering.contributions import contributions
 _FIELDS = {"position": "means", "log scale": "log_scales", "quaternion": "quats"}
 _FIELDS |= {"logit opacity": "opacity_logits"}
 NOISY = (*_FIELDS, "colour", "harmonics")
-VIEWS = 64  # in which purification looks for what is used
+VIEWS = 64  # used by purification
 
 
 @dataclass(frozen=True)
 class Change:
-    """Something that may become of a model. Raises BackendError when called without a tool that it needs."""
+    """One change of a model. Raises BackendError when called without a tool that it needs."""
 
     attack: str  # changes of one attack differ in strength only
     strength: float
     unit: str  # of the strength
-    sentence: str  # what it does, for people
+    sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
-    seed: int | None = None  # what its randomness follows from, None where nothing is random
+    seed: int | None = None  # None if nothing is random
 
     def __call__(self, model: Gaussians) -> Gaussians:
         return self.apply(model)
@@ -54,7 +53,7 @@ def random_pruning(share: float, seed: int = 0) -> Change:
         order = torch.randperm(len(model), generator=_generator("pruning", seed))
         return model[order[_removed(share, model) :].sort().values.to(model.device)]
 
-    sentence = f"{share:.0%} of the Gaussians, drawn at random, are removed."
+    sentence = f"A random {share:.0%} of the Gaussians are removed."
     return Change("random pruning", share, "share removed", sentence, apply, seed)
 
 
@@ -74,15 +73,15 @@ def noise(attribute: str, strength: float, seed: int = 0) -> Change:
     """Add normal noise to one attribute of every Gaussian; `attribute` is one of NOISY.
 
     Its standard deviation is `strength` times the attribute's spread: per component, half the distance
-    between the quantiles 0.159 and 0.841, which of normal numbers is their standard deviation and does not
-    mind a few Gaussians far away. Raises UsageError for another attribute.
+    between the quantiles 0.159 and 0.841, a robust standard deviation. Raises UsageError for another
+    attribute.
     """
     if attribute not in NOISY:
         raise UsageError(f"noise: expected one of {', '.join(NOISY)}, got {attribute!r}")
 
     def noisy(values: Tensor) -> Tensor:
-        drawn = torch.randn(values.shape, generator=_generator(f"noise on {attribute}", seed)).to(values)
-        return values + strength * spread(values) * drawn
+        random = torch.randn(values.shape, generator=_generator(f"noise on {attribute}", seed)).to(values)
+        return values + strength * spread(values) * random
 
     def apply(model: Gaussians) -> Gaussians:
         if attribute in _FIELDS:
@@ -103,7 +102,7 @@ def spread(values: Tensor) -> Tensor:
 
 
 def cropping(seed: int = 0) -> Change:
-    """Keep the half of the Gaussians on one side of a plane, whose direction is drawn at random."""
+    """Keep the half of the Gaussians on one side of a plane with a random direction."""
 
     def apply(model: Gaussians) -> Gaussians:
         direction = torch.randn(3, generator=_generator("cropping", seed)).to(model.device)
@@ -137,15 +136,15 @@ def half_floats() -> Change:
 
 
 def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
-    """Train on with the cover's photos, as plain 3DGS is trained, without density control."""
-    sentence = f"Training goes on with the cover's photos for {steps} steps."
+    """Continue training on the cover's photos, as plain 3DGS without density control."""
+    sentence = f"Training continues on the cover's photos for {steps} steps."
     return Change(
         "fine-tuning", steps, "steps", sentence, lambda model: refined(model, cover, steps, seed), seed
     )
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
-    """Prune what the cover's training views do not use, then train on: after GSPure (arXiv 2511.22262).
+    """Prune what the cover's training views do not use, then train: after GSPure (arXiv 2511.22262).
 
     `given_up`: see `unused`. GSPure finds what to prune by the same weights, but clusters them.
     """
@@ -156,28 +155,28 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
     sentence = (
         "Gaussians that the cover's photos do not use are removed"
         f"{f', giving up {given_up:.1%} of what those show' if given_up else ''}; "
-        f"then training goes on for {steps} steps."
+        f"then training continues for {steps} steps."
     )
     return Change("purification", given_up, "share of the blending weight given up", sentence, apply, seed)
 
 
 def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
-    """[N] the Gaussians that add nothing to the training views, and then those that add least.
+    """[N] the Gaussians that contribute nothing to the training views, and then those that contribute least.
 
-    Of all weights with which Gaussians are blended, summed over pixels and views, no more than the share
-    `given_up` is theirs. Never all of them.
+    Their share of the blending weights, summed over pixels and views, is at most `given_up`. Never all of
+    them.
     """
     weights = contributions(model, [view.camera for view in subsample_views(cover.train, VIEWS)]).double()
     ascending, order = weights.sort(stable=True)
-    least = ascending.cumsum(0) <= given_up * ascending.sum()
-    least[-1] = False
-    result = torch.zeros_like(least)
-    result[order] = least
+    chosen = ascending.cumsum(0) <= given_up * ascending.sum()
+    chosen[-1] = False
+    result = torch.zeros_like(chosen)
+    result[order] = chosen
     return result
 
 
 def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
-    """`model` after as many steps of plain 3DGS on the training views, at the rates of such a run."""
+    """`model` after `steps` steps of plain 3DGS on the training views, at the rates of such a run."""
     config = FitConfig(iterations=max(steps, 1))
     parameters = to_parameters(model, model.device)
     optimizers = make_optimizers(parameters, config, scene.extent)
@@ -197,9 +196,9 @@ def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussi
 
 
 def _generator(use: str, seed: int) -> torch.Generator:
-    """Random numbers that have nothing to do with those of a training with the same seed, nor of another use.
+    """Random numbers that are independent of a training with the same seed, and of other uses.
 
-    Removing just what some training chose, such as a secret's anchors, would not be random.
+    Removing exactly what a training chose, such as a secret's anchors, would not be random.
     """
     digest = hashlib.sha256(f"keyss/robustness/{use} {seed}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
@@ -211,5 +210,5 @@ def _check_share(share: float) -> None:
 
 
 def _removed(share: float, model: Gaussians) -> int:
-    """How many Gaussians are removed: at least one is left."""
+    """The number of Gaussians to remove: at least one stays."""
     return min(round(share * len(model)), len(model) - 1)

@@ -1,4 +1,4 @@
-"""To other formats and back, by other people's programs: gsply (PyPI) and splat-transform (npm, PlayCanvas).
+"""Conversions to other formats and back by third-party programs: gsply (PyPI) and splat-transform (npm).
 
 pip install gsply
 npm install --no-save @playcanvas/splat-transform@2.7.1
@@ -25,34 +25,25 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.models import read_model, write_model
 from keyss.measure.robustness.changes import Change
 
-SECONDS = 600.0  # that a program may take for one way
-
-
-@dataclass(frozen=True)
-class Converted:
-    """A model that went to another format and back."""
-
-    gaussians: Gaussians
-    bytes: int  # of the file in the other format
+TIMEOUT = 600.0  # seconds for one conversion
 
 
 @dataclass(frozen=True)
 class Converter:
-    """Takes models to a format and back."""
+    """Converts models to a format and back."""
 
     format: str
     tool: str
-    note: str  # what there is to know about this way, or nothing
+    note: str  # a remark on this conversion, or nothing
     there_and_back: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
 
-    def __call__(self, model: Gaussians) -> Converted:
-        """Raises BackendError where the tool is missing or cannot do it."""
+    def __call__(self, model: Gaussians) -> Gaussians:
+        """Raises BackendError if the tool is missing or fails."""
         with tempfile.TemporaryDirectory() as folder:
             source = Path(folder) / "source.ply"
             write_model(source, model)
             try:
-                other, back = self.there_and_back(source, Path(folder))
-                return Converted(read_model(back), other.stat().st_size)
+                return read_model(self.there_and_back(source, Path(folder))[1])
             except BackendError:
                 raise
             except (KeyssError, OSError, ValueError) as error:
@@ -62,16 +53,16 @@ class Converter:
     def change(self) -> Change:
         sentence = f"Converted to {self.format} and back by {self.tool}{self.note}."
         attack = f"conversion to {self.format} by {self.tool}"
-        return Change(attack, 1, "times", sentence, lambda model: self(model).gaussians.to(model.device))
+        return Change(attack, 1, "times", sentence, lambda model: self(model).to(model.device))
 
 
 def converters(sog_iterations: int = 1) -> list[Converter]:
-    """All ways that are known, whether their tools are there or not.
+    """All known conversions, whether or not their tools are installed.
 
-    `sog_iterations`: of the search for common harmonics in .sog, which without a GPU takes splat-transform
-    half a minute each for 20,000 Gaussians; by itself it makes ten.
+    `sog_iterations`: of the clustering of harmonics in .sog, by default ten in splat-transform, which without
+    a GPU takes half a minute each for 20,000 Gaussians.
     """
-    few = ", with one round" if sog_iterations == 1 else f", with {sog_iterations} rounds"
+    rounds = "one round" if sog_iterations == 1 else f"{sog_iterations} rounds"
     return [
         Converter("compressed .ply", "gsply", "", _gsply_compressed),
         Converter(".spz", "gsply", " (version 3)", _gsply_spz),
@@ -80,7 +71,7 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
         Converter(
             ".sog",
             "splat-transform",
-            f"{few} of its search for common harmonics",
+            f", with {rounds} of clustering harmonics",
             _through("there.sog", "-i", str(sog_iterations)),
         ),
         Converter(".splat", "splat-transform", ", which only reads this format", _splat),
@@ -101,7 +92,7 @@ def find_splat_transform() -> str:
 
 
 def find_package(name: str) -> ModuleType:
-    """A Python package of other people's. Raises BackendError."""
+    """A third-party Python package. Raises BackendError."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -113,9 +104,9 @@ def transform(source: Path, target: Path, *options: str) -> Path:
     tool = find_splat_transform()
     command = [tool, "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
     try:
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=SECONDS)
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT)
     except subprocess.TimeoutExpired as error:
-        raise BackendError(f"splat-transform took more than {SECONDS:.0f} s for {target.name}") from error
+        raise BackendError(f"splat-transform took more than {TIMEOUT:.0f} s for {target.name}") from error
     except (OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", None) or str(error)
         raise BackendError(

@@ -1,4 +1,4 @@
-"""What changes of a published model cost its cover and its secrets, and which of them breaks down first."""
+"""What changes of a published model cost its cover and its secrets, and which breaks down first."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Literal, TypeVar
 
-from keyss.core.errors import BackendError, InputError, KeyssError, UsageError
+from keyss.core.errors import BackendError, InputError, KeyssError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import Similarity
@@ -15,11 +15,11 @@ from keyss.fitting.image_metrics import quality, subsample_views
 from keyss.measure.robustness import changes as change
 from keyss.measure.robustness.changes import Change
 from keyss.measure.robustness.conversions import converters
-from keyss.methods.base import Opened
+from keyss.methods.opened import Opened
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
-DRAWS = 3  # of what is removed at random: which Gaussians they are makes a difference of a dB or two
+DRAWS = 3  # of random removals, which vary by a dB or two
 BROKEN_LOSS = 6.0  # dB: four times the squared error
 UNCHANGED = "none"
 
@@ -29,19 +29,19 @@ K = TypeVar("K", bound=Hashable)
 
 @dataclass(frozen=True)
 class Reopened:
-    """A secret as it was revealed."""
+    """A revealed secret."""
 
     gaussians: Gaussians  # in the secret's own frame
     frame: Similarity = field(default_factory=Similarity.identity)  # from there into the cover's
 
 
-# Raises a KeyssError when the secret cannot be opened.
+# Raises KeyssError if the secret does not open.
 Reopen = Callable[[Gaussians], Reopened]
 
 
 @dataclass(frozen=True)
 class Reopener:
-    """`reopener(stego)` is what `keyss reveal` gives, with `--force` where the model asks for it."""
+    """Reveals a secret as `keyss reveal` does, with `--force` if the model requires it."""
 
     key: str = field(repr=False)
     open: Callable[[Gaussians, str], Opened] = field(repr=False)  # stego model on the CPU, key
@@ -52,7 +52,7 @@ class Reopener:
         secret = self.open(stego, self.key)
         try:
             revealed = secret.reveal(stego)
-        except InputError:  # positions changed, so that it seems to be another model
+        except InputError:  # positions changed: it seems to be another model
             revealed = secret.reveal(stego, force=True)
         return Reopened(revealed, secret.frame or Similarity.identity())
 
@@ -72,8 +72,7 @@ class ChangedQuality:
 class ChangeResult:
     """What a change of the published model costs.
 
-    Where a secret does not open, its quality is what a person has without it: the changed model itself, as
-    seen from the secret's cameras.
+    If a secret does not open, its quality is that of the changed model itself, from the secret's cameras.
     """
 
     attack: str  # changes of one attack differ in strength only
@@ -81,7 +80,7 @@ class ChangeResult:
     unit: str
     sentence: str
     seed: int | None
-    skipped: str | None = None  # which tool is missing; then nothing below is known
+    skipped: str | None = None  # which tool is missing; then the fields below are unset
     gaussians: int | None = None
     cover: ChangedQuality | None = None
     secrets: tuple[ChangedQuality, ...] = ()
@@ -94,14 +93,14 @@ class StrengthLosses:
 
     strength: float
     cover: float
-    secret: float  # of several secrets the one that loses most
+    secret: float  # the maximum over the secrets
 
 
 @dataclass(frozen=True)
 class BreakdownPoint:
-    """From which strength of an attack on the cover and the secret are broken; None: at no strength tried.
+    """The first strength of an attack that breaks the cover and the secret; None: no strength tried does.
 
-    A scene is broken that has lost 6 dB or more, and a secret also if it did not open.
+    A scene is broken if it has lost 6 dB or more, and a secret also if it does not open.
     """
 
     attack: str
@@ -109,15 +108,12 @@ class BreakdownPoint:
     losses: tuple[StrengthLosses, ...]  # means over draws, in the order of the attack's strengths
     secret: float | None
     cover: float | None
-    first: First  # which is broken at the first strength at which any is
-    excess: float | None  # dB: the most that the secret loses more than the cover while that is not broken
+    first: First  # what is broken at the first strength that breaks anything
+    excess: float | None  # dB: the maximum that the secret loses more than the unbroken cover
 
 
 def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
-    """All changes, those of an attack one after another, the mildest first.
-
-    `cover`: its training photos serve those who train on.
-    """
+    """All changes, grouped by attack, the mildest first; some train on the photos of `cover`."""
     return [
         *(change.random_pruning(share, seed + draw) for share in PRUNED for draw in range(DRAWS)),
         *(change.opacity_pruning(share) for share in PRUNED),
@@ -131,7 +127,7 @@ def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
     ]
 
 
-def robustness(
+def measure_robustness(
     stego: Gaussians,
     reopen: Sequence[Reopen],  # one for each secret: a `Reopener`, or another method's
     cover: Scene,
@@ -144,10 +140,10 @@ def robustness(
 ) -> list[ChangeResult]:
     """Qualities of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
-    `changes`: `default_changes` by default, about 50. `views`: at most so many test views of each scene.
-    `progress`: called with changes done, changes in all, and the next one's name. Drawn on the device of
-    `stego`. The same seed gives the same numbers. Raises UsageError unless each secret can be reopened, and
-    the KeyssError of one that does not open in the unchanged model.
+    `changes`: `default_changes` by default, about 50. `views`: the maximum number of test views of each
+    scene. `progress`: called with changes done, changes in all, and the next one's name. Renders on the
+    device of `stego`. The same seed gives the same numbers. Raises UsageError unless there is one `reopen`
+    per secret, and KeyssError for a secret that does not open in the unchanged model.
     """
     if len(reopen) != len(secrets):
         raise UsageError(
@@ -178,7 +174,7 @@ def robustness(
 
 
 def mean_over_draws(results: Sequence[ChangeResult]) -> list[ChangeResult]:
-    """Results that differ in nothing but what was drawn, as one: means, and opened if all opened."""
+    """Results that differ only in their random draw as one: means, and opened if all opened."""
     groups = _grouped(results, lambda result: (result.attack, result.strength)).values()
     return [
         replace(
@@ -194,7 +190,7 @@ def mean_over_draws(results: Sequence[ChangeResult]) -> list[ChangeResult]:
 def breakdown_points(
     results: Sequence[ChangeResult], broken_loss: float = BROKEN_LOSS
 ) -> list[BreakdownPoint]:
-    """For each attack among `results` its losses, and where cover and secret break down."""
+    """The losses of each attack among `results`, and where cover and secret break down."""
     known = [result for result in results if result.attack != UNCHANGED and result.cover is not None]
     return [
         _breakdown_point(attack, own, broken_loss)
@@ -251,8 +247,9 @@ def _secret(
     try:
         return _quality(reopen(changed).gaussians.to(changed.device), scene, views)
     except KeyssError as error:
+        why = "this key opens nothing here" if isinstance(error, WrongKeyError) else f"{error}"
         shown = frame.inverse().apply_gaussians(changed.to("cpu")).to(changed.device)
-        return replace(_quality(shown, scene, views), opens=False, error=f"{error}")
+        return replace(_quality(shown, scene, views), opens=False, error=why)
 
 
 def _quality(model: Gaussians, scene: Scene, views: int) -> ChangedQuality:

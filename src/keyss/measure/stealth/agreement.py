@@ -1,8 +1,7 @@
-"""Numbers that lie close together for a reason: do their low bits know of each other, as they should?
+"""Numbers that are close for a reason: are their low bits related, as they should be?
 
-Channels of a grey Gaussian, axes of a round one, neighbours in space that were one Gaussian before it was
-split, Gaussians that share whole rows: where the high bits are the same, the low ones of such numbers are
-close or the same too, until something replaces them.
+Channels of a grey Gaussian, axes of a round one, neighbours that were one Gaussian before a split, Gaussians
+that share whole rows: if their high bits are equal, their low bits are close or equal too, unless replaced.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from keyss.measure.stealth.words import Bits, Floats, Ints, Words, ulps
 _LOW = 13  # bits that may have been replaced
 _CLOSE = 1 << 5  # steps of the last bit
 _NEIGHBOURS = 3
-# What embedding replaces moves a number by at most this many steps of its last bit.
+# Embedding moves a number by at most this many steps of its last bit.
 _MOVED, _AROUND = 1 << _LOW, 1 << (_LOW + 3)
 _GROUPS = {"axes": (1,), "quaternion": (2,), "channels": (5, 6, 7), "constant colour": (4,)}
 
 
 def agreement(words: Words, positions: Floats) -> dict[str, Statistic]:
-    """Of pairs with the same high bits, how many have close low bits; exact null: independent low bits.
+    """Of pairs with equal high bits, how many have close low bits (exact null: independent low bits).
 
-    And of pairs that were equal before: how many more there are a little apart than a smooth density gives.
+    And how many more pairs are slightly apart than a smooth density gives: equal ones before embedding.
     """
     found: dict[str, Statistic] = {}
     for name, attributes in _GROUPS.items():
@@ -58,14 +57,14 @@ def _of_pairs(one: Bits, other: Bits) -> dict[str, Statistic]:
 
 
 def _misses(apart: Ints) -> Statistic:
-    """Pairs less than _MOVED apart, but not equal, beyond those expected from how many are further apart."""
+    """Unequal pairs less than _MOVED apart, beyond the number expected from pairs further apart."""
     inside = int(((apart > 0) & (apart < _MOVED)).sum())
     around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
     return more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart))
 
 
 def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, Bits]]:
-    """Pairs of numbers of one Gaussian, one coefficient's channels or one attribute; signs left out."""
+    """Pairs of numbers of one Gaussian, within a coefficient's channels or an attribute, without signs."""
     for attribute in attributes:
         own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
         if not own.size:
@@ -78,7 +77,7 @@ def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, B
 
 
 def _neighbours(positions: Floats) -> Ints:
-    """[P, 2] each Gaussian and those nearest to it."""
+    """[P, 2] each Gaussian and its nearest neighbours."""
     count = min(_NEIGHBOURS + 1, len(positions))
     _, near = cKDTree(positions).query(positions, k=count)
     near = near.reshape(len(positions), -1)
@@ -88,7 +87,7 @@ def _neighbours(positions: Floats) -> Ints:
 
 
 def _sharers(words: Words) -> Ints:
-    """[P, 2] Gaussians that have a number in common, in one field; neighbours in the order of that field."""
+    """[P, 2] Gaussians with an equal number in a field, adjacent in the order of that field."""
     found = [np.zeros((0, 2), np.int64)]
     for field in range(3, words.bits.shape[1]):
         own = words.bits[:, field]

@@ -1,7 +1,7 @@
-"""Are the bits of mantissas what chance gives, whatever else an attacker sees beside them?
+"""Are the bits of mantissas random, given everything else that an attacker sees?
 
-By attribute, magnitude and position of the bit; given the bit below; and whether a number contradicts
-itself: training that leaves a zero in the last bit leaves zeros above it too, and embedding does not.
+By attribute, magnitude and position of the bit; given the bit below; and whether a number contradicts itself:
+training that leaves a zero in the last bit leaves zeros above it too, embedding does not.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from keyss.measure.stealth.words import ATTRIBUTES, MAGNITUDES, MANTISSA, Bits, 
 RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9), "9-12": (9, 13)}
 _BITS = 14  # from the last one on
 _HARMONICS = ATTRIBUTES.index("sh1")
-_LEAST = 64  # numbers of a stratum
+_MIN_COUNT = 64  # numbers of a stratum
 
 
 def bits(words: Words) -> dict[str, Statistic]:
@@ -57,8 +57,8 @@ def _of_values(values: Bits) -> dict[str, Statistic]:
 
 
 def _difference(one: Flags, other: Flags, expected: float) -> Statistic:
-    """How much more often in `one` than in `other`, where both are by chance `expected`."""
-    if min(len(one), len(other)) < _LEAST:
+    """How much more frequent in `one` than in `other`, if both are by chance `expected`."""
+    if min(len(one), len(other)) < _MIN_COUNT:
         return NOTHING
     error = (expected * (1 - expected) * (1 / len(one) + 1 / len(other))) ** 0.5
     return normal(float(one.mean() - other.mean()), error)
@@ -72,7 +72,7 @@ def _strata(values: Bits) -> Statistic:
         stratum = exponent * 2 + (values >> (bit - 1) & 1)
         count = np.bincount(stratum)
         ones = np.bincount(stratum, weights=values >> bit & 1)
-        enough = count >= _LEAST
+        enough = count >= _MIN_COUNT
         total += float(((ones - count / 2) ** 2 / np.maximum(count / 4, 1))[enough].sum())
         degrees += int(enough.sum())
     return dispersion(total, degrees)
@@ -94,7 +94,7 @@ def _together(values: Bits, chosen: Flags) -> Statistic:
     zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
     trials = chosen.sum(axis=1)
     rows = trials > 1
-    if rows.sum() < _LEAST:
+    if rows.sum() < _MIN_COUNT:
         return NOTHING
     z2 = (zeros[rows] - trials[rows] / 8) ** 2 / (trials[rows] * 7 / 64)
     # The kurtosis of a binomial number: 1 / variance - 6 / n beyond that of a normal one.
@@ -104,7 +104,7 @@ def _together(values: Bits, chosen: Flags) -> Statistic:
 
 
 def _beside_tiny(words: Words) -> dict[str, Statistic]:
-    """Bits of the other numbers of those Gaussians that have a tiny harmonic: are they treated otherwise?"""
+    """Bits of the other numbers of Gaussians with a tiny harmonic: are they treated differently?"""
     harmonics = words.attribute >= _HARMONICS
     tiny = (words.trained & (words.exponent < MAGNITUDES["tiny"][1]))[:, harmonics].any(axis=1)
     found = {}

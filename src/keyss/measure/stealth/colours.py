@@ -1,8 +1,8 @@
-"""How noisy green and blue are beside red: what somebody asks who knows which of them a writer leaves alone.
+"""How noisy green and blue are compared with red, which the channel of colours does not write.
 
-Red is the yardstick, for `channels.robust` writes green and blue. Neighbours in space and rows, which were
-often one Gaussian before density control, differ in all three by about as much; noise in two of them shows
-first in the pairs that differ least, and most in the small and faint Gaussians, which get most of it.
+Neighbours in space and rows, often one Gaussian before density control, differ in all three channels by about
+as much. Noise in two of them shows first in the pairs that differ least, and most in small and faint
+Gaussians.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from scipy.spatial import cKDTree
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic
-from keyss.measure.stealth.words import Floats, Ints
+from keyss.measure.stealth.words import Floats, Ints, doubles
 
 _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
 _CHANNELS = {"green": 1, "blue": 2}
 _PARTS = ("most visible", "more visible", "less visible", "least visible")
-_LEAST = 200  # pairs
-_TINY = 1e-4  # of a colour: what equal ones differ by
+_MIN_PAIRS = 200
+_TINY = 1e-4  # of a colour: a difference that counts as none
 
 
 def colours(model: Gaussians) -> dict[str, Statistic]:
-    """Logarithms of ratios of differences; 0 where green or blue vary as red does."""
-    values = np.nan_to_num(model.sh[:, 0].detach().cpu().double().numpy())
+    """Logarithms of ratios of differences; 0 if green or blue vary as red does."""
+    values = np.nan_to_num(doubles(model.sh[:, 0]))
     found: dict[str, Statistic] = {}
-    if len(values) < _LEAST:
+    if len(values) < _MIN_PAIRS:
         return found
-    positions = np.nan_to_num(model.means.detach().cpu().double().numpy())
+    positions = np.nan_to_num(doubles(model.means))
     _, near = cKDTree(positions).query(positions, k=2)
     rows = np.arange(len(values))
     pairs = {"neighbours": np.stack([rows, near[:, 1]], axis=1), "rows": np.stack([rows[1:], rows[:-1]], 1)}
@@ -58,7 +58,7 @@ _BETWEEN = (("red", "green", 0, 1), ("red", "blue", 0, 2), ("green", "blue", 1, 
 
 
 def _parts(model: Gaussians) -> Iterator[tuple[str, Ints]]:
-    """Quarters of the rows by how much a change of their colour shows: area times squared opacity."""
+    """Quarters of the rows by the visibility of a colour change: area times squared opacity."""
     scales = model.log_scales.detach().cpu().double().sort(dim=1).values[:, 1:].sum(dim=1)
     shown = (scales + 2 * model.opacities.detach().cpu().double().clamp_min(1e-6).log()).numpy()
     yield from zip(_PARTS, np.array_split(np.argsort(-np.nan_to_num(shown), kind="stable"), 4), strict=True)

@@ -1,13 +1,11 @@
-"""Is this model the one that is hidden in that file? Scores for whoever has a candidate, but no key.
+"""Is a candidate model hidden in a file? Scores for an attacker with a candidate, but no key.
 
-Every score is higher the more the file looks as if it held the candidate. By themselves they mean nothing,
-for one candidate resembles all files more than another does: what counts is whether the true one scores
-higher than others do, and higher than in files that hold something else (`confirmed`).
+Higher scores mean that the file looks more as if it held the candidate. A score alone means nothing, since
+some candidates resemble all files: what counts is whether the true one scores higher than others, and higher
+than in files that hold something else.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +14,18 @@ from scipy.stats import ks_2samp, spearmanr
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.opacities import UNDRAWN
-from keyss.measure.stealth.words import Floats, Words
+from keyss.measure.stealth.words import Floats, Words, doubles
 
-MOST = 20_000  # Gaussians of each that are compared
-_QUERIES = 4000  # rows for which the nearest are sought
-_LEAST_ENERGY = -20.0  # logarithm
-_MATCHED = 0.02  # distance of logarithms of energies; of unlike Gaussians hardly one in a thousand is so near
+MAX_GAUSSIANS = 20_000  # of each model
+_QUERIES = 4000  # rows whose nearest ones are searched
+_MIN_ENERGY = -20.0  # logarithm
+_MATCHED = 0.02  # distance of logarithms of energies; chance is below one in a thousand
 _LOW = 13  # bits that may have been replaced
-_LEAST = 50
+_MIN_COUNT = 50
 
 
 def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
-    """By name. Models may differ in size and SH degree; orders of rows count, so give them as they are."""
+    """Scores by name. Models may differ in size and SH degree; the order of rows matters."""
     degree = min(file.sh_degree, candidate.sh_degree)
     file, candidate = (_thinned(each.with_sh_degree(degree)) for each in (file, candidate))
     parts = _parts(file)
@@ -45,29 +43,8 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
     return found
 
 
-def confirmed(scores: npt.NDArray[np.float64], true: Sequence[int]) -> float:
-    """How often the true candidate is ranked above another one, ties counting half; 0.5 is chance.
-
-    `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Each candidate's scores
-    are taken relative to what it has in files that hold something else, and each file's to those of others.
-    """
-    scores = np.asarray(scores, float)
-    own = np.zeros(scores.shape, bool)
-    own[np.arange(len(true)), list(true)] = True
-    others = np.where(own, np.nan, scores)
-    with np.errstate(all="ignore"):
-        relative = (
-            scores - np.nanmean(others, axis=0) - (np.nanmean(others, axis=1) - np.nanmean(others))[:, None]
-        )
-    above = []
-    for row, index in zip(np.nan_to_num(relative), true, strict=True):
-        rest = np.delete(row, index)
-        above.append(float((row[index] > rest).mean() + 0.5 * (row[index] == rest).mean()))
-    return float(np.mean(above))
-
-
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
-    """Share of the Gaussians that `other` has too, but with other low bits: what copies of a cover show."""
+    """Share of the Gaussians that `other` has too, with other low bits: two copies of a cover reveal it."""
     own, theirs = (_high_rows(each, slice(None)) for each in (file, other))
     whole = [{row.tobytes() for row in Words.of(each).bits} for each in (file, other)]
     shared = np.isin(own, theirs)
@@ -77,11 +54,11 @@ def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
 
 
 def _thinned(model: Gaussians) -> Gaussians:
-    return model[:: max(1, -(-len(model) // MOST))]
+    return model[:: max(1, -(-len(model) // MAX_GAUSSIANS))]
 
 
 def _parts(file: Gaussians) -> dict[str, Gaussians]:
-    """What of a file a secret may be: all, what is never drawn, what is faint, the end."""
+    """Parts of a file that may be a secret: all, never drawn, faint, and the second half."""
     faint = file.opacity_logits < file.opacity_logits.median()
     parts = {
         "whole": file,
@@ -89,11 +66,11 @@ def _parts(file: Gaussians) -> dict[str, Gaussians]:
         "faint": file[faint],
         "second half": file[len(file) // 2 :],
     }
-    return {name: part if len(part) >= _LEAST else file for name, part in parts.items()}
+    return {name: part if len(part) >= _MIN_COUNT else file for name, part in parts.items()}
 
 
 def _energies(model: Gaussians) -> Floats:
-    """[N, 3 degree] logarithms of the energy of each band and channel: no rotation changes it."""
+    """[N, 3 degree] logarithms of the energy of each band and channel, invariant to rotation."""
     columns = [
         model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double().square().sum(1)
         for band in range(1, model.sh_degree + 1)
@@ -102,15 +79,15 @@ def _energies(model: Gaussians) -> Floats:
 
 
 def _by_rows(own: Floats, theirs: Floats) -> dict[str, float]:
-    """Nearest rows: how many fit, how well the better half does, and whether they come in the same order."""
+    """Nearest rows: how many match, how well the best do, and whether they are in the same order."""
     count = min(len(own), len(theirs))
     at_ends = max(
         _correlation(own[part, 0], theirs[:count, 0]) for part in (slice(0, count), slice(-count, None))
     )
-    # Without harmonics all are alike.
-    own, theirs = (each[(each > _LEAST_ENERGY).all(axis=1)] for each in (own, theirs))
+    # Gaussians without harmonics are all alike.
+    own, theirs = (each[(each > _MIN_ENERGY).all(axis=1)] for each in (own, theirs))
     own = own[:: max(1, -(-len(own) // _QUERIES))]
-    if min(len(own), len(theirs)) < _LEAST:
+    if min(len(own), len(theirs)) < _MIN_COUNT:
         return {"rows at the same place": at_ends}
     distance, nearest = cKDTree(theirs).query(own)
     best = distance <= np.quantile(distance, 0.25)
@@ -125,7 +102,7 @@ def _by_rows(own: Floats, theirs: Floats) -> dict[str, float]:
 
 
 def _correlation(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> float:
-    if len(one) < _LEAST or len(np.unique(one)) < 2 or len(np.unique(other)) < 2:
+    if len(one) < _MIN_COUNT or len(np.unique(one)) < 2 or len(np.unique(other)) < 2:
         return 0.0
     return float(np.nan_to_num(spearmanr(one, other).statistic))
 
@@ -147,8 +124,8 @@ def _identity(file: Gaussians, candidate: Gaussians) -> float:
 
 
 def _marginals(model: Gaussians) -> dict[str, Floats]:
-    """What does not depend on the frame: shapes, energies, colours."""
-    scales = np.sort(model.log_scales.detach().cpu().double().numpy(), axis=1)
+    """Quantities that do not depend on the frame: shapes, energies, colours."""
+    scales = np.sort(doubles(model.log_scales), axis=1)
     found = {
         "flatness": scales[:, 1] - scales[:, 0],
         "elongation": scales[:, 2] - scales[:, 1],
@@ -161,8 +138,8 @@ def _marginals(model: Gaussians) -> dict[str, Floats]:
 
 
 def _extent(model: Gaussians) -> Floats:
-    """[2] ratios of the standard deviations along the principal axes: no similarity changes them."""
-    means = model.means.detach().cpu().double().numpy()
+    """[2] ratios of the standard deviations along the principal axes, invariant to similarities."""
+    means = doubles(model.means)
     middle = means[
         np.linalg.norm(means - np.median(means, axis=0), axis=1).argsort()[: int(0.9 * len(means)) + 2]
     ]

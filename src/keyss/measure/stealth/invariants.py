@@ -1,4 +1,4 @@
-"""What some tools keep exactly; whoever moves low bits makes of it what is nearly so."""
+"""Properties that some tools keep exactly, and that changed low bits keep only nearly."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
-from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Ints, Words
+from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Ints, Words, doubles
 
-_UNIT = 5e-7  # of a length that was normalised in float32
-_MOVED, _AROUND = 2e-4, 2e-3  # as far as embedding moves a length; what a smooth density is judged by
+_UNIT = 5e-7  # error of a length normalised in float32
+_MOVED, _AROUND = 2e-4, 2e-3  # how far embedding moves a length; the range that gives the smooth density
 _CELLS = 4  # along each axis
 _BLOCKS = 16  # of rows
-_LEAST = 30  # Gaussians of a part
+_MIN_GAUSSIANS = 30  # of a part
 _CLUSTERED = 0.01  # of the usual gap between neighbouring values
 _WINDOW = 32
 
@@ -37,7 +37,7 @@ def invariants(model: Gaussians, words: Words) -> dict[str, Statistic]:
 
 
 def _lengths(model: Gaussians) -> dict[str, Statistic]:
-    """Of quaternions: how many are of unit length, in all and in parts, and how many nearly."""
+    """How many quaternions have unit length, overall and in parts, and how many nearly."""
     error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
     unit = error < _UNIT
     nearly = int((~unit & (error < _MOVED)).sum())
@@ -51,17 +51,17 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
             float(np.log10(np.median(error) + 1e-9))
         ),
     }
-    positions = model.means.detach().cpu().double().numpy()
+    positions = doubles(model.means)
     for name, part in (("space", _cells(positions)), ("rows", np.arange(len(unit)) * _BLOCKS // len(unit))):
         count, hits = np.bincount(part), np.bincount(part, weights=unit)
-        shares = (hits / np.maximum(count, 1))[count >= _LEAST]
+        shares = (hits / np.maximum(count, 1))[count >= _MIN_GAUSSIANS]
         spread = float(shares.max() - shares.min()) if len(shares) else 0.0
         found[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
     return found
 
 
 def _cells(positions: Floats) -> Ints:
-    """[N] index of the cell of space, cut at quantiles of each coordinate."""
+    """[N] index of the cell between quantiles of each coordinate."""
     cuts = np.quantile(positions, np.arange(1, _CELLS) / _CELLS, axis=0)
     index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
     found: Ints = np.ravel_multi_index(index, (_CELLS,) * 3)
@@ -69,15 +69,15 @@ def _cells(positions: Floats) -> Ints:
 
 
 def _repeated(values: Bits) -> int:
-    """How many values occur more than once."""
+    """How often values occur that occur more than once."""
     _, counts = np.unique(values, return_counts=True)
     return int(counts[counts > 1].sum())
 
 
 def _clusters(values: Floats) -> tuple[int, int]:
-    """How many gaps between neighbouring values are far smaller than those around, and how many there are.
+    """How many gaps between sorted values are far smaller than their neighbours, and the number of gaps.
 
-    Between values of a smooth density gaps over their mean are exponential: one in a hundred is below 0.01.
+    For a smooth density, gaps over their mean are exponential: one in a hundred is below 0.01.
     """
     ordered = np.unique(values)
     if len(ordered) < 4 * _WINDOW:

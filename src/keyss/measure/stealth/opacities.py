@@ -1,4 +1,4 @@
-"""Where opacities lie: what a hiding place below the drawn ones leaves, or fills."""
+"""The distribution of opacities, which hiding below the threshold of drawing changes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, portion
-from keyss.measure.stealth.words import Floats
+from keyss.measure.stealth.words import Floats, doubles
 
 UNDRAWN = -5.6  # logits below are never drawn
 _SHARES = {
@@ -21,13 +21,13 @@ _SHARES = {
 }
 _FAINT = -2.944
 _BANDWIDTH, _STEP = 0.15, 0.05  # logits
-_LEAST = 30  # Gaussians of a mode
-_DIP = 0.5  # of the lower of two modes, how far the density falls between them
+_MIN_GAUSSIANS = 30  # of a mode
+_DIP = 0.5  # of the lower of two modes: how far the density must fall between them
 
 
 def opacities(model: Gaussians) -> dict[str, Statistic]:
-    """Shares by opacity, and what the Gaussians of the faint part look like beside the others."""
-    logits = model.opacity_logits.detach().cpu().double().numpy()
+    """Shares by opacity, and how faint Gaussians differ from the others."""
+    logits = doubles(model.opacity_logits)
     found = {
         f"share of opacities, {name}": portion(float(((logits >= low) & (logits < high)).sum()), len(logits))
         for name, (low, high) in _SHARES.items()
@@ -35,7 +35,7 @@ def opacities(model: Gaussians) -> dict[str, Statistic]:
     found["modes of faint opacities"] = Statistic(float(len(modes(logits[logits < _FAINT]))))
     faint = logits < _FAINT
     for name, values in _shapes(model).items():
-        few = min(faint.sum(), (~faint).sum()) < _LEAST
+        few = min(faint.sum(), (~faint).sum()) < _MIN_GAUSSIANS
         parted = np.nan if few else float(np.median(values[faint]) - np.median(values[~faint]))
         found[f"faint against opaque, {name}"] = Statistic(parted)
         found[f"median {name}"] = Statistic(float(np.median(values)))
@@ -44,8 +44,8 @@ def opacities(model: Gaussians) -> dict[str, Statistic]:
 
 
 def modes(logits: Floats) -> list[float]:
-    """Where the density of opacity logits [N] has separate peaks: one for each group hidden there."""
-    if len(logits) < _LEAST:
+    """Separate peaks of the density of opacity logits [N]: one for each group hidden there."""
+    if len(logits) < _MIN_GAUSSIANS:
         return []
     low, high = logits.min() - 1, logits.max() + 1
     edges = np.arange(low, high + _STEP, _STEP)
@@ -58,7 +58,9 @@ def modes(logits: Floats) -> list[float]:
     for at in range(1, len(density) - 1):
         lowest = min(lowest, density[at])
         if not (
-            density[at] >= density[at - 1] and density[at] > density[at + 1] and density[at] >= _LEAST / 2
+            density[at] >= density[at - 1]
+            and density[at] > density[at + 1]
+            and density[at] >= _MIN_GAUSSIANS / 2
         ):
             continue
         if found and lowest > _DIP * min(density[found[-1]], density[at]):
@@ -71,19 +73,14 @@ def modes(logits: Floats) -> list[float]:
 
 
 def _shapes(model: Gaussians) -> dict[str, Floats]:
-    scales = model.log_scales.detach().cpu().double().numpy()
+    scales = doubles(model.log_scales)
     ordered = np.sort(scales, axis=1)
+    lengths = model.quats.detach().cpu().double().norm(dim=1).numpy()
     found = {
         "size": scales.mean(axis=1),
         "flatness": ordered[:, 1] - ordered[:, 0],
         "elongation": ordered[:, 2] - ordered[:, 1],
-        "length of quaternions": model.quats.detach()
-        .cpu()
-        .double()
-        .norm(dim=1)
-        .clamp_min(1e-9)
-        .log()
-        .numpy(),
+        "length of quaternions": np.log(np.maximum(lengths, 1e-9)),
     }
     for band in range(1, model.sh_degree + 1):
         part = model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double()

@@ -1,4 +1,4 @@
-"""The order of rows: what comes first and last, and whether neighbouring rows belong together."""
+"""The order of rows: how it correlates with their content, and whether adjacent rows are related."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from scipy.stats import ks_2samp, rankdata
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, normal, portion
-from keyss.measure.stealth.words import Floats
+from keyss.measure.stealth.words import Floats, doubles
 
 _KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
 _NEAR = 1e-5  # of the model's size
 
 
 def order(model: Gaussians) -> dict[str, Statistic]:
-    """Correlation of what a row holds with its number, first half against second; null: any order.
+    """Correlations of the content of rows with their number, and halves against each other; null: any order.
 
-    Plain models have an order too, that in which density control appended, so that controls tell what is
-    usual: a shuffled file is as odd as one with a second model at its end.
+    Plain models have an order too, given by density control: compared with controls, a shuffled file is as
+    unusual as one with a second model at its end.
     """
     found: dict[str, Statistic] = {}
     count = len(model)
@@ -37,7 +37,7 @@ def order(model: Gaussians) -> dict[str, Statistic]:
         )
         jumps = np.abs(np.diff(ranks)).mean() / count
         found[f"neighbouring rows, {name}"] = normal(float(jumps), 0.2236 / math.sqrt(count), 1 / 3)
-    positions = model.means.detach().cpu().double().numpy()
+    positions = doubles(model.means)
     size = float(np.linalg.norm(np.subtract(*np.quantile(positions, (0.9, 0.1), axis=0)))) or 1.0
     pairs = len(cKDTree(positions).query_pairs(_NEAR * size, output_type="ndarray"))
     found["near duplicates"] = portion(pairs, count)
@@ -45,7 +45,7 @@ def order(model: Gaussians) -> dict[str, Statistic]:
 
 
 def columns(model: Gaussians) -> dict[str, Floats]:
-    """[N] numbers of a Gaussian by which orders are compared."""
+    """[N] numbers of each Gaussian that orders are compared by."""
     positions = model.means.detach().cpu().double()
     found = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}
     found["distance"] = (positions - positions.median(0).values).norm(dim=1)

@@ -1,4 +1,4 @@
-"""A model's floats as an attacker sees them: bit patterns by field, attribute and magnitude."""
+"""The floats of a model as bit patterns, by field, attribute and magnitude."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 
 ATTRIBUTES = ("position", "scale", "rotation", "opacity", "colour", "sh1", "sh2", "sh3")
 MANTISSA = 23
-# Numbers by binary exponent: what was much larger once keeps the grid of that, so that small ones tell most.
+# By binary exponent. A number keeps the grid of its largest value in training, so small ones tell most.
 MAGNITUDES = {"tiny": (-126, -15), "small": (-15, -13), "middling": (-13, -9), "large": (-9, 128)}
-# A number with so many zeros at its end is a short one, not a trained one; embedding leaves those alone.
+# A number that ends in this many zeros was not trained; embedding does not change it.
 _SHORT = np.uint32((1 << 20) - 1)
 
 Floats = npt.NDArray[np.float64]
@@ -45,7 +46,7 @@ class Words:
 
     @cached_property
     def trained(self) -> Flags:
-        """[N, F] which numbers are not short ones."""
+        """[N, F] which numbers are not short: see _SHORT."""
         found: Flags = (self.bits & _SHORT) != 0
         return found
 
@@ -55,8 +56,14 @@ class Words:
         return slice(int(columns[0]), int(columns[-1]) + 1) if len(columns) else slice(0, 0)
 
 
+def doubles(values: Tensor) -> Floats:
+    """A tensor as float64 on the CPU."""
+    found: Floats = values.detach().cpu().double().numpy()
+    return found
+
+
 def ulps(one: Bits, other: Bits) -> Ints:
-    """How many steps of the last bit lie between numbers; the far end of the integers where signs differ."""
+    """Steps of the last bit between numbers; 2^31 if their signs differ."""
     a, b = (each & 0x7FFFFFFF for each in (one, other))
     apart = np.abs(a.astype(np.int64) - b.astype(np.int64))
     return np.where((one ^ other) >> 31 == 0, apart, np.int64(1) << 31)

@@ -1,196 +1,186 @@
-"""The carry method: the secret's Gaussians, quantised and encrypted, in the low bits of the cover's."""
+"""The method `carry`: the secrets' Gaussians, encrypted in the published model."""
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
-from keyss.channels.base import Content, RecordRequest
-from keyss.channels.low_bits import LOW_BITS, LowBitsCover
-from keyss.channels.low_bits.layout import plan_records, record_capacity
-from keyss.channels.rooms import room_in
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import KeyssWarning
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import expand
-from keyss.methods.base import (
-    Capabilities,
-    Context,
-    KeyedSource,
-    Outlook,
-    SceneInput,
-    Source,
-    Stego,
-    advising,
-)
-from keyss.methods.carry.options import PRESETS, CarryOptions
-from keyss.methods.dither import dither, sampled
-from keyss.methods.records.embedding import embed_models, embed_whole, shares_of, unpack_records
-from keyss.methods.records.encoding import (
-    CarriedSecret,
-    check_degrees,
-    record_request,
-    record_requests,
-    subsampled_counts,
-)
-from keyss.methods.records.precision import check_fits
-from keyss.methods.records.prospect import outlook_whole
-from keyss.rendering.difference import Viewpoints, cost
+from keyss.methods.base import Capabilities, Context, Source, Stego, role_of
+from keyss.methods.carry.options import CarryOptions
+from keyss.methods.carry.refit import MODEL_ITERATIONS, refitted
+from keyss.methods.carry.room import RecordRoom, SecretRoom, Wanted, room_for
+from keyss.methods.plan import Plan
+from keyss.methods.records.embedding import Embedded
+from keyss.methods.records.quantise import out_of_range
+from keyss.rendering.difference import Viewpoints, psnr_between
 
-_PRUNE = '`prune_to_fit=True` leaves out the least visible, `publish="any"` has room'
-_ANY = '`publish="any"` needs no low bits of the cover'
-_DITHER = f"`dither=True` gives it new low bits, {_ANY}"
-_DITHER_AND_PRUNE = (
-    f"`dither=True, prune_to_fit=True` gives it new low bits and leaves out the least visible, {_ANY}"
+_SMALLER = (
+    "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
+    "keys can notice that there are other secrets"
 )
-_PRUNE_OR_PLY = '`prune_to_fit=True` leaves out what is seen least, `publish="ply"` has more room'
-
-NAME = "carry"
 
 
 class CarryMethod:
     """See `keyss.methods.base.Method`."""
 
-    name = NAME
-    summary = "carry models in the low bits of the cover's"
-    trains = False
+    name = CarryOptions.method
+    summary = "the secrets' Gaussians, encrypted in the cover's"
     most_secrets = 256
     capabilities = Capabilities()
     options = CarryOptions
-    presets: Mapping[str, CarryOptions] = PRESETS
 
-    def prepare(self, inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-        """Refuses given models that will not fit, and a given cover whose low bits are not random.
+    def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
+        """Decides which secrets are refitted.
 
-        Of models that are fitted first, sizes and low bits are not known: they are made to fit rather than
-        refused after their training.
+        Refuses a given cover without room, and given secrets that neither fit nor may be changed. Secrets
+        that are fitted first are made to fit.
         """
-        if options.publish != "ply":
-            return _prepared_for_room(inputs, options)
-        cover, *others = (each.model for each in inputs)
-        degree, *degrees = _degrees(inputs, options)
-        check_degrees(LOW_BITS, degree, degrees)
-        secrets = [model for model in others if model is not None]
-        requests = record_requests(secrets)
-        if cover is None:
-            if requests and not options.prune_to_fit:
-                with advising(UsageError, _PRUNE):  # at best all of them can carry something
-                    plan_records(requests, options.fit.max_gaussians, degree)
-            return replace(options, dither=True, prune_to_fit=True)
-        try:
-            prepared = _prepared(cover, options)
-        except InputError as error:
-            raise InputError(
-                f"{error}; {_ways(cover, options, [] if options.prune_to_fit else requests)}"
-            ) from error
-        if len(secrets) < len(others):
-            return replace(options, prune_to_fit=True)
-        _counts(prepared, secrets, options)
-        return options
+        cover, *secrets = sources
+        degree = options.sh_degree
+        if degree is None:
+            degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
+        options = options.with_fit(sh_degree=degree)
+        if cover.given is None and options.place.records:  # whose low bits may not be random
+            options = replace(options, dither=True)
+        room, wanted = room_for(cover.given, options), _wanted(secrets, options)
+        sizes = room.sizes(wanted)
+        fits = [size == each.size for size, each in zip(sizes, wanted, strict=True)]
+        if options.refit == "never" and not options.prune_to_fit:
+            room.check(wanted)
+        if options.refit == "always":
+            fits = [False] * len(fits)
+        elif options.refit == "never" or options.prune_to_fit:
+            fits = [True] * len(fits)
+        elif not all(fits) and sizes != [room.sizes([each])[0] for each in wanted]:
+            warnings.warn(_SMALLER, KeyssWarning, stacklevel=2)
+        steps = [
+            options.iterations
+            or (options.fit.iterations if each.photos else min(options.fit.iterations, MODEL_ITERATIONS))
+            for each in secrets
+        ]
+        return replace(
+            options, refits=tuple(0 if fit else each for fit, each in zip(fits, steps, strict=True))
+        )
 
-    def outlook(self, inputs: Sequence[SceneInput], options: CarryOptions) -> Outlook:
-        """The cover as it is, and in it what its carriers have room for."""
-        if options.publish != "ply":
-            return outlook_whole(inputs, options)
-        sizes = [options.fit.max_gaussians if each.model is None else len(each.model) for each in inputs]
-        degrees = _degrees(inputs, options)
-        cover, notes = inputs[0].model, []
-        carriers = sizes[0]
-        if cover is not None:
-            prepared = _prepared(cover, options)
-            carriers = prepared.carriers
-            if prepared.cover is not cover:
-                psnr = cost(cover, prepared.cover)
-                notes.append(f"dithering leaves the cover at {psnr:.1f} dB PSNR against itself")
-        requests = list(map(record_request, sizes[1:], degrees[1:]))
-        asked = sum(sizes[1:])
-        fit = record_capacity(requests, carriers, degrees[0])
-        return Outlook(sizes[0], degrees[0], asked, min(asked, fit), notes=tuple(notes))
+    def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
+        """The room in the cover; notes tell what is lost of the cover and of harmonics."""
+        cover, *secrets = sources
+        room, wanted = room_for(cover.given, options), _wanted(secrets, options)
+        sizes = room.sizes(wanted)
+        found, notes = room.plan(wanted), []
+        for index, (each, degree) in enumerate(
+            zip(sources, [room.sh_degree, *(degree for _, degree in sizes)], strict=True)
+        ):
+            if each.given is not None and each.given.sh_degree > degree:
+                psnr = psnr_between(each.given, each.given.with_sh_degree(degree))
+                notes.append(
+                    f"the {role_of(index, len(sources))} of SH degree {each.given.sh_degree} gets degree "
+                    f"{degree}: {psnr:.1f} dB PSNR against itself"
+                )
+        if (changed := _dithered(room, cover.given)) is not None:
+            notes.append(f"dithering leaves the cover at {changed:.1f} dB PSNR against itself")
+        drawn = [count if steps else 0 for steps, (count, _) in zip(options.refits, sizes, strict=True)]
+        return replace(
+            found,
+            steps=max(options.refits),
+            drawn=(0, *drawn),
+            notes=(*notes, *found.notes),
+        )
 
     def hide(
-        self, cover: Source, secrets: Sequence[KeyedSource], options: CarryOptions, context: Context
+        self, cover: Source, secrets: Sequence[Source], options: CarryOptions, context: Context
     ) -> Stego:
-        """Carry the secrets, and open each again as its reader will.
+        """Refit the secrets that need it, embed all, and open each again as its reader will.
 
-        Raises UsageError for too large secrets, InputError for a cover whose low bits are not random.
+        Raises UsageError and InputError for a cover without room, Interrupted on Ctrl-C, and InputError for a
+        checkpoint of another run.
         """
+        room = room_for(cover.model, options, context.entropy)
+        plain = [each.model for each in secrets]
+        viewpoints = [Viewpoints.of(each.scene) for each in secrets]
+        models, seconds = list(plain), 0.0
+        if any(options.refits):
+            sizes = room.refit_sizes(plain, viewpoints)
+            for index, (secret, steps, (count, degree)) in enumerate(
+                zip(secrets, options.refits, sizes, strict=True)
+            ):
+                if steps:
+                    found = refitted(
+                        secret.model.with_sh_degree(degree),
+                        secret.scene,
+                        count,
+                        replace(options.fit, iterations=steps),
+                        context,
+                        photos=secret.photos,
+                        name=role_of(index + 1, len(secrets) + 1),
+                    )
+                    models[index], seconds = found.gaussians, seconds + found.seconds
         start = time.monotonic()
-        models, keys = [each.source.model for each in secrets], [each.key for each in secrets]
-        if options.publish != "ply":
-            room = room_in(cover.model, options.publish, options.channel, repair=options.repair)
-            with advising(UsageError, _PRUNE_OR_PLY):
-                views = [Viewpoints.of(each.source.scene) for each in secrets]
-                written = embed_whole(
-                    room, keys, models, views, prune=options.prune_to_fit, entropy=context.entropy
-                )
-            seconds = time.monotonic() - start
-            return Stego(written.stego, written.opened, seconds, details=written.details, verified=True)
-        check_degrees(LOW_BITS, cover.model.sh_degree, [model.sh_degree for model in models])
-        with advising(InputError, _ANY if options.dither else _DITHER):
-            prepared = _prepared(cover.model, options, context.entropy)
-        counts = _counts(prepared, models, options)
-        found = embed_models(prepared, keys, models, counts, NAME, entropy=context.entropy)
-        seconds = time.monotonic() - start
-        return Stego(found.stego, found.opened, seconds, details=found.details(cover.model), verified=True)
-
-    def unpack(self, content: Content) -> CarriedSecret:
-        """The Gaussians that are left. Raises InputError for damage."""
-        return unpack_records(content)
+        embedded = room.embed([each.key for each in secrets], models, viewpoints, context.entropy)
+        seconds += time.monotonic() - start
+        details = embedded.details | _losses(room, cover.model, plain, models, embedded)
+        return Stego(
+            embedded.stego,
+            embedded.opened,
+            seconds,
+            max(options.refits),
+            details,
+            verified=True,
+        )
 
 
-def _prepared_for_room(inputs: Sequence[SceneInput], options: CarryOptions) -> CarryOptions:
-    """Refuses given models that will not fit; those that are fitted first are made to fit."""
-    cover, *others = (each.model for each in inputs)
-    secrets = [model for model in others if model is not None]
-    if cover is None or len(secrets) < len(others):
-        return replace(options, prune_to_fit=True)
-    room = room_in(cover, options.publish, options.channel, repair=options.repair)
-    with advising(UsageError, _PRUNE_OR_PLY):
-        if not options.prune_to_fit:
-            for model, share in zip(secrets, shares_of(room, secrets), strict=True):
-                check_fits(model, share)
-    return options
+def _wanted(secrets: Sequence[Source], options: CarryOptions) -> list[Wanted]:
+    fits = options.fits(1 + len(secrets))[1:]
+    return [
+        Wanted(fit.max_gaussians, fit.sh_degree) if each.given is None else Wanted.of(each.given)
+        for each, fit in zip(secrets, fits, strict=True)
+    ]
 
 
-def _degrees(inputs: Sequence[SceneInput], options: CarryOptions) -> list[int]:
-    """SH degrees of the models that are given, and of those that will be fitted."""
-    return [options.fit.sh_degree if each.model is None else each.model.sh_degree for each in inputs]
+def _dithered(room: SecretRoom, cover: Gaussians | None) -> float | None:
+    """PSNR in dB of a cover that was changed before anything lies in it against the one that was given."""
+    prepared = room.prepared if isinstance(room, RecordRoom) else None
+    return (
+        None
+        if cover is None or prepared is None or prepared.cover is cover
+        else psnr_between(cover, prepared.cover)
+    )
 
 
-def _prepared(cover: Gaussians, options: CarryOptions, entropy: bytes | None = None) -> LowBitsCover:
-    """The cover as it is, if that will do."""
-    try:
-        LOW_BITS.prepare(sampled(cover))
-        return LOW_BITS.prepare(cover)
-    except InputError:
-        if not options.dither:
-            raise
-    random = os.urandom(32) if entropy is None else expand(entropy, "carry/dither", 32)
-    return LOW_BITS.prepare(dither(cover, random))
+def _losses(
+    room: SecretRoom,
+    cover: Gaussians,
+    plain: Sequence[Gaussians],
+    models: Sequence[Gaussians],
+    found: Embedded,
+) -> dict[str, Any]:
+    """Numbers for metrics.json of what cover and secrets lost; `models`: after refits."""
+    kept = [each.gaussians for each in found.opened]
+    details: dict[str, Any] = {"gaussians_before_pruning": list(map(len, plain))}
+    pairs = list(zip(models, kept, strict=True))
+    if any(len(after) < len(before) for before, after in pairs):
+        details["share_kept_by_pruning"] = [round(len(after) / len(before), 4) for before, after in pairs]
+        details["pruned_secret_psnr_against_the_whole"] = [
+            round(psnr_between(before, after), 1) if len(after) < len(before) else None
+            for before, after in pairs
+        ]
+    fewer = [
+        round(psnr_between(before, before.with_sh_degree(after.sh_degree)), 1)
+        for before, after in zip((cover, *plain), (found.stego, *kept), strict=True)
+        if before.sh_degree > after.sh_degree
+    ]
+    if fewer:
+        details["psnr_of_fewer_harmonics"] = fewer
+    if any(clamped := list(map(out_of_range, models))):
+        details["gaussians_with_clamped_numbers"] = clamped
+    if (changed := _dithered(room, cover)) is not None:
+        details["dithered_cover_psnr_against_the_one_before"] = round(changed, 1)
+    return details
 
 
-def _ways(cover: Gaussians, options: CarryOptions, requests: Sequence[RecordRequest]) -> str:
-    """What works for a cover whose low bits are not random."""
-    if options.dither:
-        return _ANY
-    try:
-        prepared = LOW_BITS.prepare(dither(cover, os.urandom(32)))  # all: a sample shows few duplicates
-    except InputError:
-        return _ANY
-    fits = not requests or sum(each.count for each in requests) <= prepared.record_capacity(requests)
-    return _DITHER if fits else _DITHER_AND_PRUNE
-
-
-def _counts(prepared: LowBitsCover, models: Sequence[Gaussians], options: CarryOptions) -> list[int]:
-    """How many Gaussians of each model are carried: all, unless pruning may leave some out.
-
-    Raises UsageError if they do not fit.
-    """
-    with advising(UsageError, _ANY):
-        kept = subsampled_counts(prepared, models)  # refuses where pruning would not help either
-    if options.prune_to_fit:
-        return kept
-    with advising(UsageError, _PRUNE):
-        prepared.plan_records(record_requests(models))
-    return [len(model) for model in models]
+METHOD = CarryMethod()

@@ -1,12 +1,4 @@
-"""The peers: what others have published, and the simplest things that could be done, behind one protocol.
+"""The peers: published methods and simple baselines behind one protocol, to compare with (docs/peers.md).
 
-Written from the papers' descriptions, to be compared with (docs/peers.md); nobody's code is in them.
+They are written from the papers' descriptions and contain nobody else's code.
 """
-
-from keyss.methods.peers.bound import BoundMethod
-from keyss.methods.peers.decoder import DecoderMethod
-from keyss.methods.peers.gs_hider import GsHiderMethod
-from keyss.methods.peers.sh import ShMethod
-from keyss.methods.peers.watergs import WaterGsMethod
-
-PEERS = (BoundMethod(), ShMethod(), DecoderMethod(), GsHiderMethod(), WaterGsMethod())

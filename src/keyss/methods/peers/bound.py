@@ -1,27 +1,18 @@
-"""The bound: two plain 3DGS models (Kerbl et al. 2023), one published, one sent. Nothing is hidden."""
+"""The bound: two plain 3DGS models (Kerbl et al. 2023), one published, one handed over. Nothing is hidden."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
-from keyss.channels.base import Content
-from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import (
-    Capabilities,
-    Context,
-    KeyedSource,
-    Outlook,
-    SceneInput,
-    Source,
-    Stego,
-    Training,
-)
-from keyss.methods.peers.options import PeerOptions, presets_of
+from keyss.methods.base import Capabilities, Context, Source, Stego, Training
+from keyss.methods.peers.method import Peer
+from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.plan import Plan
 
-NAME = "3dgs"
 _NAMES = tuple(each.name for each in fields(Gaussians))
 
 
@@ -29,47 +20,39 @@ _NAMES = tuple(each.name for each in fields(Gaussians))
 class BoundOptions(PeerOptions):
     """Of plain models; there is no other training."""
 
+    method: ClassVar[str] = "3dgs"
+
     def training(self, scenes: int) -> tuple[Training, ...]:
         """None."""
         return (Training(),) * scenes
 
 
-class BoundMethod:
+class BoundMethod(Peer):
     """See `keyss.methods.base.Method`."""
 
-    name = NAME
+    name = BoundOptions.method
     summary = "two plain models, the second handed over: nothing is hidden, a bound"
-    trains = False
-    most_secrets = 1
     capabilities = Capabilities(keys=False, hands_over=True)
     options = BoundOptions
-    presets: Mapping[str, PeerOptions] = presets_of(BoundOptions)
 
-    def prepare(self, inputs: Sequence[SceneInput], options: PeerOptions) -> PeerOptions:
-        """Nothing can go wrong."""
-        return options
-
-    def outlook(self, inputs: Sequence[SceneInput], options: PeerOptions) -> Outlook:
+    def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
         """Both as they are."""
         fit = options.fit
-        cover, secret = (fit.max_gaussians if each.model is None else len(each.model) for each in inputs)
-        degree = fit.sh_degree if inputs[0].model is None else inputs[0].model.sh_degree
-        return Outlook(cover, degree, secret, secret)
+        cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
+        degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
+        return Plan(gaussians=cover, sh_degree=degree, asked=secret, capacity=secret)
 
-    def hide(
-        self, cover: Source, secrets: Sequence[KeyedSource], options: PeerOptions, context: Context
-    ) -> Stego:
-        """Nothing is done."""
+    def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
+        """Hand the secret's model over."""
         (secret,) = secrets
-        tensors = {name: getattr(secret.source.model, name) for name in _NAMES}
-        payload = HandedTensors(tensors).payload(NAME)
+        tensors = {name: getattr(secret.model, name) for name in _NAMES}
+        payload = HandedTensors(tensors).payload(self.name)
         return Stego(cover.model, (self.unpack(payload),), 0.0, handed=(payload,))
 
-    def unpack(self, content: Content) -> HandedSecret:
-        """The plain model. Raises InputError for damage."""
-        handed = HandedTensors.of(content)
-        try:
-            model = Gaussians(*handed.taken(_NAMES))
-        except ValueError as error:
-            raise InputError(f"what was handed over is damaged: {error}") from error
-        return HandedSecret(handed, lambda stego: model, aligned=False)
+    def open(self, handed: HandedTensors) -> HandedSecret:
+        model = Gaussians(*handed.taken(_NAMES))
+        return HandedSecret(handed, lambda stego: model)
+
+
+METHOD = BoundMethod()
+unpack = METHOD.unpack

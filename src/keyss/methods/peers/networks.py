@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from keyss.core.decoded import PictureNetwork
-from keyss.core.errors import InputError
 from keyss.methods.peers.payload import HandedTensors
 
 WIDTH, LAYERS = 64, 5
@@ -25,18 +24,14 @@ class Convolutions(torch.nn.Module):
         )
 
     def network(self, background: Tensor) -> PictureNetwork:
-        """As what is drawn before `background` [C] goes through it; attached to the graph."""
+        """For pictures with `background` [C]; attached to the graph."""
         weights = list(self.parameters())
         return PictureNetwork(tuple(zip(weights[::2], weights[1::2], strict=True)), background)
 
 
-def untrained(channels: int) -> PictureNetwork:
-    """One of that size, which shows nothing."""
-    widths = [channels, *[WIDTH] * (LAYERS - 1), 3]
-    layers = tuple(
-        (torch.zeros(after, before, 3, 3), torch.zeros(after)) for before, after in pairwise(widths)
-    )
-    return PictureNetwork(layers, torch.zeros(channels))
+def weights_of(channels: int) -> int:
+    """Weights of such a network, biases not counted."""
+    return sum(9 * before * after for before, after in pairwise([channels, *[WIDTH] * (LAYERS - 1), 3]))
 
 
 def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
@@ -48,10 +43,7 @@ def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
 
 
 def network_of(handed: HandedTensors) -> PictureNetwork:
-    """What `network_tensors` gave. Raises InputError for damage."""
+    """What `network_tensors` gave. Raises InputError, ValueError and TypeError for damage."""
     names = [f"{kind}.{index}" for index in range(LAYERS) for kind in ("weight", "bias")]
     background, *rest = handed.taken(["background", *names])
-    try:
-        return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"what was handed over is damaged: {error}") from error
+    return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)

@@ -1,26 +1,27 @@
 """Splats in Splats, also WaterGS (Guo et al. 2024): harmonics in the low bits of harmonics, mapped opacities.
 
 Both scenes share positions, scales and rotations. The secret's harmonics lie encrypted in the low bits of the
-cover's, and its opacities are what a small convolutional autoencoder makes of the cover's. The published file
-is a 3DGS model; the autoencoder and what decrypts are handed over, sealed with the key.
+cover's, and a small convolutional autoencoder maps the cover's opacities to its own. The published file is a
+3DGS model; the autoencoder and the cipher's key are handed over, sealed with the secret's key.
 
-The paper leaves open how many bits there are and when the autoencoder is trained; what is chosen here:
+The paper leaves the number of bits and the time of the autoencoder's training open. Here:
 
 - *importance-graded* both ways: the secret's constant coefficients get most bits, degree 3 the fewest, and
   the bits that matter most lie where they cost the cover least, at the bottom of its highest degrees;
-- once no Gaussians are added any more, they are sorted along a Morton curve, so that neighbours in the list
-  are neighbours in space; the autoencoder is fitted to the opacities that the secret has by then, and takes
-  their place for the rest of the training, so that everything else makes up for what it misses.
+- once growth has stopped, the Gaussians are sorted along a Morton curve, where neighbours in the list are
+  neighbours in space; the autoencoder is fitted to the secret's opacities and replaces them for the rest of
+  the training, in which everything else adapts to it.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -31,24 +32,20 @@ from torch import Tensor
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
-from keyss.core.similarity import Similarity
 from keyss.files.formats.common import morton_order
 from keyss.fitting.parameters import make_optimizers
 from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
-from keyss.methods.peers.joint import JointPeer
-from keyss.methods.peers.options import PeerOptions, presets_of
+from keyss.methods.joint import Picture
+from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
+from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
-from keyss.methods.peers.training import PeerRun, Picture
-from keyss.methods.poses import PlacedScene
-from keyss.rendering import render_with_meta
 
-NAME = "watergs"
 COVER_BITS = (8, 10, 12, 14)  # of the 23 of a mantissa, by degree
 SECRET_BITS = (16, 13, 11, 10)  # of a coefficient where there is room for all, by degree
 WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # of the autoencoder, along the list of Gaussians
-_FIT_STEPS = 200  # of the autoencoder, to the opacities that it takes the place of
+_FIT_STEPS = 200  # of the autoencoder, to the secret's own opacities
 _RANGE = 0.999  # of the coefficients of a degree, but for the constant ones; larger ones are cut off
 _BLOCK = 1 << 14  # Gaussians at a time
 _CIPHER_BYTES = 32
@@ -165,7 +162,7 @@ class OpacityMapping(torch.nn.Module):
         return values[0, 0]
 
 
-class WaterGsRun(PeerRun):
+class WaterGsTraining(PeerTraining):
     """Two sets of harmonics and of opacities; the second opacities are mapped in the end."""
 
     def prepare(self, start: Gaussians) -> None:
@@ -198,13 +195,13 @@ class WaterGsRun(PeerRun):
             if scene:
                 logits = self.mapping(logits) if self.mapped else self.parameters["secret_opacities"]
                 sh = self.parameters["secret_sh"]
-            model = Gaussians(**self.geometry(), opacity_logits=logits, sh=sh)
-            pictures.append(render_with_meta(model, camera, self.backgrounds[scene], sh_degree=sh_degree))
+            model = gaussians_of(self.parameters, logits, sh)
+            pictures.append(self.render(model, scene, camera, sh_degree))
         return pictures
 
     @torch.no_grad()
     def _sort(self) -> None:
-        """The order in which the model is published, and by which the autoencoder goes."""
+        """Sort the Gaussians as they are published; the autoencoder depends on their order."""
         means = self.parameters["means"]
         order = torch.from_numpy(morton_order(means.detach().cpu().numpy())).to(means.device)
         for name, parameter in self.parameters.items():
@@ -213,7 +210,7 @@ class WaterGsRun(PeerRun):
                     values.copy_(values[order])
 
     def _fit_mapping(self) -> None:
-        """By cross entropy: squared errors of opacities have no slope where these are nearly 0 or 1."""
+        """By cross entropy: squared errors have hardly a gradient where opacities are nearly 0 or 1."""
         logits = self.parameters["opacities"].detach()
         wanted = self.parameters["secret_opacities"].detach().sigmoid()
         adam = torch.optim.Adam(self.mapping.parameters(), lr=5 * self.options.network_rate)
@@ -229,11 +226,13 @@ class WaterGsRun(PeerRun):
 class WaterGsOptions(PeerOptions):
     """See `PeerOptions`."""
 
+    method: ClassVar[str] = "watergs"
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if int(self.fit.iterations * self.fit.grow_stop) < 1:
             raise UsageError(
-                "`fit`: expected at least one step before growth stops, for opacities are mapped then; got "
+                "`fit`: expected at least one step before growth stops, when opacities are mapped; got "
                 f"{self.fit.iterations} steps, and growth in {self.fit.grow_stop:g} of them"
             )
 
@@ -241,35 +240,29 @@ class WaterGsOptions(PeerOptions):
 class WaterGsMethod(JointPeer):
     """See `keyss.methods.base.Method`."""
 
-    name = NAME
+    name = WaterGsOptions.method
     summary = "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)"
     capabilities = Capabilities(hands_over=True)
     options = WaterGsOptions
-    presets: Mapping[str, PeerOptions] = presets_of(WaterGsOptions)
+    training = WaterGsTraining
 
-    def begin(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> WaterGsRun:
-        return WaterGsRun(scenes, options, device)
-
-    def publish(self, run: WaterGsRun, frame: Similarity) -> tuple[Gaussians, HandedTensors]:
-        """All Gaussians: the autoencoder goes by their list."""
+    def publish(self, run: WaterGsTraining) -> tuple[Gaussians, HandedTensors]:
+        """All Gaussians: the autoencoder depends on their order."""
         kept = {name: value.detach().cpu() for name, value in run.parameters.items()}
         ranges, cipher = ranges_of(kept["secret_sh"]), os.urandom(_CIPHER_BYTES)
         sh = write_bits(kept["sh"], kept["secret_sh"], ranges, cipher)
-        stego = Gaussians(kept["means"], kept["quats"], kept["scales"], kept["opacities"], sh)
+        stego = gaussians_of(kept, kept["opacities"], sh)
         tensors = {f"mapping.{name}": value for name, value in run.mapping.state_dict().items()}
         tensors |= {"ranges": ranges, "cipher": torch.tensor(list(cipher), dtype=torch.uint8)}
-        return stego, HandedTensors(tensors, frame, rows=len(stego))
+        return stego, HandedTensors(tensors, run.frame, rows=len(stego))
 
     def open(self, handed: HandedTensors) -> HandedSecret:
         mapping = OpacityMapping().requires_grad_(False)
         names = [f"mapping.{name}" for name in mapping.state_dict()]
         *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
-        try:
-            mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
-        except RuntimeError as error:
-            raise InputError("what was handed over is damaged: no such autoencoder") from error
+        mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
         if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
-            raise InputError("what was handed over is damaged: no such cipher")
+            raise ValueError("no such cipher")
         cipher = bytes(numbers.tolist())
 
         def show(stego: Gaussians) -> Gaussians:
@@ -280,3 +273,7 @@ class WaterGsMethod(JointPeer):
             return Gaussians(stego.means, stego.quats, stego.log_scales, logits, sh)
 
         return HandedSecret(handed, show)
+
+
+METHOD = WaterGsMethod()
+unpack = METHOD.unpack

@@ -16,7 +16,7 @@ _TAIL = 0.05  # share of the numbers that says nothing of how far the bulk reach
 _EVEN_MARGIN = 0.75  # on a line divided evenly the bulk's neighbourhood ends as many of its widths from it
 _FAR = 8.0  # on one by asinh it ends at as many times the bulk's distance from the median
 _FURTHEST = 1e30  # no value that a line may give is larger
-_LEAST_SPREAD = 1e-9
+_MIN_SPREAD = 1e-9
 _HALF = 1e-3  # half precision rounds by less than this share
 LINE = struct.Struct("<2f2e")  # centre, spread, reach, reach of outliers
 # The line with the least square error makes numbers smaller on average, which costs more against photos than
@@ -79,6 +79,11 @@ class Extent(NamedTuple):
     least: float
     largest: float
 
+    @staticmethod
+    def of(values: Floats) -> Extent:
+        """Of all values; there may be none."""
+        return Extent(float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)))
+
     def from_centre(self, centre: float) -> float:
         """The largest distance of a number from `centre`; 0 where there are none."""
         return max(self.largest - centre, centre - self.least, 0.0)
@@ -109,7 +114,7 @@ def fitted(kind: Kind, bits: int, sample: Floats, extent: Extent, centre: float,
     """
     if kind.even:
         return _line((extent.least + extent.largest) / 2, 0, (extent.largest - extent.least) / 2)
-    spread = max(spread, _LEAST_SPREAD)
+    spread = max(spread, _MIN_SPREAD)
     if kind.clips:
         return _best_line(sample, bits, extent.from_centre(centre) or 1.0, centre, spread)
     return reaching(_line(centre, spread, 1), extent)

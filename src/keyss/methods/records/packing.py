@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -13,18 +13,20 @@ Bytes = npt.NDArray[np.uint8]
 CHUNK = 1 << 14  # Gaussians at a time: every bit takes a byte meanwhile
 
 
-def packed(columns: Iterator[tuple[Codes, int]]) -> Bytes:
-    """[N, bytes] the codes one after the other, the highest bit of each first."""
-    parts = []
-    for codes, bits in columns:
-        shifts = np.arange(bits - 1, -1, -1, dtype=np.uint32)
-        parts.append((codes[:, :, None] >> shifts & 1).astype(np.uint8).reshape(len(codes), -1))
-    return np.packbits(np.concatenate(parts, axis=1), axis=1)
-
-
 def records_of_codes(columns: Sequence[Codes], layout: Sequence[tuple[int, int]]) -> Bytes:
-    """[N, bytes] records of codes [N, columns] for each (columns, bits) of a `layout`."""
-    return packed(iter([(codes, bits) for codes, (_, bits) in zip(columns, layout, strict=True)]))
+    """[N, bytes] the codes one after the other, the highest bit of each first.
+
+    `columns`: codes [N, columns] for each (columns, bits) of `layout`.
+    """
+    parts = []
+    for start in range(0, len(columns[0]), CHUNK):
+        bits = []
+        for codes, (_, count) in zip(columns, layout, strict=True):
+            shifts = np.arange(count - 1, -1, -1, dtype=np.uint32)
+            part = codes[start : start + CHUNK, :, None] >> shifts & 1
+            bits.append(part.astype(np.uint8).reshape(len(part), -1))
+        parts.append(np.packbits(np.concatenate(bits, axis=1), axis=1))
+    return np.concatenate(parts)
 
 
 def codes_of_records(records: Bytes, layout: Sequence[tuple[int, int]]) -> list[Codes]:

@@ -12,15 +12,15 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.encoding import most_visible
 from keyss.methods.records.table import Table
-from keyss.methods.records.whole import MOST_BITS, USUAL_BITS, Precision, decode, encode
-from keyss.rendering.difference import Viewpoints, cost
+from keyss.methods.records.whole import MAX_BITS, USUAL_BITS, Precision, decode, encode
+from keyss.rendering.difference import Viewpoints, psnr_between
 
 _GOOD_ENOUGH = 44.0  # dB of pictures against those of the model: of photos at 30 dB it takes 0.2
 # Of each attribute alone, until they are good enough together; shares of opacities, of which there are fewer
 # than of others, and of harmonics, of which more numbers than three become longer.
 _GOALS, _BIT = range(47, 61), 6.02  # dB
 _ATTRIBUTES, _SHARES = ("means", "log_scales", "quats", "opacity_logits"), (0, 0, 0, 4.8, 0, -8)
-_FEWEST, _MOST = (8, 4, 4, 4, 4), 20  # bits
+_FEWEST, _MAX = (8, 4, 4, 4, 4), 20  # bits
 _COARSEST = 0.1  # step of harmonics: they show from near, and not from around
 
 
@@ -31,18 +31,18 @@ def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Preci
     which the squared error of each is in proportion to the numbers that a bit more is spent on.
     """
     table, step = Precision.of_size(Table.short().total)
-    rough = decode(encode(model, Precision(table, step))).gaussians
+    rough = decode(encode(model, Precision(table, step)))
     model = in_morton_order(model)
     constant = replace(model, sh=torch.cat([rough.sh[:, :1], model.sh[:, 1:]], 1))
     harmonics = replace(model, sh=torch.cat([model.sh[:, :1], rough.sh[:, 1:]], 1))
     changed = [replace(model, **{name: getattr(rough, name)}) for name in _ATTRIBUTES]
-    costs = [cost(model, each, viewpoints) for each in (*changed, constant, harmonics)]
+    psnrs = [psnr_between(model, each, viewpoints) for each in (*changed, constant, harmonics)]
     for goal in _GOALS:
-        missing = [goal + more - each for more, each in zip(_SHARES, costs, strict=True)]
+        missing = [goal + more - each for more, each in zip(_SHARES, psnrs, strict=True)]
         bits = (each + math.ceil(dB / _BIT) for each, dB in zip(table.bits, missing, strict=False))
-        found = Table(tuple(min(max(each, least), _MOST) for each, least in zip(bits, _FEWEST, strict=True)))
+        found = Table(tuple(min(max(each, least), _MAX) for each, least in zip(bits, _FEWEST, strict=True)))
         precision = Precision(found, min(_COARSEST, step * 10 ** (-missing[-1] / 20)))
-        if cost(model, decode(encode(model, precision)).gaussians, viewpoints) >= _GOOD_ENOUGH:
+        if psnr_between(model, decode(encode(model, precision)), viewpoints) >= _GOOD_ENOUGH:
             break
     return precision
 
@@ -73,7 +73,7 @@ def pruned(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) ->
     candidates = [found for each in degrees if (found := _pruned(model.with_sh_degree(each), room))]
     if not candidates:
         raise UsageError(f"nothing of a secret fits into {room:,} bytes")
-    return max(candidates, key=lambda each: cost(model, each, viewpoints))
+    return max(candidates, key=lambda each: psnr_between(model, each, viewpoints))
 
 
 def fitted(
@@ -109,7 +109,7 @@ def _most_precise(model: Gaussians, room: int) -> bytes:
     """The longest encoding that fits, at least that of the usual bits."""
     usual = encode(model)
     more = 8 * (room - len(usual)) // len(model)
-    for bits in range(min(MOST_BITS, USUAL_BITS + more), USUAL_BITS, -2):
+    for bits in range(min(MAX_BITS, USUAL_BITS + more), USUAL_BITS, -2):
         data = encode(model, Precision.of_size(bits))
         if len(data) <= room:
             return data

@@ -19,9 +19,8 @@ clamped.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,41 +28,34 @@ import torch
 
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
-from keyss.core.gaussians import MAX_COLOUR, MAX_COORDINATE, MAX_LENGTH, MAX_LOG_SCALE, Gaussians
-from keyss.methods.records import kernels
+from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
 from keyss.methods.records.lines import (
     COLOUR,
     EVEN,
     HARMONIC,
     LINE,
     POSITION,
+    Codes,
     Extent,
+    Floats,
     Kind,
     Line,
     fitted,
     neighbourhood,
     reaching,
 )
+from keyss.methods.records.packing import Bytes, codes_of_records, records_of_codes
 from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
 from keyss.rendering.cpu.parallel import in_blocks
 
-__all__ = ["Codec", "Line", "out_of_range", "outliers"]
-
-Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float64]
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is drawn at all
 _MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
 _SAMPLE = 20_000  # Gaussians that a line is fitted to
 _TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
-_LOOKED_UP = 13  # bits of codes for which there is a table of numbers
-_BLOCK = 1 << 14  # Gaussians that a thread takes at a time
-_QUAT_REACH = 0.5**0.5  # of the three smaller components
-_LIMITS = np.array([MAX_COORDINATE, MAX_LOG_SCALE, MAX_LOGIT, _MAX_HARMONIC], np.float32)
-# Limits of what is drawn, those of single precision as it has them.
-_OVERFLOW = np.array([np.float32(MAX_COORDINATE), MAX_LOG_SCALE, MAX_LENGTH, np.float32(MAX_COLOUR)])
+_QUAT_LINE = Line(0, 0, 0.5**0.5)  # of the three smaller components
 
 
 @dataclass(frozen=True)
@@ -80,71 +72,51 @@ class Codec:
         if table.sh_degree != gaussians.sh_degree:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
         outlier = outliers(gaussians)
-        kinds, line_of = _kinds(table.sh_degree), _line_of(table.sh_degree)
-        numbers = _numbers(gaussians)
-        centres = _centres(numbers, kinds, line_of, ~outlier)
+        kinds, bits, found = _kinds(table.sh_degree), _bits(table), list[_Measured]()
+        for kind, values in zip(kinds, _numbers(gaussians), strict=True):
+            found.append(_Measured.of(kind, values[~outlier], values[outlier]))
 
-        def measured(start: int, stop: int) -> Floats:
-            found = np.empty((len(kinds), 5))
-            kernels.reaches(start, stop, *numbers, line_of, centres, outlier, found)
-            return found
-
-        parts = np.stack(in_blocks(measured, len(gaussians), _BLOCK))
-        least, largest = parts[:, :, [0, 3]].min(axis=0), parts[:, :, [1, 4]].max(axis=0)
-        distances = parts[:, :, 2].sum(axis=0)
-        rows = np.flatnonzero(~outlier)
-        sample = list(_sampled(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])]))
-        bits = _bits(table)
-
-        def fit_line(line: int, _: int) -> tuple[Line, Line]:
-            inner, outer = (Extent(least[line, i], largest[line, i]) for i in range(2))
-            spread = distances[line] / (len(rows) * int((line_of == line).sum()))
-            values = sample[line].ravel()
-            found = fitted(kinds[line], int(bits[line]), values, inner, centres[line], spread)
-            return found, reaching(found, outer)
+        def fit_line(index: int, _: int) -> tuple[Line, Line]:
+            each = found[index]
+            line = fitted(kinds[index], bits[index], each.sample, each.inner, each.centre, each.spread)
+            return line, reaching(line, each.outer)
 
         lines, far = zip(*in_blocks(fit_line, len(kinds), 1), strict=True)
         return Codec(table, lines, far)
 
     def encode(self, gaussians: Gaussians) -> Bytes:
         """[N, record_bytes] the records of N Gaussians; the bits left over are zero."""
-        records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
-        means, scales, *others = _numbers(gaussians)
-        _for_all(
-            gaussians,
-            kernels.encode,
-            *(means, scales, _array(gaussians.quats), *others),
-            *(*self._arrays, outliers(gaussians), _bits(self.table), self.table.bits[2], _QUAT_REACH),
-            *(_MIN_LENGTH, records),
-        )
-        return records
+        outlier = outliers(gaussians)
+        left_out, three = _three_smallest(_doubles(gaussians.quats))
+        columns = [
+            outlier[:, None].astype(np.uint32),
+            left_out,
+            _QUAT_LINE.encode(three, self.table.bits[2]),
+        ]
+        every = zip(self.lines, self.far, _bits(self.table), _numbers(gaussians), strict=True)
+        for line, far, bits, values in every:
+            codes = line.encode(values, bits)
+            codes[outlier] = far.encode(values[outlier], bits)
+            columns.append(codes)
+        return records_of_codes(columns, self.table.layout)
 
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes]: finite float32, whatever bytes they are."""
-        count, bits = len(records), _bits(self.table)
-        shapes = ((3,), (3,), (4,), (), ((self.table.sh_degree + 1) ** 2, 3))
-        means, scales, quats, opacities, sh = (np.empty((count, *shape), np.float32) for shape in shapes)
-        tables, begins, size = [np.zeros(0)], np.full(len(bits), -1), 0
-        for line, each in enumerate(bits.tolist()):
-            if each <= _LOOKED_UP:
-                codes = np.arange(1 << each, dtype=np.uint32)
-                tables += [self.lines[line].decode(codes, each), self.far[line].decode(codes, each)]
-                begins[line], size = size, size + 2 * len(codes)
-        looked_up = (np.concatenate(tables), begins, bits, self.table.bits[2], _QUAT_REACH, OPPONENT)
-        tensors = (means, scales, quats, opacities, sh)
-        rows = np.ascontiguousarray(records)
-        in_blocks(
-            lambda start, stop: kernels.decode(start, stop, rows, *self._arrays, *looked_up, *tensors),
-            count,
-            _BLOCK,
-        )
-        return Gaussians(*(torch.from_numpy(each) for each in (means, quats, scales, opacities, sh)))
-
-    @property
-    def _arrays(self) -> tuple[npt.NDArray[np.int64], Floats, Floats]:
-        """The line of each number, the lines and the reaches of outliers, for kernels."""
-        lines = np.array([[line.centre, line.spread, line.reach] for line in self.lines])
-        return _line_of(self.table.sh_degree), lines, np.array([line.reach for line in self.far])
+        outlier, left_out, three, *columns = codes_of_records(records, self.table.layout)
+        beyond = outlier[:, 0] > 0
+        numbers = []
+        for line, far, bits, codes in zip(self.lines, self.far, _bits(self.table), columns, strict=True):
+            values = line.decode(codes, bits)
+            values[beyond] = far.decode(codes[beyond], bits)
+            numbers.append(values)
+        x, y, z, scales, opacities, *colours = numbers
+        bands = []
+        for brightness, differences in zip(colours[::2], colours[1::2], strict=True):
+            pairs = differences.reshape(*brightness.shape, 2)
+            bands.append(np.concatenate([brightness[:, :, None], pairs], axis=2) @ OPPONENT)
+        quats = _whole_quats(left_out, _QUAT_LINE.decode(three, self.table.bits[2]))
+        tensors = (np.concatenate([x, y, z], 1), quats, scales, opacities[:, 0], np.concatenate(bands, 1))
+        return Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in tensors))
 
     def pack(self) -> bytes:
         """The codec itself: 92 to 164 bytes."""
@@ -175,14 +147,30 @@ class Codec:
         return Codec(table, lines, far)
 
 
+@dataclass(frozen=True)
+class _Measured:
+    """What a line is fitted to."""
+
+    sample: Floats  # of numbers that are no outliers'
+    inner: Extent  # of all of these
+    outer: Extent  # of outliers'
+    centre: float
+    spread: float  # mean distance from the centre
+
+    @staticmethod
+    def of(kind: Kind, values: Floats, outlying: Floats) -> _Measured:
+        centre = 0.0 if kind.even or kind.centred else float(np.median(values))
+        spread = float(np.abs(values - centre).mean())
+        sample = values[:: max(1, len(values) // _SAMPLE)].ravel()
+        return _Measured(sample, Extent.of(values), Extent.of(outlying), centre, spread)
+
+
 def outliers(gaussians: Gaussians) -> Mask:
     """[N] which Gaussians have a number far outside of the bulk; none where that would be all."""
-    sample = _sampled(gaussians[:: max(1, len(gaussians) // _SAMPLE)])
-    kinds = _kinds(gaussians.sh_degree)
-    ends = np.array([neighbourhood(values, kind) for values, kind in zip(sample, kinds, strict=True)])
-    least, largest = ends.T[:, _line_of(gaussians.sh_degree)]
-    found = np.empty(len(gaussians), bool)
-    _for_all(gaussians, kernels.beyond, *_numbers(gaussians), least, largest, found)
+    found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
+    for kind, values in zip(_kinds(gaussians.sh_degree), _numbers(gaussians), strict=True):
+        least, largest = neighbourhood(values[::every], kind)
+        found |= ((values < least) | (values > largest)).any(axis=1)
     return found if not found.all() else ~found
 
 
@@ -192,70 +180,59 @@ def out_of_range(gaussians: Gaussians) -> int:
     return int((beyond | (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)).sum())
 
 
-def _centres(
-    numbers: tuple[Any, ...], kinds: Sequence[Kind], line_of: npt.NDArray[np.int64], counted: Mask
-) -> Floats:
-    """[L] the median of each line that has a centre of its own, of the `counted` [N] Gaussians; else 0."""
-    means, scales, opacities, sh, *others = numbers
-    constant = np.ascontiguousarray(sh[:, :1])  # the lines in question are those of positions and colours
-    numbers = (means, scales, opacities, constant, *others)
-
-    def centre(line: int, _: int) -> float:
-        if kinds[line].even or kinds[line].centred:
-            return 0.0
-        chosen = np.flatnonzero(line_of == line)
-        values = np.empty((len(chosen), len(means)))
-        kernels.numbers_of(0, len(means), *numbers, chosen, values)
-        return float(np.median(values[:, counted], overwrite_input=True))
-
-    return np.array(in_blocks(centre, len(kinds), 1))
-
-
 def _kinds(sh_degree: int) -> list[Kind]:
     """What suits each line: x, y, z, log scales, opacity logits; two per band, the constant one first."""
     return [POSITION] * 3 + [EVEN] * 2 + [COLOUR] * 2 + [HARMONIC] * 2 * sh_degree
 
 
-def _bits(table: Table) -> npt.NDArray[np.int64]:
-    """[L] of the codes of each line."""
+def _bits(table: Table) -> list[int]:
+    """Of the codes of each line."""
     means, log_scales, _, opacity, *colours = table.bits
     harmonics = [bits - fewer for bits in colours for fewer in (0, CHROMA_FEWER)]
-    return np.array([means, means, means, log_scales, opacity, *harmonics])
+    return [means, means, means, log_scales, opacity, *harmonics]
 
 
-def _line_of(sh_degree: int) -> npt.NDArray[np.int64]:
-    """[M] the line of each number, in the order of records."""
-    counts = [each * count for count in BANDS[: sh_degree + 1] for each in (1, 2)]
-    return np.repeat(np.arange(5 + len(counts)), [1, 1, 1, 3, 1, *counts])
-
-
-def _numbers(gaussians: Gaussians) -> tuple[Any, ...]:
-    """What kernels make numbers of: means, log scales, opacity logits, harmonics, overflow, limits, colours.
+def _numbers(gaussians: Gaussians) -> Iterator[Floats]:
+    """[N, count] the numbers of each line.
 
     A Gaussian that is never drawn becomes transparent, so that its numbers in the limits are not drawn
     either.
     """
-    means, scales, opacities, sh = map(
-        _array, (gaussians.means, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
-    )
-    overflow = np.empty(len(gaussians), bool)
-    _for_all(gaussians, kernels.overflow, means, scales, _array(gaussians.quats), sh, _OVERFLOW, overflow)
-    return means, scales, opacities, sh, overflow, _LIMITS, OPPONENT
+    positions = _doubles(gaussians.means.clamp(-MAX_COORDINATE, MAX_COORDINATE))
+    yield from np.split(positions, 3, axis=1)
+    yield _doubles(gaussians.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+    logits = gaussians.opacity_logits.masked_fill(gaussians.overflow, -MAX_LOGIT)
+    yield _doubles(logits.clamp(-MAX_LOGIT, MAX_LOGIT))[:, None]
+    first = 0
+    for count in BANDS[: gaussians.sh_degree + 1]:
+        harmonics = gaussians.sh[:, first : first + count].clamp(-_MAX_HARMONIC, _MAX_HARMONIC)
+        rotated = _doubles(harmonics) @ OPPONENT.T
+        yield rotated[:, :, 0]
+        yield rotated[:, :, 1:].reshape(len(rotated), -1)
+        first += count
 
 
-def _sampled(gaussians: Gaussians) -> Iterator[Floats]:
-    """Of each line the numbers [N, count] of a few Gaussians."""
-    line_of = _line_of(gaussians.sh_degree)
-    values = np.empty((len(line_of), len(gaussians)))
-    _for_all(gaussians, kernels.numbers_of, *_numbers(gaussians), np.arange(len(line_of)), values)
-    return (values[line_of == line].T for line in range(line_of[-1] + 1))
+def _three_smallest(quats: Floats) -> tuple[Codes, Floats]:
+    """[N, 1] which component is the largest, and [N, 3] the others, of the unit quaternion with it > 0."""
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    turned = length > _MIN_LENGTH
+    unit = np.where(turned, quats / np.where(turned, length, 1), [1.0, 0, 0, 0])
+    largest = np.abs(unit).argmax(axis=1)[:, None]
+    unit = unit * np.where(np.take_along_axis(unit, largest, 1) < 0, -1.0, 1.0)
+    others = np.arange(3) + (np.arange(3) >= largest)
+    return largest.astype(np.uint32), np.take_along_axis(unit, others, 1)
 
 
-def _for_all(gaussians: Gaussians, kernel: Any, *arguments: Any) -> None:
-    """`kernel(start, stop, ...)` for all Gaussians, on several threads."""
-    in_blocks(lambda start, stop: kernel(start, stop, *arguments), len(gaussians), _BLOCK)
+def _whole_quats(largest: Codes, three: Floats) -> Floats:
+    """[N, 4] unit quaternions; codes that no quaternion has give one too."""
+    index = largest.astype(np.int64)
+    quats = np.empty((len(three), 4))
+    np.put_along_axis(quats, np.arange(3) + (np.arange(3) >= index), three, 1)
+    rest = np.sqrt((1 - np.square(three).sum(axis=1, keepdims=True)).clip(0))
+    np.put_along_axis(quats, index, rest, 1)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True).clip(0.5)
+    return quats
 
 
-def _array(values: torch.Tensor) -> npt.NDArray[np.float32]:
-    array: npt.NDArray[np.float32] = values.detach().to("cpu", torch.float32).contiguous().numpy()
-    return array
+def _doubles(values: torch.Tensor) -> Floats:
+    return values.detach().cpu().numpy().astype(np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MOST_BITS = 24  # of one number: float32 has no more
+MAX_BITS = 24  # of one number: float32 has no more
 CHROMA_FEWER = 2  # bits
 BANDS = (1, 3, 5, 7)  # spherical harmonics of degrees 0 to 3; each of three colours
 
@@ -27,7 +27,7 @@ class Table:
     bits: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        if not 5 <= len(self.bits) <= 8 or not all(1 <= each <= MOST_BITS for each in self.bits):
+        if not 5 <= len(self.bits) <= 8 or not all(1 <= each <= MAX_BITS for each in self.bits):
             raise ValueError(f"bits out of range: {self}")
         if min(self.bits[4:]) <= CHROMA_FEWER:
             raise ValueError(f"no bits are left for differences of colours: {self}")
@@ -52,7 +52,7 @@ class Table:
         table = least or Table.floor(sh_degree)
         while (room := bits - table.total) >= 0:
             given = table.bits
-            grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= room and each < MOST_BITS]
+            grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= room and each < MAX_BITS]
             if not grow:
                 return table
             best = max(grow, key=lambda i: 4 ** (_BITS_FOR_60_DB[i] - given[i]) / _NUMBERS[i])
@@ -73,3 +73,13 @@ class Table:
     def record_bytes(self) -> int:
         """Whole bytes of a record."""
         return -(-self.total // 8)
+
+    @property
+    def layout(self) -> list[tuple[int, int]]:
+        """(columns, bits) of codes in the order of records: outlier, largest part of the quaternion, ..."""
+        means, log_scales, quats, opacity, *colours = self.bits
+        positions = [(1, means)] * 3
+        layout = [(1, 1), (1, 2), (3, quats), *positions, (3, log_scales), (1, opacity)]
+        for count, bits in zip(BANDS, colours, strict=False):
+            layout += [(count, bits), (2 * count, bits - CHROMA_FEWER)]
+        return layout

@@ -1,48 +1,51 @@
-"""A model as one string of bytes, for places where all of it comes out or nothing.
+"""A model as one string of bytes, for channels that carry all of it or nothing.
 
     Gaussians (4 bytes), SH degree (1), step of harmonics (4), codec (see `quantise`),
-    columns of codes, packed by LZMA
+    columns of codes, compressed by zstd
 
-Gaussians are sorted along a Z-order curve, so that positions differ little from one to the next. Everything
-but the harmonics above degree 0 is coded as in records. Of these most are next to nothing: in brightness and
-two differences of colours they are divided by a step and rounded, and LZMA makes little of the zeros.
+Gaussians are sorted along a Z-order curve, which keeps the differences between neighbouring positions small.
+Everything except the harmonics above degree 0 is coded as in records. Those harmonics are mostly close to
+zero: they are converted to brightness and two colour differences, divided by a step and rounded.
 
-What an error of a Gaussian's harmonics costs grows with how much of a picture it covers, so the step is
-smaller for large and opaque ones: by a quarter of an octave for each octave that area times opacity squared
-is above that of the middle one. (Equal errors in a picture would take half an octave, but small Gaussians are
-looked at from nearer; measured, a quarter takes the fewest bytes.) Both sides know it from the other numbers.
-Gaussians with equal steps lie together, because they pack better.
+An error in a Gaussian's harmonics costs more the more of a picture the Gaussian covers. The step therefore
+shrinks by a quarter of an octave for each octave by which area times opacity squared exceeds the median.
+(Equal errors in a picture would need half an octave, but small Gaussians are seen from nearer; a quarter
+measured best.) Both sides compute it from the other numbers. Gaussians with equal steps are stored together
+because they compress better.
 """
 
 from __future__ import annotations
 
-import lzma
 import math
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+import zstandard
 
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.encoding import CarriedSecret
+from keyss.files.formats.common import check_count, in_morton_order
 from keyss.methods.records.packing import Bytes, Codes, codes_of_records, records_of_codes
 from keyss.methods.records.quantise import Codec
-from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
+from keyss.methods.records.table import Table
 
-MOST_GAUSSIANS = 1 << 22
-USUAL_BITS, MOST_BITS = 110, 143  # of all but harmonics: about 48 and 60 dB
+MAX_GAUSSIANS = 1 << 22
+USUAL_BITS, MAX_BITS = 110, 143  # of all but harmonics: about 48 and 60 dB
 _HEAD = struct.Struct("<IBf")
 _STEP, _HALVED = 0.06, 20  # of harmonics at the usual bits; with so many more bits it is half as large
 _LARGEST = 127  # code of a harmonic
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
 _FINER = 6  # half octaves by which a step is finer or coarser, at most
-_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
+_WINDOW_LOG = 22
+_OWN_BLOCK = 256  # bytes of a plane that begins a block of its own
+# The header of every frame, which is not stored: no size, no checksum, and this window.
+_FRAME = bytes.fromhex("28b52ffd00") + bytes([(_WINDOW_LOG - 10) << 3])
 _POSITIONS = range(3, 6)  # among the columns of a layout
 
 
@@ -54,7 +57,7 @@ class Precision(NamedTuple):
 
     @staticmethod
     def of_size(bits: int) -> Precision:
-        """With at most USUAL_BITS to MOST_BITS for all of a Gaussian but harmonics, before packing."""
+        """With at most USUAL_BITS to MAX_BITS for all of a Gaussian but harmonics, before packing."""
         table = Table.of_size(bits, 0, Table.short())
         if table is None:
             raise ValueError(f"expected at least {Table.short().total} bits, got {bits}")
@@ -69,34 +72,29 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     plain = model.with_sh_degree(0)
     codec = Codec.fit(plain, table)
     records = codec.encode(plain)
-    columns = codes_of_records(records, _layout(table))
-    planes = [plane for i, each in enumerate(columns) for plane in _planes(each, _layout(table)[i][1], i)]
-    planes.append(_harmonics(model, codec.decode(records), step))
-    packed = lzma.compress(b"".join(planes), lzma.FORMAT_RAW, filters=_FILTERS)
-    return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + packed
+    columns = codes_of_records(records, table.layout)
+    planes = [plane for i, each in enumerate(columns) for plane in _planes(each, table.layout[i][1], i)]
+    planes += _harmonics(model, codec.decode(records), step)
+    return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + _compress(planes)
 
 
-def decode(data: bytes) -> CarriedSecret:
-    """The model of `encode`. Raises InputError for damage; no more memory is taken than `data` may hold."""
+def decode(data: bytes) -> Gaussians:
+    """The model of `encode`. Raises InputError for damage.
+
+    Memory is bounded by `data`: above 2^18 Gaussians, each announced one must take at least a byte.
+    """
     if len(data) < _HEAD.size:
         raise InputError("the hidden secret is damaged: it is too short")
     count, sh_degree, step = _HEAD.unpack_from(data)
     codec = Codec.unpack(data[_HEAD.size :])
-    if not (0 < count <= MOST_GAUSSIANS and sh_degree <= 3 and codec.table.sh_degree == 0 and 0 < step < 1):
+    if not (0 < count <= MAX_GAUSSIANS and sh_degree <= 3 and codec.table.sh_degree == 0 and 0 < step < 1):
         raise InputError(
             f"the hidden secret is damaged: it announces {count:,} Gaussians of SH degree {sh_degree}"
         )
-    layout, harmonics = _layout(codec.table), 3 * ((sh_degree + 1) ** 2 - 1)
+    check_count(count, len(data))
+    layout, harmonics = codec.table.layout, 3 * ((sh_degree + 1) ** 2 - 1)
     own = count * sum(columns * -(-bits // 8) for columns, bits in layout)
-    start = _HEAD.size + Codec.packed_size(0)
-    size = own + count * harmonics
-    try:
-        unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS)
-        planes = unpacker.decompress(data[start:], size + 1)
-    except lzma.LZMAError as error:
-        raise InputError(f"the hidden secret is damaged: {error}") from error
-    if len(planes) != size or not unpacker.eof or unpacker.unused_data:
-        raise InputError("the hidden secret is damaged: it is not whole")
+    planes = _decompress(data[_HEAD.size + Codec.packed_size(0) :], own + count * harmonics)
     found, at = [], 0
     for index, (columns, bits) in enumerate(layout):
         width = columns * -(-bits // 8) * count
@@ -106,21 +104,49 @@ def decode(data: bytes) -> CarriedSecret:
     plain = codec.decode(records_of_codes(found, layout))
     codes = np.frombuffer(planes, np.int8, offset=own).reshape(harmonics // 3, 3, count)
     numbers = _from_harmonics(codes, plain, step)
-    gaussians = Gaussians(
-        plain.means, plain.quats, plain.log_scales, plain.opacity_logits, torch.cat([plain.sh, numbers], 1)
+    return replace(plain, sh=torch.cat([plain.sh, numbers], 1))
+
+
+def _compress(planes: Sequence[bytes]) -> bytes:
+    """The blocks of a zstd frame; planes have different statistics, so large ones get blocks of their own."""
+    parameters = zstandard.ZstdCompressionParameters.from_level(
+        19, window_log=_WINDOW_LOG, min_match=6, write_content_size=False
     )
-    return CarriedSecret(gaussians, count, round(8 * len(data) / count))
+    compressor = zstandard.ZstdCompressor(compression_params=parameters).compressobj()
+    parts = []
+    for plane in planes:
+        parts.append(compressor.compress(plane))
+        if len(plane) >= _OWN_BLOCK:
+            parts.append(compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
+    frame = b"".join([*parts, compressor.flush()])
+    if not frame.startswith(_FRAME):
+        raise RuntimeError("this version of zstandard writes another frame header")
+    return frame[len(_FRAME) :]
 
 
-def _harmonics(model: Gaussians, plain: Gaussians, step: float) -> bytes:
-    """Of each coefficient above degree 0 the codes of brightness and two differences, a byte each.
+def _decompress(blocks: bytes, size: int) -> bytes:
+    """The `size` bytes of `_compress`. Raises InputError for damage and for any other size."""
+    try:
+        found: bytes = zstandard.ZstdDecompressor(max_window_size=1 << _WINDOW_LOG).decompress(
+            _FRAME + blocks, max_output_size=size, allow_extra_data=False
+        )
+    except zstandard.ZstdError as error:
+        raise InputError(f"the hidden secret is damaged: {error}") from error
+    if len(found) != size:
+        raise InputError("the hidden secret is damaged: it is not whole")
+    return found
+
+
+def _harmonics(model: Gaussians, plain: Gaussians, step: float) -> list[bytes]:
+    """Codes of brightness and two differences for each coefficient above degree 0, a byte per Gaussian.
 
     `plain`: `model` as it will be decoded, but for these.
     """
     numbers = model.sh[:, 1:].detach().cpu().numpy().astype(np.float64) @ OPPONENT.T
     finer = _finer(plain)
     codes = np.rint(numbers / _steps(step, finer)[:, None, None]).clip(-_LARGEST, _LARGEST)
-    return codes[np.argsort(finer, kind="stable")].astype(np.int8).transpose(1, 2, 0).tobytes()
+    columns = codes[np.argsort(finer, kind="stable")].astype(np.int8).reshape(len(model), -1).T
+    return [column.tobytes() for column in columns]
 
 
 def _from_harmonics(codes: npt.NDArray[np.int8], plain: Gaussians, step: float) -> torch.Tensor:
@@ -154,15 +180,6 @@ def _steps(step: float, finer: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]
         step * np.where(finer % 2, math.sqrt(2), 1.0) * 2.0 ** -((finer + 1) // 2)
     )
     return steps
-
-
-def _layout(table: Table) -> list[tuple[int, int]]:
-    """(columns, bits) in the order of records: outlier, largest part; positions; ... (see `quantise`)."""
-    means, log_scales, quats, opacity, *colours = table.bits
-    layout = [(1, 1), (1, 2), (3, quats), (1, means), (1, means), (1, means), (3, log_scales), (1, opacity)]
-    for count, bits in zip(BANDS, colours, strict=False):
-        layout += [(count, bits), (2 * count, bits - CHROMA_FEWER)]
-    return layout
 
 
 def _planes(codes: Codes, bits: int, index: int) -> Sequence[bytes]:

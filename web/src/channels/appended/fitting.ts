@@ -1,13 +1,7 @@
 /** Similarity transforms, found by least squares. */
-import type { Similarity } from '../../core/similarity.ts';
+import { movedPoint, rotationOf, type Similarity } from '../../core/similarity.ts';
 
-/** Where it takes the point at `at` of points [P, 3]. */
-export function movedPoint({ scale, rotation, translation }: Similarity, points: ArrayLike<number>, at: number): number[] {
-  const [x, y, z] = [points[3 * at], points[3 * at + 1], points[3 * at + 2]];
-  return [0, 1, 2].map((row) => {
-    return scale * (rotation[3 * row] * x + rotation[3 * row + 1] * y + rotation[3 * row + 2] * z) + translation[row];
-  });
-}
+const SQUARINGS = 50;
 
 /**
  * From points of `source` [P, 3] to those of `target` with the least squares; null where there is none. The rotation is
@@ -36,11 +30,9 @@ export function fittedSimilarity(
   ]);
   const scale = value / spread;
   if (!(spread > 0 && scale > 0 && Number.isFinite(scale) && vector.every(Number.isFinite))) return null;
-  const rotation = matrixOf(vector);
-  const translation = goal.map((each, row) => {
-    return each - scale * (rotation[3 * row] * centre[0] + rotation[3 * row + 1] * centre[1] + rotation[3 * row + 2] * centre[2]);
-  });
-  return { scale, rotation, translation };
+  const turned = { scale, rotation: rotationOf(vector), translation: [0, 0, 0] };
+  const away = movedPoint(turned, centre);
+  return { ...turned, translation: goal.map((each, axis) => each - away[axis]) };
 }
 
 function middle(points: ArrayLike<number>, rows: ArrayLike<number>): number[] {
@@ -51,37 +43,18 @@ function middle(points: ArrayLike<number>, rows: ArrayLike<number>): number[] {
   });
 }
 
-/** The largest eigenvalue of a symmetric matrix [4, 4], which is changed, and its unit vector (Jacobi's method). */
+/** The largest eigenvalue of a symmetric matrix [4, 4] and its unit vector, by squaring the matrix again and again. */
 function largestEigen(matrix: number[][]): { value: number; vector: number[] } {
-  const vectors = [0, 1, 2, 3].map((row) => [0, 1, 2, 3].map((column) => Number(row === column)));
-  for (let sweep = 0; sweep < 20; sweep++) {
-    for (let p = 0; p < 3; p++) {
-      for (let q = p + 1; q < 4; q++) {
-        if (!matrix[p][q]) continue;
-        const angle = (matrix[q][q] - matrix[p][p]) / (2 * matrix[p][q]);
-        const tangent = (angle < 0 ? -1 : 1) / (Math.abs(angle) + Math.hypot(angle, 1));
-        const cosine = 1 / Math.hypot(tangent, 1);
-        const sine = tangent * cosine;
-        const turned = (row: number[]): void => {
-          [row[p], row[q]] = [cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]];
-        };
-        matrix.forEach(turned);
-        for (let column = 0; column < 4; column++) {
-          const [a, b] = [matrix[p][column], matrix[q][column]];
-          [matrix[p][column], matrix[q][column]] = [cosine * a - sine * b, sine * a + cosine * b];
-        }
-        vectors.forEach(turned);
-      }
-    }
+  const bound = Math.max(...matrix.map((row) => row.reduce((sum, each) => sum + Math.abs(each), 0)));
+  const four = [0, 1, 2, 3];
+  let power = matrix.map((row, i) => row.map((each, j) => each / bound + Number(i === j))); // no eigenvalue below 0
+  for (let round = 0; round < SQUARINGS; round++) {
+    const largest = Math.max(...power.flat().map(Math.abs));
+    const scaled = power.map((row) => row.map((each) => each / largest));
+    power = scaled.map((row) => four.map((j) => row.reduce((sum, each, k) => sum + each * scaled[k][j], 0)));
   }
-  const best = [0, 1, 2, 3].reduce((a, b) => (matrix[b][b] > matrix[a][a] ? b : a));
-  return { value: matrix[best][best], vector: vectors.map((row) => row[best]) };
-}
-
-function matrixOf([w, x, y, z]: readonly number[]): number[] {
-  return [
-    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-  ];
+  const column = power[four.reduce((a, b) => (power[b][b] > power[a][a] ? b : a))];
+  const vector = column.map((each) => each / Math.hypot(...column));
+  const value = vector.reduce((sum, a, i) => sum + vector.reduce((own, b, j) => own + a * b * matrix[i][j], 0), 0);
+  return { value, vector };
 }

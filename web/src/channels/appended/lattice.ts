@@ -1,8 +1,8 @@
 /**
- * Words of 84 bits that lie in faint Gaussians, after a format has rounded them (docs/appended.md);
+ * Words of 84 bits that lie in faint Gaussians, after a format has rounded them (docs/channels.md);
  * `keyss.channels.appended.lattice` on the other side.
  */
-import { coefficients, type Gaussians, opacity, selected } from '../../core/gaussians.ts';
+import { COLUMNS, type Gaussians, opacity, selected, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
 
@@ -15,21 +15,15 @@ const [FARTHEST, MOST_SHIFTS] = [1 << 12, 500]; // steps of log scales: that are
 /** The Gaussians that are as faint as appended ones, without harmonics. */
 export function candidates(model: Gaussians): Gaussians {
   const rows: number[] = [];
-  const harmonics = 3 * coefficients(model.shDegree);
   for (let row = 0; row < model.count; row++) {
     const own = opacity(model.opacityLogits[row]);
-    if (!(own > FAINTEST && own < STRONGEST)) continue;
-    const finite = ([values, width]: [Float32Array, number]): boolean =>
-      values.subarray(width * row, width * (row + 1)).every(Number.isFinite);
-    const all: [Float32Array, number][] = [
-      [model.means, 3], [model.quats, 4], [model.logScales, 3], [model.sh, harmonics],
-    ];
-    if (all.every(finite)) rows.push(row);
+    const finite = (column: (typeof COLUMNS)[number]): boolean => {
+      const width = model[column].length / model.count;
+      return model[column].subarray(width * row, width * (row + 1)).every(Number.isFinite);
+    };
+    if (own > FAINTEST && own < STRONGEST && COLUMNS.every(finite)) rows.push(row);
   }
-  const found = selected(model, rows);
-  const sh = new Float32Array(3 * rows.length);
-  for (let row = 0; row < rows.length; row++) sh.set(found.sh.subarray(harmonics * row, harmonics * row + 3), 3 * row);
-  return { ...found, shDegree: 0, sh };
+  return withDegree(selected(model, rows), 0);
 }
 
 /** [N, 3] the nearest lattice points of colours. */

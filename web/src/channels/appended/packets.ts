@@ -1,9 +1,17 @@
 /** Packets: 6 bytes, and which ones they are, in words of 84 bits; `keyss.channels.appended.packets` on the other side. */
 import { ecb } from '@noble/ciphers/aes.js';
-import { mixAt } from '../mixing.ts';
+import { mostFrequent } from '../../core/bytes.ts';
+import { tooMuchLost } from '../../core/errors.ts';
+import { mixAt } from '../../core/words.ts';
+import { decodeCodeword } from '../reed_solomon.ts';
 
-export const PACKET_BYTES = 6;
-export const NUMBER_BITS = 20;
+const PACKET_BYTES = 6;
+const NUMBER_BITS = 20;
+const LENGTH_BITS = 8; // of the packets of a block that hold data
+const MOST_DATA = 150; // packets of a block that hold data
+const MOST_CHUNKS = 255;
+const MOST_BLOCKS = Math.min(1 << (NUMBER_BITS - LENGTH_BITS), Math.floor((1 << NUMBER_BITS) / MOST_CHUNKS)) - 1;
+const [LEFT, DEVIATIONS] = [0.72, 4.5]; // of packets that may be relied upon
 const AGREEING_HEADERS = 3; // one or two may be there by chance
 
 /** N words: 48 bits of data, and 36 of tag. */
@@ -51,8 +59,48 @@ export function readPackets(
 
 /** The number that most headers tell; null where there are too few. */
 export function readHeader(key: Uint8Array, words: TaggedWords): number | null {
-  const votes = new Map<number, number>();
-  readPackets(key, words, (number) => votes.set(number, (votes.get(number) ?? 0) + 1));
-  const [value, count] = [...votes].reduce((a, b) => (b[1] > a[1] ? b : a), [0, 0]);
+  const numbers: number[] = [];
+  readPackets(key, words, (number) => numbers.push(number));
+  const [value, count] = mostFrequent(numbers) ?? [0, 0];
   return count >= AGREEING_HEADERS ? value : null;
+}
+
+/** Packets of a payload in blocks of one size. */
+export class Blocks {
+  private constructor(readonly count: number, readonly data: number) {}
+
+  /** null where no writer would have written this header. */
+  static ofHeader(header: number): Blocks | null {
+    const [count, data] = [header >> LENGTH_BITS, header & ((1 << LENGTH_BITS) - 1)];
+    return count > 0 && count <= MOST_BLOCKS && data > 0 && data <= MOST_DATA ? new Blocks(count, data) : null;
+  }
+
+  /** Packets of a block. */
+  get length(): number {
+    let length = this.data;
+    while (length * LEFT - DEVIATIONS * Math.sqrt(length * LEFT * (1 - LEFT)) < this.data) length++;
+    return Math.min(length, MOST_CHUNKS);
+  }
+
+  /** The encrypted payload. Raises InputError where too few packets are left. */
+  decode(key: Uint8Array, words: TaggedWords): Uint8Array {
+    const { count, data, length } = this;
+    const rows = new Int32Array(count * length).fill(-1);
+    readPackets(key, words, (number, row) => {
+      // Two packets with one number: one is there by chance, and both are left out.
+      if (number < rows.length) rows[number] = rows[number] === -1 ? row : -2;
+    });
+    const found = new Uint8Array(count * data * PACKET_BYTES);
+    for (let block = 0; block < count; block++) {
+      const left = new Map<number, Uint8Array>();
+      for (let index = 0; index < length; index++) {
+        const row = rows[index * count + block];
+        if (row >= 0) left.set(index, words.blocks.subarray(16 * row, 16 * row + PACKET_BYTES));
+      }
+      const decoded = decodeCodeword(left, data, length);
+      if (decoded === null) throw tooMuchLost();
+      decoded.forEach((packet, index) => found.set(packet, (index * count + block) * PACKET_BYTES));
+    }
+    return found;
+  }
 }

@@ -1,9 +1,9 @@
 /** Pilots: appended Gaussians that everybody can read; `keyss.channels.appended.pilots` on the other side. */
-import type { Similarity } from '../../core/similarity.ts';
-import type { Words } from '../../core/words.ts';
+import { mostFrequent } from '../../core/bytes.ts';
+import { movedPoint, type Similarity } from '../../core/similarity.ts';
+import { mixAt, type Words } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/derivation.ts';
-import { mixAt } from '../mixing.ts';
-import { fittedSimilarity, movedPoint } from './fitting.ts';
+import { fittedSimilarity } from './fitting.ts';
 import { POSITION_BITS } from './lattice.ts';
 
 export const LEAST = 128; // of a model
@@ -57,7 +57,7 @@ function agreeing(there: Float64Array, expected: Float64Array, chosen: number[])
   const found: number[] = [];
   const similarity = fittedSimilarity(there, expected, chosen);
   for (let at = 0; similarity && at < there.length / 3; at++) {
-    const place = movedPoint(similarity, there, at);
+    const place = movedPoint(similarity, there.subarray(3 * at, 3 * at + 3));
     if (place.every((each, axis) => Math.abs(each - expected[3 * at + axis]) < NEAR)) found.push(at);
   }
   return found;
@@ -76,21 +76,20 @@ function drawing(count: number): () => number {
 
 /** What most pilots say of each part; null where one has nobody left. */
 function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
-  const votes = Array.from({ length: PARTS }, () => new Map<number, number>());
+  const parts = Array.from({ length: PARTS }, (): number[] => []);
   const state = new Uint32Array(2);
   for (const row of rows) {
     const [low, high] = [invariants[2 * row], invariants[2 * row + 1]];
     [state[0], state[1]] = [(low & 0x3ffff) ^ PUBLIC_LOW, PUBLIC_HIGH]; // of the scales
     mixAt(state, 0);
     const said = (((high << 14) | (low >>> 18)) ^ (state[1] >>> 11)) >>> RANDOM_BITS; // 21 bits, whitened
-    const own = votes[said >>> 16];
-    own.set(said & 0xffff, (own.get(said & 0xffff) ?? 0) + 1);
+    parts[said >>> 16].push(said & 0xffff);
   }
   const salt = new Uint8Array(SALT_BYTES);
-  for (const [part, own] of votes.entries()) {
-    if (!own.size) return null;
-    const [value] = [...own].reduce((a, b) => (b[1] > a[1] ? b : a));
-    salt.set([value >> 8, value & 255], 2 * part);
+  for (const [part, own] of parts.entries()) {
+    const best = mostFrequent(own);
+    if (!best) return null;
+    salt.set([best[0] >> 8, best[0] & 255], 2 * part);
   }
   return salt;
 }

@@ -1,21 +1,20 @@
-/** Secrets in appended Gaussians (docs/appended.md); `keyss.channels.appended.channel` on the other side. */
-import { ascii, bytesKey } from '../../core/bytes.ts';
+/** Secrets in appended Gaussians (docs/channels.md); `keyss.channels.appended.channel` on the other side. */
+import { ascii } from '../../core/bytes.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { type Derive, expand } from '../../keys/derivation.ts';
-import { damaged, decrypted } from '../../keys/encryption.ts';
+import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
 import type { Payload, Reader } from '../content.ts';
-import { Blocks } from './blocks.ts';
+import { unframedPayload } from '../packing.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
 } from './lattice.ts';
-import { readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
+import { Blocks, readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
 import { countPilots, type Found, LEAST, ONE_IN, readPilots } from './pilots.ts';
 
 // Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations more of
 // them than by chance.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
-const METHOD_BYTES = 15;
 const ASSOCIATED = ascii('keyss/v1/appended/data');
 
 /** A model's appended Gaussians, prepared for any number of keys. */
@@ -54,10 +53,7 @@ export class AppendedReader implements Reader {
       readPackets(packets, this.words, () => undefined); // as a key that opens something does
       return null;
     }
-    const plain = decrypted(data, blocks.decode(packets, this.words), ASSOCIATED);
-    if (plain.length < METHOD_BYTES) throw damaged();
-    const method = bytesKey(plain.subarray(0, METHOD_BYTES)).replace(/\0+$/, '');
-    return { service: 'payload', method, data: plain.slice(METHOD_BYTES) };
+    return unframedPayload(await decrypted(data, blocks.decode(packets, this.words), ASSOCIATED));
   }
 }
 

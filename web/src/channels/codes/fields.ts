@@ -1,12 +1,15 @@
 /**
- * Which numbers of a file's codes carry bits, and how many each; `keyss.channels.codes.fields` on the other side.
+ * Which numbers of a file's codes carry bits, how many each, and in which order these are counted;
+ * `keyss.channels.codes.fields` and `order` on the other side. A .sog is sorted by what is written; its bits are counted
+ * in an order of what is not.
  *
  * All of it is arithmetic that is the same on every machine, in the same order as there, and no logarithms: a bit more or
  * less anywhere, and nothing could be read.
  */
+import { highProduct, runs, sortingOrder, type Words } from '../../core/words.ts';
 import { CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
 import type { Codes } from '../../files/models.ts';
-import { FINEST, type SogCodes } from '../../files/sog.ts';
+import { FINEST, LARGEST, type SogCodes } from '../../files/sog.ts';
 import { positionCode, rotationPart, rotationWord, type SpzCodes } from '../../files/spz.ts';
 
 const MOST_BITS = 10;
@@ -15,21 +18,22 @@ const LOG_SCALE = -4; // 2 to this: the range of what is written in log scales
 const LOG2_E = 1.4426950408889634;
 const MOST_DISTANCE = 64; // powers of 2
 const AXES = [0, 1, 2];
+const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
 
 /** One coordinate of an attribute of N Gaussians. */
-export interface Field {
+interface Field {
   readonly levels: Int32Array; // [N] integers that grow with what they stand for
   readonly bits: Uint8Array; // [N] that each carries, 0 to 10
 }
 
 /** In the order of the file's Gaussians. */
-export function fieldsOf(codes: Codes): Field[] {
+function fieldsOf(codes: Codes): Field[] {
   if (codes.kind === 'spz') return spzFields(codes);
   return codes.kind === 'sog' ? sogFields(codes) : compressedPlyFields(codes);
 }
 
 /** By how many powers of 2 a .sog's steps are larger at a position than at 0. */
-export function sogDistance(codes: SogCodes, row: number, axis: number): number {
+function sogDistance(codes: SogCodes, row: number, axis: number): number {
   const log = Math.abs(codes.mins[axis] + sogExtent(codes, axis) * (codes.positions[3 * row + axis] / FINEST));
   return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MOST_DISTANCE);
 }
@@ -107,4 +111,53 @@ export function log2(value: number): number {
   const exponent = ((HALVES[1] >>> 20) & 2047) - 1022 - (small ? 54 : 0);
   HALVES[1] = (HALVES[1] & 0x800fffff) | (1022 << 20);
   return exponent + 2 * (NUMBER[0] - 1); // of a mantissa of 0.5 to 1
+}
+
+/** The last bits of all levels, each 0 or 1, in the order in which they are counted. */
+export function lastBits(codes: Codes): Uint8Array {
+  const rows = codes.kind === 'sog' ? sogOrder(codes) : null;
+  const fields = fieldsOf(codes);
+  const count = rows?.length ?? codes.count;
+  const rowAt = (index: number): number => (rows === null ? index : rows[index]);
+  let size = 0;
+  for (const { bits } of fields) for (let index = 0; index < count; index++) size += bits[rowAt(index)];
+  const found = new Uint8Array(size);
+  let at = 0;
+  for (const { levels, bits } of fields) {
+    for (let index = 0; index < count; index++) {
+      const row = rowAt(index);
+      for (let bit = 0; bit < bits[row]; bit++) found[at++] = (levels[row] >> bit) & 1;
+    }
+  }
+  return found;
+}
+
+/** Gaussians by hashes of what is not written, without those that share one: these carry nothing. */
+function sogOrder(codes: SogCodes): Uint32Array {
+  const words = hashes(codes.count, [
+    ...AXES.map((axis) => (row: number) => codes.scales[4 * row + axis]),
+    ...[0, 1, 2, 3].map((part) => (row: number) => codes.colours[4 * row + part]),
+    (row) => codes.labels[row],
+    (row) => codes.quats[4 * row + 3] - LARGEST,
+    ...AXES.map((axis) => (row: number) => sogDistance(codes, row, axis)),
+  ]);
+  const order = sortingOrder(words);
+  const starts = runs(words, order);
+  return starts.filter((start, run) => starts[run + 1] === start + 1).map((start) => order[start]);
+}
+
+/** [N] of each Gaussian a hash of all columns: times a constant, and the upper bits added to the lower ones. */
+function hashes(count: number, columns: ((row: number) => number)[]): Words {
+  const words = new Uint32Array(2 * count);
+  for (const column of columns) {
+    for (let row = 0; row < count; row++) {
+      const low = (words[2 * row] ^ column(row)) >>> 0;
+      const lower = Math.imul(low, FACTOR_LOW) >>> 0;
+      const product = highProduct(low, FACTOR_LOW) + Math.imul(low, FACTOR_HIGH);
+      const upper = (product + Math.imul(words[2 * row + 1], FACTOR_LOW)) >>> 0;
+      words[2 * row] = lower ^ ((lower >>> 29) | (upper << 3));
+      words[2 * row + 1] = upper ^ (upper >>> 29);
+    }
+  }
+  return words;
 }

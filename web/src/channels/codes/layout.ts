@@ -1,10 +1,9 @@
 /** Where what lies among the last bits of all levels; `keyss.channels.codes.layout` on the other side. */
 import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { ascii, viewOf } from '../../core/bytes.ts';
-import { InputError } from '../../core/errors.ts';
+import { damaged, otherVersion } from '../../core/errors.ts';
 import { expand, SALT_BYTES, streamWords } from '../../keys/derivation.ts';
-import { damaged } from '../../keys/encryption.ts';
-import { sortingOrder } from '../../core/sorting.ts';
+import { sortingOrder } from '../../core/words.ts';
 import { BLOCK } from './syndromes.ts';
 
 const VERSION = 1;
@@ -59,7 +58,7 @@ export function order(salt: Uint8Array, count: number): Uint32Array {
   streamWords(seed, 'codes/order', 2 * count, (word, at) => {
     if (at & 1) high[at >>> 1] = word;
   });
-  return sortingOrder(high);
+  return sortingOrder(high, 1);
 }
 
 /** The header that what a key became opens; all slots are tried. Raises InputError for one that makes no sense. */
@@ -79,7 +78,7 @@ export function findHeader(zone: Uint8Array, master: Uint8Array, room: Room): He
   }
   if (found === null) return null;
   const view = viewOf(found);
-  if (found[0] !== VERSION) throw new InputError('What this key opens was hidden by another version of keyss.');
+  if (found[0] !== VERSION) throw otherVersion();
   const [rate, start, size] = [view.getUint16(1, true), view.getUint32(3, true), view.getUint32(7, true)];
   const bits = room.dataBlocks * rate;
   if (!(rate <= BLOCK && size > 0 && 8 * size <= bits && start < bits)) throw damaged();

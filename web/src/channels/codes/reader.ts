@@ -4,18 +4,18 @@
  *
  * All that does not depend on the key is done before there is one: a key that opens nothing makes the same passes.
  */
-import { ascii, bytesKey } from '../../core/bytes.ts';
+import { ascii } from '../../core/bytes.ts';
 import type { Codes } from '../../files/models.ts';
 import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
-import { damaged, decrypted } from '../../keys/encryption.ts';
+import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
+import { unframedPayload } from '../packing.ts';
+import { lastBits } from './fields.ts';
 import { findHeader, order, Room, ZONE_RATE } from './layout.ts';
-import { lastBits } from './order.ts';
 import { BLOCK, bytesOf, matrix, products } from './syndromes.ts';
 
 const ASSOCIATED = ascii('keyss/v1/codes/data');
-const METHOD_BYTES = 15;
 const USUAL_RATE = 800; // of a key that opens nothing
 const MOST_BITS = 2 ** 30; // of which more would take more memory than tabs have
 
@@ -57,10 +57,7 @@ export class CodesReader implements Reader {
     const { rate, start, size } = header ?? { rate: USUAL_RATE, start: 0, size: most };
     const encrypted = bytesOf(this.held, rate, start, size);
     try {
-      const plain = decrypted(expand(secret, 'codes/data', 32), encrypted, ASSOCIATED);
-      if (plain.length < METHOD_BYTES) throw damaged();
-      const method = bytesKey(plain.subarray(0, METHOD_BYTES)).replace(/\0+$/, '');
-      return { service: 'payload', method, data: plain.slice(METHOD_BYTES) };
+      return unframedPayload(await decrypted(expand(secret, 'codes/data', 32), encrypted, ASSOCIATED));
     } catch (error) {
       if (header === null) return null;
       throw error;

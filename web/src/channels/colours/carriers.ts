@@ -1,7 +1,8 @@
 /**
  * Which numbers of a model carry something, and by what else of the model they are known again;
- * `keyss.channels.robust.carriers` on the other side.
+ * `keyss.channels.colours.carriers` on the other side.
  */
+import { median } from '../../core/bytes.ts';
 import { coefficients, type Gaussians, opacity } from '../../core/gaussians.ts';
 
 export const [SCALE_STEP, COLOUR_STEP, OPACITY_STEP] = [1 / 16, 1 / 38.25, 1 / 255]; // of 8-bit formats
@@ -39,7 +40,7 @@ export function numbersOf(model: Gaussians): Numbers {
   });
   const sizes = Float64Array.from(rows, (_, at) => (logScales[3 * at] + logScales[3 * at + 1] + logScales[3 * at + 2]) / 3);
   const own = Float64Array.from(rows, (row) => opacities[row]);
-  return { count: rows.length, size: median(sizes.sort()), logScales, opacities: own, colours };
+  return { count: rows.length, size: median(sizes), logScales, opacities: own, colours };
 }
 
 /** C Gaussians as a reader sees them. */
@@ -108,10 +109,4 @@ export function impact(names: Int16Array, row: number): number {
   const two = a + b + c - Math.min(a, b, c) + 1; // halves of a cell are added
   const seen = (names[NAME * row + 3] + 0.5) * OPACITY_STEPS * OPACITY_STEP;
   return two * CELL + 2 * Math.log(Math.max(1e-3, seen));
-}
-
-function median(sorted: Float64Array): number {
-  const middle = sorted.length >> 1;
-  if (!sorted.length) return 0;
-  return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
 }

@@ -1,11 +1,16 @@
-/** The header, on which a key is tried first: how to read the rest; `keyss.channels.robust.header` on the other side. */
+/**
+ * The header, on which a key is tried first: how to read the rest, in a few Gaussians that the key chooses;
+ * `keyss.channels.colours.header` on the other side.
+ */
+import { chacha20 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
-import type { Carriers } from './carriers.ts';
-import { NOISY } from './equations.ts';
-import { Fountain } from './fountain.ts';
-import { type Lattice, rank, SPACINGS } from './lattice.ts';
-import { type Index, type Kind, KINDS, oddsOf, USUAL } from './places.ts';
+import { ascii } from '../../core/bytes.ts';
+import { mixAt, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
+import { expand } from '../../keys/derivation.ts';
+import { type Carriers, chosen } from './carriers.ts';
+import { Fountain, NOISY } from './fountain.ts';
+import { bitsOf, COLUMNS, dithers, type Lattice, LEVELS, rank, readBits, seedsOf } from './lattice.ts';
 
 export const FILE_KEY_BYTES = 5;
 export const SHARES = 256; // parts of the carriers, of which a payload has some
@@ -18,6 +23,22 @@ const TRIES = 3; // to tell salts that were lost
 const [LEAST_TRUST, MOST_TRUST] = [0.02, 0.95];
 const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
 const MERGED = [0.4, 0.2];
+const PILOTS = 16; // numbers of each salt's part that are known beforehand
+const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
+const PUBLIC = sha256(ascii('keyss/v1/robust-places'));
+const [PAD_LOW, PAD_HIGH] = [0x1e98df25, 0x9fb21c65];
+
+/** How headers are written: in how many Gaussians for each salt, and by a lattice that gives as many bits to all. */
+export interface Kind {
+  readonly places: number;
+  readonly lattice: Lattice;
+}
+
+const KINDS: readonly Kind[] = [
+  { places: 64, lattice: { level: LEVELS - 1, depth: 1 } },
+  { places: 96, lattice: { level: LEVELS - 1, depth: 2 } },
+];
+const USUAL = [0.65];
 /** How a header is looked at: of which kind, and how likely its places, and those after them, hold what was written. */
 export const VIEWS: readonly (readonly [Kind, readonly number[]])[] = [
   [KINDS[0], USUAL], [KINDS[1], USUAL], [KINDS[1], MERGED],
@@ -64,23 +85,19 @@ export function readHeader(
 ): Header | null {
   if (!index.size || !secrets.length) return null;
   const parts = index.parts(secrets, kind, view, kind.places);
-  const { hints, seeds } = parts;
-  const width = hints.length / view.length / secrets.length;
-  const saltOf = (bit: number): number => Math.floor(bit / width) % secrets.length;
+  const seeds = Uint32Array.from(parts.flatMap((part) => [...part.seeds]));
   const odds = oddsOf(parts, secrets.length);
   let trusts = odds.map(trust);
   for (let attempt = 0; attempt < TRIES; attempt++) {
-    const ratios = Float32Array.from(hints, (hint, bit) => {
-      return 2 * Math.atanh(Math.max(-0.9999, Math.min(0.9999, hint * trusts[saltOf(bit)])));
-    });
+    const ratios = Float32Array.from(parts.flatMap(({ hints, salt }) => [...hints].map((hint) => {
+      return 2 * Math.atanh(Math.max(-0.9999, Math.min(0.9999, hint * trusts[salt])));
+    })));
     const every = fountain.likeliest(seeds, ratios, ROUNDS);
     const header = unpackHeader(every.subarray(0, fountain.size), check);
     if (header !== null) return header;
-    const agreement = odds.slice();
-    fountain.sums(every, seeds).forEach((one, bit) => {
-      agreement[saltOf(bit)] += DECODED * Math.log1p(Math.max(-0.99, one ? -hints[bit] : hints[bit]));
-    });
-    trusts = agreement.map(trust);
+    const agree = odds.slice();
+    for (const part of parts) agree[part.salt] += DECODED * agreement(signed(part.hints, fountain.sums(every, part.seeds)));
+    trusts = agree.map(trust);
   }
   return null;
 }
@@ -89,9 +106,15 @@ export function readHeader(
 export function headerAgreement(header: Header, secrets: readonly Uint8Array[], index: Index): number {
   if (!index.size) return 0;
   const kind = kindOf(header);
-  const { seeds, hints, pilots } = index.parts(secrets, kind, USUAL, kind.places);
-  const ones = fountain.encode(header.bits, seeds);
-  return pilots.reduce((sum, each) => sum + each, hints.reduce((sum, each, bit) => sum + (ones[bit] ? -each : each), 0));
+  const sum = (values: Float64Array): number => values.reduce((before, each) => before + each, 0);
+  return index.parts(secrets, kind, USUAL, kind.places).reduce((before, { seeds, hints, pilots }) => {
+    return before + sum(pilots) + sum(signed(hints, fountain.encode(header.bits, seeds)));
+  }, 0);
+}
+
+/** Hints that bits are what they were read as, of hints that they are 0. */
+function signed(hints: Float64Array, bits: Uint8Array): Float64Array {
+  return hints.map((hint, at) => (bits[at] ? -hint : hint));
 }
 
 /** null where it is not one: by chance one of 2^16 is, and opens nothing. */
@@ -104,15 +127,15 @@ function unpackHeader(bits: Uint8Array, check: Uint8Array): Header | null {
   const found = {
     fileKey: data.slice(0, FILE_KEY_BYTES),
     partition: data.slice(FILE_KEY_BYTES, FILE_KEY_BYTES + PARTITION_BYTES),
-    // 6 bits of level, 2 of spacing, 3 of depth, 8 each of first, last and bucket, 5 of idle
-    lattice: { level: a >> 2, spacing: SPACINGS[a & 3], depth: b >> 5 },
+    // 6 bits of level, 2 unused, 3 of depth, 8 each of first, last and bucket, 5 of idle
+    lattice: { level: a >> 2, depth: b >> 5 },
     first: ((b & 31) << 3) | (c >> 5),
     last: ((c & 31) << 3) | (d >> 5),
     bucket: ((d & 31) << 3) | (e >> 5),
     idle: e & 31,
     bits: bits.slice(),
   };
-  return found.lattice.depth === 0 || found.last < found.first ? null : found;
+  return (a & 3) !== 0 || found.lattice.depth === 0 || found.last < found.first ? null : found;
 }
 
 /** Bytes of bits, the highest first. */
@@ -124,4 +147,112 @@ export function packBits(bits: Uint8Array): Uint8Array {
 
 function trust(odds: number): number {
   return Math.max(LEAST_TRUST, Math.min(MOST_TRUST, 1 / (1 + Math.exp(-odds))));
+}
+
+/** Code bits of a header under one salt, as one Gaussian of each place says; hints are P(0) - P(1). */
+interface Part {
+  readonly salt: number;
+  readonly seeds: Words; // [B]
+  readonly hints: Float64Array; // [B]
+  readonly pilots: Float64Array; // [PILOTS] the same of bits that are 0
+}
+
+/** Carriers by the public hash of their names. */
+export class Index {
+  private readonly hashes: Words; // [P] ascending, each once
+  private readonly first: Uint32Array; // [P] a carrier with each name
+  private readonly alike: Uint32Array; // [P] how many have it
+
+  constructor(private readonly carriers: Carriers) {
+    const { lattice } = KINDS[KINDS.length - 1];
+    const bits = bitsOf(lattice, carriers);
+    const hashes = rank(PUBLIC, 'places', carriers.names);
+    const order = sortingOrder(hashes).filter((row) => bits[row] === lattice.depth); // all but impossible sizes
+    const starts = runs(hashes, order);
+    this.first = starts.slice(0, -1).map((start) => order[start]);
+    this.alike = starts.slice(1).map((end, at) => end - starts[at]);
+    this.hashes = new Uint32Array(2 * this.first.length).map((_, at) => hashes[2 * this.first[at >> 1] + (at & 1)]);
+  }
+
+  get size(): number {
+    return this.first.length;
+  }
+
+  /** [count] names that this secret's header is in, or those so many behind. */
+  places(secret: Uint8Array, count: number, behind = 0): Uint32Array {
+    const key = expand(secret, 'robust/places', 32);
+    const points = wordsOf(chacha20(key, new Uint8Array(12), new Uint8Array(8 * count)));
+    const found = new Uint32Array(count);
+    for (let at = 0; at < count; at++) {
+      found[at] = (this.firstFrom(points[2 * at], points[2 * at + 1]) + behind) % this.size;
+    }
+    return found;
+  }
+
+  /** [...] a carrier with each name. */
+  rows(places: Uint32Array): Uint32Array {
+    return places.map((place) => this.first[place]);
+  }
+
+  /** What the first `most` Gaussians of each salt hold, if it is one. */
+  parts(secrets: readonly Uint8Array[], { lattice }: Kind, view: readonly number[], most: number): Part[] {
+    const bits = COLUMNS * lattice.depth;
+    return view.flatMap((sure, behind) => secrets.map((secret, salt) => {
+      const places = this.places(secret, most, behind);
+      const own = chosen(this.carriers, this.rows(places));
+      const words = seedsOf(rank(secret, 'header-seeds', own.names), new Uint8Array(most).fill(bits));
+      const full = new Uint8Array(most).fill(lattice.depth);
+      const read = readBits(lattice, dithers(secret, own.names), own, new Float64Array(most), full);
+      const hints = Float64Array.from(read, (ratio, bit) => {
+        const at = Math.floor(bit / bits);
+        const certain = (sure * (1 - own.doubt[at])) / this.alike[places[at]];
+        return Math.tanh(ratio / 2) * certain * (isPadded(words, bit) ? -1 : 1);
+      });
+      return { salt, seeds: words.subarray(2 * PILOTS), hints: hints.subarray(PILOTS), pilots: hints.subarray(0, PILOTS) };
+    }));
+  }
+
+  /** How much likelier what is known beforehand is with a header than without: a logarithm. */
+  promise(secrets: readonly Uint8Array[]): number {
+    if (!this.size || !secrets.length) return -Infinity;
+    return Math.max(...KINDS.map((kind) => {
+      const parts = this.parts(secrets, kind, USUAL, PILOTS / (COLUMNS * kind.lattice.depth));
+      const odds = oddsOf(parts, secrets.length);
+      return odds.reduce((sum, each) => sum + Math.log1p(Math.exp(Math.max(-50, Math.min(50, each)))), 0);
+    }));
+  }
+
+  /** The first place whose hash is at least this word; `size` where there is none. */
+  private firstFrom(low: number, high: number): number {
+    let [from, to] = [0, this.size];
+    while (from < to) {
+      const middle = (from + to) >> 1;
+      const difference = this.hashes[2 * middle + 1] - high || this.hashes[2 * middle] - low;
+      if (difference < 0) from = middle + 1;
+      else to = middle;
+    }
+    return from;
+  }
+}
+
+/** [S] logarithms of the odds that each of the salts is one. */
+function oddsOf(parts: readonly Part[], salts: number): number[] {
+  const odds = new Array<number>(salts).fill(PRIOR);
+  for (const { salt, pilots } of parts) odds[salt] += agreement(pilots);
+  return odds;
+}
+
+/** The logarithm of how much likelier these hints are if all bits are 0 than by chance. */
+function agreement(hints: Float64Array): number {
+  return hints.reduce((sum, hint) => sum + Math.log1p(Math.max(-0.99, hint)), 0);
+}
+
+const scratch = new Uint32Array(2);
+
+/** Whether the code bit with this seed is encrypted by a one. */
+function isPadded(seeds: Words, at: number): boolean {
+  scratch[0] = seeds[2 * at] ^ PAD_LOW;
+  scratch[1] = seeds[2 * at + 1] ^ PAD_HIGH;
+  mixAt(scratch, 0);
+  return scratch[1] >>> 31 === 1;
 }

@@ -1,25 +1,23 @@
 /**
  * Bits in numbers: dithered quantisation index modulation (Chen and Wornell 2001), read softly;
- * `keyss.channels.robust.lattice` on the other side.
+ * `keyss.channels.colours.lattice` on the other side.
  */
 import { ecb } from '@noble/ciphers/aes.js';
-import { wordsOf, type Words } from '../../core/words.ts';
+import { mixAt, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
-import { mixAt } from '../mixing.ts';
 import { type Carriers, impact } from './carriers.ts';
 
 export const COLUMNS = 2; // numbers of a Gaussian that are written
-export const SPACINGS = [0.0275, 0.04, 0.06, 0.09];
+const SPACING = 0.0275; // between neighbouring points
 export const LEVELS = 64;
 const MOST_BITS = 5; // of a number
 const FOUR = Math.log(4);
 const [LEVEL_STEP, MIDDLE] = [FOUR / 4, 44];
 const NOISE = 0.23; // standard deviation of what formats do to a number, of the spacing
 
-/** `level`: below LEVELS, the more the more bits. `spacing`: between points. `depth`: bits of a number, at most. */
+/** `level`: below LEVELS, the more the more bits. `depth`: bits of a number, at most. */
 export interface Lattice {
   readonly level: number;
-  readonly spacing: number;
   readonly depth: number;
 }
 
@@ -66,7 +64,7 @@ export function readBits(
     if (own > MOST_BITS) to += COLUMNS * own; // no writer has so many: nothing is known of them
     else for (let column = 0; own && column < COLUMNS; column++) {
       const at = COLUMNS * row + column;
-      const off = values[at] / lattice.spacing - dither[at] * period;
+      const off = values[at] / SPACING - dither[at] * period;
       const place = off - Math.floor(off / period) * period;
       const first = Math.floor(place) - 1;
       let sum = 0;

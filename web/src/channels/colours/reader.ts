@@ -1,11 +1,11 @@
 /**
- * What a key opens in the colours of a model: bytes that survive other formats (docs/robust.md).
- * `keyss.channels.robust.reading` on the other side.
+ * What a key opens in the colours of a model: bytes that survive other formats (docs/channels.md).
+ * `keyss.channels.colours.reading` on the other side.
  */
 import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined, viewOf } from '../../core/bytes.ts';
-import { InputError } from '../../core/errors.ts';
+import { tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { namesakes } from '../../core/words.ts';
 import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
@@ -15,10 +15,10 @@ import { unpackPayload } from '../packing.ts';
 import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
 import { Fountain } from './fountain.ts';
 import {
-  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, kindOf, ownRows, packBits, readHeader, SHARES, VIEWS,
+  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, Index, kindOf, ownRows, packBits, readHeader,
+  SHARES, VIEWS,
 } from './header.ts';
-import { bitsOf, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf, SPACINGS } from './lattice.ts';
-import { Index } from './places.ts';
+import { bitsOf, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf } from './lattice.ts';
 import { saltsOf } from './salts.ts';
 
 const STATIC_SALT = sha256(ascii('keyss/v1/robust-static')).slice(0, SALT_BYTES);
@@ -95,7 +95,7 @@ export class ColoursReader implements Reader {
       const data = payload(header, derived.fixed, free, changed, ROUNDS);
       if (data !== null) return data;
     }
-    throw new InputError('The key is right, but too much of the model was lost or changed.');
+    throw tooMuchLost();
   }
 
   /** What the writer may have taken for a log scale of zero, and the carriers by their names then. */
@@ -132,7 +132,7 @@ export class ColoursReader implements Reader {
 const NOTHING: Header = {
   fileKey: new Uint8Array(FILE_KEY_BYTES),
   partition: new Uint8Array(2),
-  lattice: { level: LEVELS - 1, spacing: SPACINGS[0], depth: 1 },
+  lattice: { level: LEVELS - 1, depth: 1 },
   first: 0,
   last: SHARES / 4 - 1,
   bucket: 64,

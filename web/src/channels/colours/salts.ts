@@ -1,8 +1,7 @@
-/** The Gaussians that serve as salts of Argon2id; `keyss.channels.robust.salts` on the other side. */
+/** The Gaussians that serve as salts of Argon2id; `keyss.channels.colours.salts` on the other side. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined } from '../../core/bytes.ts';
-import { sortingOrderOfPairs } from '../../core/sorting.ts';
-import { same } from '../../core/words.ts';
+import { runs, sortingOrder } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/derivation.ts';
 import { COLOUR_NOISE, COLOUR_STEP, NAME, type Numbers, OPACITY_NOISE, OPACITY_STEP, SCALE_STEP } from './carriers.ts';
 import { rank } from './lattice.ts';
@@ -35,10 +34,10 @@ export function saltsOf(numbers: Numbers): Uint8Array[] {
       names.set(cells.subarray(STEPS.length * row, STEPS.length * row + UNCHANGED), NAME * to);
     });
     const ranks = rank(PUBLIC, 'salt', names);
-    const order = sortingOrderOfPairs(ranks);
-    const listed = [...order.filter((row, at) => at === 0 || !same(ranks, row, order[at - 1]))];
-    for (const at of listed.slice(0, SALTS / stable.length)) {
-      const own = cells.slice(STEPS.length * rows[at], STEPS.length * (rows[at] + 1));
+    const order = sortingOrder(ranks);
+    for (const start of runs(ranks, order).slice(0, -1).slice(0, SALTS / stable.length)) {
+      const row = rows[order[start]];
+      const own = cells.slice(STEPS.length * row, STEPS.length * (row + 1));
       const salt = sha256(joined(LABEL, new Uint8Array(own.buffer))).slice(0, SALT_BYTES);
       salts.set(bytesKey(salt), salt);
     }

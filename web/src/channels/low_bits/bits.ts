@@ -3,7 +3,7 @@
  * See docs/format.md, "Low bits".
  */
 import { blake2b } from '@noble/hashes/blake2.js';
-import { ascii } from '../../core/bytes.ts';
+import { ascii, median } from '../../core/bytes.ts';
 import { coefficients, type Gaussians } from '../../core/gaussians.ts';
 
 export const IDENTITY_BYTES = 16;
@@ -105,10 +105,4 @@ export function lowBits(fields: Fields): Uint8Array {
     }
   }
   return found;
-}
-
-function median(values: Float64Array): number {
-  const sorted = Float64Array.from(values).sort();
-  const middle = sorted.length >> 1;
-  return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
 }

@@ -1,9 +1,8 @@
 /** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/format.md, "Cells". */
 import { ecb } from '@noble/ciphers/aes.js';
 import { expand } from '../../keys/derivation.ts';
-import { IDENTITY_BYTES } from './bits.ts';
 
-const BLOCK = 16;
+const BLOCK = 16; // of AES, and an identity
 const CELLS = 1 << 14; // at a time
 
 /** What was found: rows of Gaussians, and the data of each. */
@@ -29,7 +28,7 @@ export class CellCipher {
   /** Tries the bytes from `offset` on of every row of `low` [N, width]. */
   decrypt(names: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Found {
     const found: Found = { rows: [], data: [] };
-    const count = names.length / IDENTITY_BYTES;
+    const count = names.length / BLOCK;
     for (let start = 0; start < count; start += CELLS) {
       this.decryptSome(found, names, low, width, offset, slot, start, Math.min(count, start + CELLS));
     }
@@ -42,53 +41,38 @@ export class CellCipher {
   ): void {
     const { size, tagBytes } = this;
     const count = end - start;
-    const own = names.subarray(start * IDENTITY_BYTES, end * IDENTITY_BYTES);
+    const from = (cell: number): number => (start + cell) * width + offset;
+    const own = names.subarray(start * BLOCK, end * BLOCK);
     let seeds: Uint8Array = own.slice();
     for (let cell = 0; cell < count; cell++) {
-      const from = (start + cell) * width + offset;
-      for (let at = 0; at < tagBytes; at++) seeds[cell * BLOCK + at] ^= low[from + at];
+      for (let at = 0; at < tagBytes; at++) seeds[cell * BLOCK + at] ^= low[from(cell) + at];
       seeds[cell * BLOCK + tagBytes] ^= slot;
     }
     seeds = encrypted(this.seedKey, seeds);
-    const blocks = Math.ceil(size / BLOCK);
-    const counted = new Uint8Array(count * blocks * BLOCK);
-    for (let cell = 0; cell < count; cell++) {
-      const seed = seeds.subarray(cell * BLOCK, (cell + 1) * BLOCK);
-      for (let block = 0; block < blocks; block++) {
-        const to = (cell * blocks + block) * BLOCK;
-        counted.set(seed, to);
-        counted[to + BLOCK - 1] ^= block;
-      }
-    }
-    const stream = encrypted(this.streamKey, counted);
-    const messageBlocks = Math.ceil((1 + size) / BLOCK);
-    const messages = new Uint8Array(count * messageBlocks * BLOCK);
-    for (let cell = 0; cell < count; cell++) {
-      const from = (start + cell) * width + offset + tagBytes;
-      const to = cell * messageBlocks * BLOCK;
-      messages[to] = slot;
-      for (let at = 0; at < size; at++) {
-        messages[to + 1 + at] = low[from + at] ^ stream[cell * blocks * BLOCK + at];
-      }
-    }
-    let state = encrypted(this.tagKey, own.slice());
-    for (let block = 0; block < messageBlocks; block++) {
-      const mixed = state.slice();
+    const stride = Math.ceil((1 + size) / BLOCK) * BLOCK;
+    const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
+    for (let block = 0; block * BLOCK < size; block++) {
+      const counted = seeds.slice();
+      for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= block;
+      const stream = encrypted(this.streamKey, counted);
       for (let cell = 0; cell < count; cell++) {
-        const from = (cell * messageBlocks + block) * BLOCK;
-        for (let at = 0; at < BLOCK; at++) mixed[cell * BLOCK + at] ^= messages[from + at];
+        messages[cell * stride] = slot;
+        for (let at = block * BLOCK; at < Math.min(size, (block + 1) * BLOCK); at++) {
+          messages[cell * stride + 1 + at] = low[from(cell) + tagBytes + at] ^ stream[cell * BLOCK + (at % BLOCK)];
+        }
       }
-      state = encrypted(this.tagKey, mixed);
+    }
+    let state = encrypted(this.tagKey, own);
+    for (let block = 0; block < stride; block += BLOCK) {
+      for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
+      state = encrypted(this.tagKey, state);
     }
     for (let cell = 0; cell < count; cell++) {
-      const from = (start + cell) * width + offset;
       let different = 0;
-      for (let at = 0; at < tagBytes; at++) different |= state[cell * BLOCK + at] ^ low[from + at];
-      if (different === 0) {
-        const message = cell * messageBlocks * BLOCK + 1;
-        found.rows.push(start + cell);
-        found.data.push(messages.slice(message, message + size));
-      }
+      for (let at = 0; at < tagBytes; at++) different |= state[cell * BLOCK + at] ^ low[from(cell) + at];
+      if (different !== 0) continue;
+      found.rows.push(start + cell);
+      found.data.push(messages.slice(cell * stride + 1, cell * stride + 1 + size));
     }
   }
 }

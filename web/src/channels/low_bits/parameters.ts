@@ -1,7 +1,6 @@
 /** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
-import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
-import { InputError } from '../../core/errors.ts';
-import { damaged } from '../../keys/encryption.ts';
+import { bytesKey, joined, mostFrequent, viewOf } from '../../core/bytes.ts';
+import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 
 const VERSION = 2;
 const PREFIX_BYTES = 40;
@@ -34,11 +33,11 @@ export type Parameters = RecordParameters | PayloadParameters;
 export function unpackParameters(parts: Uint8Array[], chunkBytes: number): Parameters {
   const best = new Map<number, Uint8Array>();
   for (const number of new Set(parts.map((part) => part[0]))) {
-    best.set(number, mostFrequent(parts.filter((part) => part[0] === number))!.subarray(1));
+    best.set(number, mostFrequentOf(parts.filter((part) => part[0] === number))!.subarray(1));
   }
   const prefix = firstBytes(best, PREFIX_BYTES);
   const view = viewOf(prefix);
-  if (prefix[0] !== VERSION) throw new InputError('What this key opens was hidden by another version of keyss.');
+  if (prefix[0] !== VERSION) throw otherVersion();
   const method = bytesKey(prefix.subarray(2, 17)).replace(/\0+$/, '');
   if (prefix[1] === 1) {
     const [size, codewords] = [view.getUint32(NUMBERS, true), view.getUint32(NUMBERS + 4, true)];
@@ -54,26 +53,17 @@ export function unpackParameters(parts: Uint8Array[], chunkBytes: number): Param
   return { service: 'records', method, cells, recordBytes, header };
 }
 
-export function tooMuchRemoved(): InputError {
-  return new InputError('The key is right, but too much of the model was removed.');
-}
-
 /** Of equal byte strings those that occur most; the first of several. */
-export function mostFrequent(all: Uint8Array[]): Uint8Array | null {
-  const votes = new Map<string, number>();
-  let best: Uint8Array | null = null;
-  for (const each of all) votes.set(bytesKey(each), (votes.get(bytesKey(each)) ?? 0) + 1);
-  for (const each of all) {
-    if (best === null || votes.get(bytesKey(each))! > votes.get(bytesKey(best))!) best = each;
-  }
-  return best;
+export function mostFrequentOf(all: Uint8Array[]): Uint8Array | undefined {
+  const best = mostFrequent(all.map(bytesKey));
+  return best && all.find((each) => bytesKey(each) === best[0]);
 }
 
 function firstBytes(parts: Map<number, Uint8Array>, length: number): Uint8Array {
   let data = new Uint8Array(0);
   for (let number = 0; data.length < length; number++) {
     const part = parts.get(number);
-    if (part === undefined) throw tooMuchRemoved();
+    if (part === undefined) throw tooMuchLost();
     data = joined(data, part) as Uint8Array<ArrayBuffer>;
   }
   return data.slice(0, length);

@@ -4,20 +4,22 @@
  * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
  * tried, so that how long it takes tells next to nothing.
  */
-import { bytesKey } from '../../core/bytes.ts';
+import { ascii, bytesKey } from '../../core/bytes.ts';
+import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import { type Derive, expand } from '../../keys/derivation.ts';
+import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
-import { damaged } from '../../keys/encryption.ts';
 import type { Content, Payload, Reader, Records } from '../content.ts';
+import { decodeCodeword } from '../reed_solomon.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
 import { CellCipher } from './cells.ts';
 import {
-  mostFrequent, type Parameters, type PayloadParameters, type RecordParameters, tooMuchRemoved, unpackParameters,
+  mostFrequentOf, type PayloadParameters, type RecordParameters, unpackParameters,
 } from './parameters.ts';
-import { decodePayload } from './payload.ts';
 import { salts } from './salts.ts';
 
+const ASSOCIATED = ascii('keyss/v1/low-bits');
 const DATA_KEY_BYTES = 16;
 const TAG_BYTES = 4;
 const CHUNK_TAG_BYTES = 6;
@@ -60,12 +62,14 @@ export class LowBitsReader implements Reader {
     for (const each of masters) {
       secret = new Uint8Array(expand(await each, 'low-bits/key', 32));
       if (!room) continue;
-      const found = mostFrequent(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
-      if (found !== null) dataKeys.push(found);
+      const found = mostFrequentOf(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
+      if (found) dataKeys.push(found);
     }
     for (const dataKey of dataKeys) {
       const parts = this.decrypted(this.parameterCipher(dataKey));
-      if (parts.length) return this.content(dataKey, unpackParameters(parts, this.chunkBytes));
+      if (!parts.length) continue;
+      const parameters = unpackParameters(parts, this.chunkBytes);
+      return parameters.service === 'records' ? this.records(dataKey, parameters) : this.payload(dataKey, parameters);
     }
     if (room && dataKeys.length === 0) this.passesForNothing(secret);
     return null;
@@ -78,12 +82,6 @@ export class LowBitsReader implements Reader {
     for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), DUMMY_CELLS);
   }
 
-  private content(dataKey: Uint8Array, parameters: Parameters): Content {
-    return parameters.service === 'records'
-      ? this.records(dataKey, parameters)
-      : this.payload(dataKey, parameters);
-  }
-
   private records(dataKey: Uint8Array, parameters: RecordParameters): Records {
     const { cells, recordBytes, method, header } = parameters;
     if (recordBytes < 1 || recordBytes > Math.floor(this.width / cells) - TAG_BYTES) throw damaged();
@@ -92,14 +90,29 @@ export class LowBitsReader implements Reader {
     );
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
-    if (!all.length) throw tooMuchRemoved();
+    if (!all.length) throw tooMuchLost();
     return { service: 'records', method, header, records: all };
   }
 
-  private payload(dataKey: Uint8Array, parameters: PayloadParameters): Payload {
-    const cipher = new CellCipher(dataKey, 'chunk', NUMBER_BYTES + this.chunkBytes, CHUNK_TAG_BYTES);
-    const data = decodePayload(dataKey, parameters, this.decrypted(cipher), this.chunkBytes);
-    return { service: 'payload', method: parameters.method, data };
+  /** What lies in numbered chunks, a codeword each; see docs/format.md, "A payload". */
+  private async payload(dataKey: Uint8Array, { method, codewords, n, k, size }: PayloadParameters): Promise<Payload> {
+    const { chunkBytes } = this;
+    const cipher = new CellCipher(dataKey, 'chunk', NUMBER_BYTES + chunkBytes, CHUNK_TAG_BYTES);
+    const chunks = this.decrypted(cipher);
+    if (codewords * k > chunks.length) throw tooMuchLost();
+    const rows = Array.from({ length: codewords }, () => new Map<number, Uint8Array>());
+    for (const chunk of chunks) {
+      const number = chunk[0] | (chunk[1] << 8) | (chunk[2] << 16);
+      if (number < codewords * n) rows[Math.floor(number / n)].set(number % n, chunk.subarray(NUMBER_BYTES));
+    }
+    const encrypted = new Uint8Array(codewords * k * chunkBytes);
+    rows.forEach((each, codeword) => {
+      const data = decodeCodeword(each, k, n);
+      if (data === null) throw tooMuchLost();
+      data.forEach((row, index) => encrypted.set(row, (codeword * k + index) * chunkBytes));
+    });
+    const data = await decrypted(expand(dataKey, 'payload-key', 32), encrypted.subarray(0, size), ASSOCIATED);
+    return { service: 'payload', method, data };
   }
 
   private parameterCipher(dataKey: Uint8Array): CellCipher {
@@ -124,16 +137,13 @@ export class LowBitsReader implements Reader {
 
 /** Rows of Gaussians, those that agree in identity and low bits only once. */
 function firstOfEach(names: Uint8Array, low: Uint8Array, width: number): number[] {
-  const seen = new Map<string, Set<string>>();
+  const seen = new Set<string>();
   const rows: number[] = [];
   for (let row = 0; row < names.length / IDENTITY_BYTES; row++) {
-    const name = bytesKey(names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES));
-    const bits = bytesKey(low.subarray(row * width, (row + 1) * width));
-    const others = seen.get(name);
-    if (others === undefined) seen.set(name, new Set([bits]));
-    else if (others.has(bits)) continue;
-    else others.add(bits);
-    rows.push(row);
+    const name = names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES);
+    const all = bytesKey(name) + bytesKey(low.subarray(row * width, (row + 1) * width));
+    if (!seen.has(all)) rows.push(row);
+    seen.add(all);
   }
   return rows;
 }

@@ -1,0 +1,290 @@
+"""What the colours of a model carry, what that costs, and what of it survives.
+
+python benchmarks/colours.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
+                                [--only FORMAT] [--size BYTES]
+python benchmarks/colours.py MODEL.ply ... --payloads N --log FILE [--gaussians N] [--foreign-each M]
+python benchmarks/colours.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
+python benchmarks/colours.py MODEL.ply --speed [--gaussians N]
+
+For each model and strength: net bits per Gaussian and the cost of a full model, and how many of P payloads,
+each with a new key and new entropy, do not come back from each format, alone and with a quarter of the
+Gaussians removed at random on top. With --changes also other changes, at full capacity and at a fifth of it.
+Argon2id is cheap, which has nothing to do with what is measured, but with --speed.
+
+With --log, N payloads in all, spread over the models, each through the formats that this library writes,
+and each M-th through other people's programs as well: one line of JSON for each payload, appended; what is in
+the file already is not done again.
+
+With --pairs nothing is measured: each model, and each with a payload of so much of its capacity, is written
+as it comes back from each format, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` names them for
+`xargs python benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200
+bytes and of reading with a right key and a wrong one, Argon2id included. `--gaussians` draws so many of each
+model, and with --speed more than it has.
+
+pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import resource
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from colours_payloads import run_payloads
+from keyss.channels import Colours, ColoursCover, Payload
+from keyss.core.errors import BackendError, InputError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.files.models import read_model, write_model
+from keyss.measure import converters
+from keyss.measure.robustness import changes
+from keyss.rendering.difference import psnr_between
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import cheap_keys
+
+Change = Callable[[Gaussians], Gaussians]
+FIFTH = 0.2
+METHOD, PACKED = "t", 2  # of payloads, and bytes that they take beside their data
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("models", nargs="+", type=Path)
+    parser.add_argument("--gaussians", type=int)
+    parser.add_argument("--payloads", type=int, default=5)
+    parser.add_argument("--log", type=Path, metavar="FILE")
+    parser.add_argument("--foreign-each", type=int, default=10)
+    parser.add_argument("--strengths", type=float, nargs="+", default=[45.0])
+    parser.add_argument("--seed", type=int, default=0, help="of keys, payloads and what is removed")
+    parser.add_argument("--size", type=int, help="bytes of a payload, instead of all that a model holds")
+    parser.add_argument("--changes", action="store_true")
+    parser.add_argument("--only", default="", help="formats with this in their name")
+    parser.add_argument("--pairs", type=Path, metavar="FOLDER")
+    parser.add_argument("--shares", type=float, nargs="+", default=[1.0, 0.5, 0.2, 0.05])
+    parser.add_argument("--speed", action="store_true")
+    asked = parser.parse_args()
+    if not asked.speed:
+        cheap_keys.pytest_sessionstart()
+    if asked.pairs:
+        for strength in asked.strengths:
+            _write_pairs(asked.models, asked.pairs, asked.shares, strength, asked.only)
+        return
+    if asked.speed:
+        _measure_speed(asked.models, asked.gaussians)
+        return
+    if asked.log:
+        run_payloads(
+            [(path.stem, partial(_of_file, path, asked.gaussians)) for path in asked.models],
+            asked.payloads,
+            asked.log,
+            strength=asked.strengths[0],
+            foreign={what: change for what, change in _BY_TOOL.items() if asked.only in what},
+            each=asked.foreign_each,
+            embed=_embedded,
+            opens=_opens,
+        )
+        return
+    print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for path in asked.models:
+        model = _of_file(path, asked.gaussians)
+        for strength in asked.strengths:
+            prepared = Colours(strength).prepare(model)
+            name = f"{path.stem} | {len(prepared.cover):,} | {strength:.0f}"
+            formats = {what: change for what, change in FORMATS.items() if asked.only in what}
+            share = 1.0 if asked.size is None else asked.size / prepared.capacity
+            _measure(prepared, name, formats, asked.payloads, asked.seed, share, pruned=True)
+            if asked.changes:
+                _measure(prepared, name, OTHERS, asked.payloads, asked.seed)
+                _measure(prepared, name, OTHERS, asked.payloads, asked.seed, FIFTH)
+
+
+def _of_file(path: Path, gaussians: int | None) -> Gaussians:
+    """As many as asked for, or all where there are fewer."""
+    model = read_model(path)
+    return _drawn(model, gaussians) if gaussians is not None and gaussians < len(model) else model
+
+
+def _embedded(prepared: ColoursCover, number: int, data: bytes) -> Gaussians:
+    return prepared.embed([(_key(number), Payload(METHOD, data))], entropy=number.to_bytes(32, "big"))
+
+
+def _measure(
+    prepared: ColoursCover,
+    name: str,
+    wanted: dict[str, Change],
+    payloads: int,
+    first: int,
+    share: float = 1.0,
+    pruned: bool = False,
+) -> None:
+    """Prints a row for each change in `wanted`."""
+    size, failures, psnrs = round(share * (prepared.capacity - PACKED)), Counter[str](), []
+    missing: set[str] = set()
+    for seed in range(first, first + payloads):
+        data = np.random.default_rng(seed).bytes(size)
+        stego = _embedded(prepared, seed, data)
+        psnrs.append(psnr_between(prepared.cover, stego))
+        for what, change in wanted.items():
+            try:
+                changed = change(stego)
+            except BackendError:
+                missing.add(what)
+                continue
+            failures[what] += not _opens(changed, seed, data)
+            if pruned:
+                removed = changes.random_pruning(0.25, seed)(changed)
+                failures[f"{what}, 25 % removed"] += not _opens(removed, seed, data)
+    bits = 8 * size / len(prepared.cover)
+    start = f"| {name} | {np.mean(psnrs):.1f} ({min(psnrs):.1f}) | {size:,} | {bits:.2f}"
+    for what in wanted:
+        if what in missing:
+            print(f"{start} | {what} | not measured |")
+            continue
+        rows = (what, f"{what}, 25 % removed") if pruned else (what,)
+        for row in rows:
+            print(f"{start} | {row} | {failures[row]} of {payloads} |", flush=True)
+
+
+def _write_pairs(
+    models: Sequence[Path], folder: Path, shares: Sequence[float], strength: float, only: str
+) -> None:
+    wanted = {what: change for what, change in FORMATS.items() if only in what}
+    lines: dict[str, list[str]] = {}
+    for number, path in enumerate(models):
+        scene, prepared = path.stem.rsplit("-", 1)[0], Colours(strength).prepare(read_model(path))
+        made = {"plain": prepared.cover}
+        for share in shares:
+            size = int(share * (prepared.capacity - PACKED))
+            data = np.random.default_rng(number).bytes(size)
+            stego = made[f"{share:g}"] = _embedded(prepared, number, data)
+            print(
+                f"{path.stem} {share:g}: {size:,} bytes, {psnr_between(prepared.cover, stego):.1f} dB",
+                flush=True,
+            )
+        for what, change in wanted.items():
+            own = folder / f"{strength:g}-{re.sub('[^a-z]+', '-', what).strip('-')}"
+            own.mkdir(parents=True, exist_ok=True)
+            for name, model in made.items():
+                write_model(own / f"{path.stem}-{name}.ply", change(model))
+                if name != "plain":
+                    pair = f"{scene}={own}/{path.stem}-plain.ply:{own}/{path.stem}-{name}.ply"
+                    lines.setdefault(f"{own.name}-{name}", []).append(pair)
+    for name, pairs in lines.items():
+        (folder / f"{name}.txt").write_text("\n".join(pairs) + "\n")
+
+
+def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
+    print("| model | Gaussians | embed | extract | wrong key | most memory |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for path in models:
+        model = _drawn(read_model(path), gaussians)
+        seconds = []
+        stego = model
+        for step in ("embed", "right", "wrong"):
+            start = time.monotonic()
+            if step == "embed":
+                stego = (
+                    Colours().prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
+                )
+            elif step == "right":
+                Colours().reader(stego).open("a key of some length")
+            else:
+                with suppress(WrongKeyError):
+                    Colours().reader(stego).open("another key of some length")
+            seconds.append(f"{time.monotonic() - start:.1f} s")
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
+
+
+def _drawn(model: Gaussians, count: int | None) -> Gaussians:
+    """So many of a model; where it has fewer, each as often as it takes, scaled at random by a little."""
+    if count is None:
+        return model
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randperm(len(model), generator=generator)
+    if count > len(model):
+        rows = torch.randint(len(model), (count,), generator=generator)
+        jitter = 0.2 * torch.randn(count, 3, generator=generator)
+        return replace(model[rows], log_scales=model.log_scales[rows] + jitter)
+    return model[rows[:count]]
+
+
+def _opens(model: Gaussians, seed: int, data: bytes) -> bool:
+    try:
+        return Colours().reader(model).open(_key(seed)) == Payload(METHOD, data)
+    except (WrongKeyError, InputError):
+        return False
+
+
+def _key(seed: int) -> str:
+    return f"key number {seed}"
+
+
+def _moved(scale: float) -> Change:
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    return Similarity(scale, rotation, torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)).apply_gaussians
+
+
+def _shuffled(model: Gaussians) -> Gaussians:
+    return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(0))]
+
+
+def _beside(share: float) -> Change:
+    """Put together with some of itself, moved, mirrored in colour and scaled: another scene of that kind."""
+
+    def apply(model: Gaussians) -> Gaussians:
+        other = _moved(1.3)(model[: int(share * len(model))])
+        return Gaussians.cat([model, Gaussians(*_parts(other))])
+
+    def _parts(other: Gaussians) -> tuple[torch.Tensor, ...]:
+        opacity_logits = -0.5 - 0.7 * other.opacity_logits
+        return other.means, other.quats, other.log_scales.flip(1), opacity_logits, -other.sh
+
+    return apply
+
+
+def _then(first: Change, second: Change) -> Change:
+    return lambda model: second(first(model))
+
+
+_BY_TOOL = {f"{each.format} by {each.tool}": (lambda model, each=each: each(model)) for each in converters()}
+FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
+OTHERS: dict[str, Change] = {
+    "reordered": _shuffled,
+    "cropped to a half": changes.cropping(1),
+    "50 % removed at random": changes.random_pruning(0.5, 1),
+    "25 % of lowest opacity removed": changes.opacity_pruning(0.25),
+    "another scene a quarter as large": _beside(0.25),
+    "another scene as large": _beside(1.0),
+    "without harmonics": changes.fewer_harmonics(0),
+    "half floats": changes.half_floats(),
+    "rotated and moved": _moved(1.0),
+    "scaled by 1.37, rotated and moved": _moved(1.37),
+    "`.spz` by gsply, then scaled": _then(_BY_TOOL[".spz by gsply"], _moved(1.37)),
+    "scaled, then `.spz` by gsply": _then(_moved(1.37), _BY_TOOL[".spz by gsply"]),
+    "noise on colour, 0.01 of its spread": changes.noise("colour", 0.01),
+    "noise on colour, 0.03 of its spread": changes.noise("colour", 0.03),
+    "noise on log scales, 0.01 of their spread": changes.noise("log scale", 0.01),
+    "noise on opacity, 0.01 of its spread": changes.noise("logit opacity", 0.01),
+}
+
+
+if __name__ == "__main__":
+    start = time.monotonic()
+    main()
+    print(f"\n{time.monotonic() - start:.0f} s")

@@ -1,0 +1,213 @@
+"""How well statistics tell files that hide something from plain ones, learned from other scenes.
+
+A scene's own files are never learned from. Standard errors are bootstrapped over whole models, for parts of
+one are not independent; the largest of many areas under curves is held against the same with labels exchanged
+within pairs, which is what chance makes of so many tries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from keyss.measure.stealth.words import Floats, Ints
+
+import numpy as np
+
+_DRAWS = 300  # of a bootstrap
+_EXCHANGES = 100
+_BEST = 12  # statistics that tell most, for logistic regression ...
+_EXAMPLES = 16  # ... one for so many examples, for others fit by chance
+MAX_NAMED = 10  # single detectors
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One detector: area under the ROC curve on scenes that it did not learn from."""
+
+    name: str
+    auc: float
+    error: float  # standard error
+    pooled: float  # area over the files of all scenes together, as for one threshold
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Files, or one part of each; those of one `model` are the same, plain and with something in it."""
+
+    names: tuple[str, ...]  # of statistics
+    values: Floats  # [E, S], NaN where there was too little to count
+    hidden: Ints  # [E] 0 plain, 1 with something in it
+    scene: Ints  # [E]
+    model: Ints  # [E]
+
+    @staticmethod
+    def of(
+        rows: Sequence[Mapping[str, float]],
+        hidden: Sequence[int],
+        scenes: Sequence[str],
+        models: Sequence[str],
+    ) -> Examples:
+        names = tuple(dict.fromkeys(name for row in rows for name in row))
+        values = np.array([[row.get(name, np.nan) for name in names] for row in rows], float)
+        scene, model = (np.unique(each, return_inverse=True)[1] for each in (scenes, models))
+        return Examples(names, values, np.array(hidden), scene, model)
+
+
+def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detection], float]:
+    """Every statistic by itself, the worst first, and what chance makes of the largest in one of 20 cases.
+
+    Its direction, and what is usual, come from the other scenes.
+    """
+    held_out = _HeldOut.of(examples)
+    scores = held_out.scores(examples.hidden)
+    found = areas(scores, examples.hidden, examples.scene)
+    random = np.random.default_rng(seed)
+    largest = []
+    for _ in range(_EXCHANGES):
+        flip = random.integers(0, 2, examples.model.max() + 1)[examples.model]
+        exchanged = examples.hidden ^ flip
+        largest.append(areas(held_out.scores(exchanged), exchanged, examples.scene).max())
+    worst = np.argsort(-found)[:MAX_NAMED]
+    errors = _errors(scores[:, worst], examples)
+    named = [
+        Detection(examples.names[index], float(found[index]), float(error), float(pooled))
+        for index, error, pooled in zip(worst, errors, _pooled(scores[:, worst], examples), strict=True)
+    ]
+    return named, float(np.quantile(largest, 0.95))
+
+
+def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
+    """Logistic regression and boosted trees over all statistics."""
+    from sklearn.ensemble import HistGradientBoostingClassifier
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import QuantileTransformer
+
+    found = []
+    for name in ("logistic", "trees"):
+        scores = np.zeros(len(examples.hidden))
+        for scene in np.unique(examples.scene):
+            held = examples.scene == scene
+            others = examples.values[~held]
+            usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
+            train, test = (np.where(np.isnan(part), usual, part) for part in (others, examples.values[held]))
+            if name == "logistic":
+                # By rank, for a few statistics have tails of many standard deviations.
+                spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
+                above = _lean(_ranks(train), examples.hidden[~held])
+                best = np.argsort(-np.abs(above))[: min(_BEST, 1 + len(train) // _EXAMPLES)]
+                train, test = train[:, best], test[:, best]
+                machine = make_pipeline(spread, LogisticRegression(C=0.1, max_iter=2000))
+            else:
+                machine = HistGradientBoostingClassifier(
+                    max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=seed
+                )
+            scores[held] = machine.fit(train, examples.hidden[~held]).decision_function(test)
+        (area,) = areas(scores[:, None], examples.hidden, examples.scene)
+        (error,) = _errors(scores[:, None], examples)
+        (pooled,) = _pooled(scores[:, None], examples)
+        found.append(Detection(f"{name} over all", float(area), float(error), float(pooled)))
+    return found
+
+
+def areas(scores: Floats, hidden: Ints, scene: Ints) -> Floats:
+    """[S] areas under the ROC curves of scores [E, S], ties counting half: means over scenes.
+
+    Each scene's files are compared with each other only. Over all together, scores of scenes that learned
+    from each other would be compared, and detectors of nothing come out below a half.
+    """
+    total, weights = np.zeros(scores.shape[1]), 0
+    for each in np.unique(scene):
+        held = scene == each
+        own = hidden[held]
+        positives = int(own.sum())
+        negatives = len(own) - positives
+        if positives and negatives:
+            ranks = _ranks(scores[held])
+            above = ranks[own == 1].sum(axis=0) - positives * (positives + 1) / 2
+            total += len(own) * above / (positives * negatives)
+            weights += len(own)
+    found: Floats = total / max(weights, 1)
+    return found
+
+
+def confirmed(scores: Floats, true: Sequence[int]) -> float:
+    """How often the true candidate is ranked above another one, ties counting half; 0.5 is chance.
+
+    `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Each candidate's scores
+    are taken relative to what it has in files that hold something else, and each file's to those of others.
+    """
+    scores = np.asarray(scores, float)
+    own = np.zeros(scores.shape, bool)
+    own[np.arange(len(true)), list(true)] = True
+    others = np.where(own, np.nan, scores)
+    with np.errstate(all="ignore"):
+        relative = (
+            scores - np.nanmean(others, axis=0) - (np.nanmean(others, axis=1) - np.nanmean(others))[:, None]
+        )
+    above = []
+    for row, index in zip(np.nan_to_num(relative), true, strict=True):
+        rest = np.delete(row, index)
+        above.append(float((row[index] > rest).mean() + 0.5 * (row[index] == rest).mean()))
+    return float(np.mean(above))
+
+
+def _pooled(scores: Floats, examples: Examples) -> Floats:
+    return areas(scores, examples.hidden, np.zeros_like(examples.scene))
+
+
+def _ranks(values: Floats) -> Floats:
+    from scipy.stats import rankdata
+
+    ranks: Floats = rankdata(values, axis=0)
+    return ranks
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """Each scene's statistics as whoever knows the other scenes sees them."""
+
+    centred: Floats  # [E, S] values less the median of the other scenes
+    folds: tuple[tuple[Ints, Ints, Floats], ...]  # of each scene: its examples, the others, ranks of these
+
+    @staticmethod
+    def of(examples: Examples) -> _HeldOut:
+        centred, folds = np.empty_like(examples.values), []
+        for scene in np.unique(examples.scene):
+            held = examples.scene == scene
+            others = examples.values[~held]
+            usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
+            centred[held] = np.nan_to_num(examples.values[held] - usual)
+            ranks = _ranks(np.nan_to_num(others - usual))
+            folds.append((np.flatnonzero(held), np.flatnonzero(~held), ranks))
+        return _HeldOut(centred, tuple(folds))
+
+    def scores(self, hidden: Ints) -> Floats:
+        """[E, S] with the sign that files with something in them have in the other scenes."""
+        signed = np.empty_like(self.centred)
+        for held, others, ranks in self.folds:
+            labels = hidden[others]
+            signed[held] = self.centred[held] * np.where(_lean(ranks, labels) >= 0, 1, -1)
+        return signed
+
+
+def _lean(ranks: Floats, hidden: Ints) -> Floats:
+    """[S] how much higher statistics rank where something is hidden."""
+    found: Floats = ranks[hidden == 1].mean(axis=0) - ranks[hidden == 0].mean(axis=0)
+    return found
+
+
+def _errors(scores: Floats, examples: Examples) -> Floats:
+    """[S] standard errors of areas: whole models are drawn again, scene by scene."""
+    random = np.random.default_rng(0)
+    rows = [np.flatnonzero(examples.model == model) for model in np.unique(examples.model)]
+    scenes = np.array([examples.scene[own[0]] for own in rows])
+    strata = [np.flatnonzero(scenes == scene) for scene in np.unique(scenes)]
+    found = []
+    for _ in range(_DRAWS):
+        chosen = np.concatenate([random.choice(own, len(own)) for own in strata])
+        drawn = np.concatenate([rows[index] for index in chosen])
+        found.append(areas(scores[drawn], examples.hidden[drawn], examples.scene[drawn]))
+    errors: Floats = np.std(found, axis=0)
+    return errors

@@ -1,0 +1,163 @@
+"""A learned test: boosted trees predict a bit from all that an attacker sees beside it.
+
+Trained on plain models of other scenes. On a file whose bits are what training left they predict a little, or
+much, where the trainer's arithmetic shows; bits that were replaced they predict no better than a coin, which
+is an exact null: whatever the trees say, a fair bit that is independent of it agrees with it half the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from keyss.core import Gaussians
+from keyss.measure.stealth.statistic import NOTHING, Statistic, normal
+from keyss.measure.stealth.words import Bits, Flags, Floats, Ints, Words, ulps
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+LOWEST, HIGHEST = 1, 13  # bits that are predicted, the candidates for being replaced
+ATTRIBUTES_LEFT_ALONE = (0, 4)  # positions and constant colours
+_ABOVE, _BELOW = 5, 4  # bits that are seen
+ROWS = 30_000  # of one model
+_TREES, _LEAVES = 60, 24
+_UNSIGNED = np.uint32(0x7FFFFFFF)
+_SURE = 0.1  # distance from 1/2 of a prediction that says something
+_MIN_COUNT = 64
+_OFTEN = 6  # times: three channels of a grey Gaussian and of its sibling
+_DISTANCES = slice(0, 2)  # columns of what is seen
+
+
+class BitPredictor:
+    """Trees that predict single bits; `fit` them on plain models of scenes other than the judged ones."""
+
+    def __init__(self, trees: Any) -> None:
+        self._trees = trees
+
+    @staticmethod
+    def fit(models: Sequence[Gaussians], *, seed: int = 0) -> BitPredictor:
+        samples = [sample(model, ROWS, seed + index) for index, model in enumerate(models)]
+        return BitPredictor.of_samples(samples, seed=seed)
+
+    @staticmethod
+    def of_samples(samples: Sequence[tuple[Floats, Ints]], *, seed: int = 0) -> BitPredictor:
+        """From `sample`s, which several folds can share."""
+        from sklearn.ensemble import HistGradientBoostingClassifier  # slow to import
+
+        x, y = (np.concatenate(each) for each in zip(*samples, strict=True))
+        trees = HistGradientBoostingClassifier(
+            max_iter=_TREES,
+            max_leaf_nodes=_LEAVES,
+            l2_regularization=1.0,
+            min_samples_leaf=50,
+            random_state=seed,
+        )
+        return BitPredictor(trees.fit(x, y))
+
+    def statistics(self, model: Gaussians, *, seed: int = 0) -> dict[str, Statistic]:
+        """How well the bits of a file are predicted; see `of_sample`."""
+        return self.of_sample(*sample(model, ROWS, seed))
+
+    def of_sample(self, seen: Floats, bits: Ints) -> dict[str, Statistic]:
+        """Gain in log-likelihood per bit, and agreement with predictions as a share of what they promise.
+
+        Agreement is 1 where the file is as plain models are and 0 where its bits are random; null: 0.
+        """
+        chance = self._trees.predict_proba(seen)[:, 1]
+        said = np.where(bits == 1, chance, 1 - chance).clip(1e-6)
+        found = {"gain": Statistic(float(np.log2(2 * said).mean()))}
+        nearest = seen[:, _DISTANCES].min(axis=1)
+        kinds = {
+            "without a like": nearest >= HIGHEST,
+            "beside a like": (nearest > 0) & (nearest < HIGHEST),
+            "beside its equal": nearest == 0,
+        }
+        for kind, own in kinds.items():
+            for name, least in (("", 0.0), (", sure", _SURE)):
+                rows = own & (np.abs(chance - 0.5) > least)
+                found[f"agreement {kind}{name}"] = _agreement(chance[rows] - 0.5, bits[rows] - 0.5)
+        return {name: each for name, each in found.items() if not np.isnan(each.value)}
+
+
+def _agreement(lean: Floats, came: Floats) -> Statistic:
+    promised = float((2 * lean**2).sum())
+    if len(lean) < _MIN_COUNT or promised == 0:
+        return NOTHING
+    return normal(float((lean * came * 2).sum()) / promised, float((lean**2).sum()) ** 0.5 / promised)
+
+
+def sample(model: Gaussians, rows: int, seed: int) -> tuple[Floats, Ints]:
+    """[R, features] and [R] bits: of the smallest numbers, of those with the nearest likes, and of any."""
+    words = Words.of(model)
+    random = np.random.default_rng(seed)
+    beside, distance = _likes(words, model)
+    # What occurs again and again is a multiple of a learning rate, which everybody leaves alone.
+    allowed = words.trained & ~np.isin(words.attribute, ATTRIBUTES_LEFT_ALONE) & ~_repeated(words.bits)
+    chosen = []
+    candidates = np.flatnonzero(allowed)
+    if not len(candidates):
+        return np.zeros((0, 1)), np.zeros(0, np.int64)
+    for badness in (words.exponent, distance.min(axis=0)):
+        flat = badness.ravel()[candidates] + random.random(len(candidates))
+        count = min(rows // 3, len(candidates))
+        chosen.append(candidates[np.argpartition(flat, count - 1)[:count]])
+    chosen.append(random.choice(candidates, rows // 3))
+    at = np.concatenate(chosen)
+    bit = random.integers(LOWEST, HIGHEST, len(at))
+    return _seen(words, at, bit, beside, distance), (words.bits.ravel()[at] >> bit & 1).astype(np.int64)
+
+
+def _seen(words: Words, at: Ints, bit: Ints, beside: Bits, distance: Floats) -> Floats:
+    """[R, features] of numbers `at` (flat indices) and their bits."""
+    own, width = words.bits.ravel()[at], words.bits.shape[1]
+    row, field = at // width, at % width
+    columns: list[Any] = [each.ravel()[at] for each in distance]
+    columns += [beside[index].ravel()[at] >> bit & 1 for index in range(len(beside))]
+    columns += [words.attribute[field], words.exponent.ravel()[at], bit]
+    for step in range(1, _BELOW + 1):
+        columns.append(np.where(bit >= step, own >> np.maximum(bit - step, 0) & 1, 2))
+    columns += [own >> (bit + step) & 1 for step in range(1, _ABOVE + 1)]
+    below = own & ((np.uint32(1) << bit.astype(np.uint32)) - np.uint32(1))
+    columns += [own & 1, below == 0]
+    harmonics = words.attribute > 4
+    if harmonics.any():
+        columns.append(np.where(words.trained, words.exponent, 0)[:, harmonics].min(axis=1)[row])
+        zeros = (words.bits[:, harmonics] & 1 == 0) & words.trained[:, harmonics]
+        columns += [zeros.mean(axis=1)[row]]
+    return np.stack([np.asarray(each, np.float64) for each in columns], axis=1)
+
+
+def _repeated(bits: Bits) -> Flags:
+    """[N, F] which numbers occur again and again, whatever their sign."""
+    _, inverse, times = np.unique(bits & _UNSIGNED, return_inverse=True, return_counts=True)
+    found: Flags = (times > _OFTEN)[inverse].reshape(bits.shape)
+    return found
+
+
+def _likes(words: Words, model: Gaussians) -> tuple[Bits, Floats]:
+    """[L, N, F] numbers that may be alike, and [L, N, F] base-2 logarithms of their distance in last bits.
+
+    The nearest of the other channels or axes of the same Gaussian, and the same field of the nearest
+    neighbour in space.
+    """
+    bits = words.bits
+    nearest = np.zeros_like(bits)
+    least = np.full(bits.shape, np.int64(1) << 31)
+    for attribute, width in ((1, 3), (2, 4), (4, 3), (5, 3), (6, 3), (7, 3)):
+        own = words.of_attribute(attribute)
+        if own.stop == own.start:
+            continue
+        groups = bits[:, own].reshape(len(bits), -1, width)
+        for turn in range(1, width):
+            other = np.roll(groups, turn, axis=2).reshape(len(bits), -1)
+            apart = ulps(bits[:, own] & _UNSIGNED, other & _UNSIGNED)
+            closer = apart < least[:, own]
+            nearest[:, own] = np.where(closer, other, nearest[:, own])
+            least[:, own] = np.where(closer, apart, least[:, own])
+    positions = model.means.detach().cpu().double().numpy()
+    neighbour = (
+        cKDTree(positions).query(positions, k=min(2, len(positions)))[1].reshape(len(positions), -1)[:, -1]
+    )
+    beside = np.stack([nearest, bits[neighbour]])
+    return beside, np.log2(1.0 + np.stack([least, ulps(bits, bits[neighbour])]))

@@ -1,1 +1,0 @@
-"""The public verbs, one module for those that go together; `keyss.api` has their names."""

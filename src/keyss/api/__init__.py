@@ -1,0 +1,1 @@
+"""The public functions, which `keyss` exports and the command line calls."""

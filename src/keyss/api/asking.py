@@ -1,0 +1,116 @@
+"""Arguments and result of `hide`: arguments are checked before any work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import combinations
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
+from keyss.core.scene import Scene
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.methods import registry
+from keyss.methods.base import Method, MethodOptions, Source
+from keyss.methods.plan import Plan
+from keyss.rendering.orbit import is_model
+from keyss.runs.metrics import HideMetrics
+from keyss.runs.sources import PathLike, as_3dgs_model, path_of
+
+_READERS = 2  # threads that read files
+
+
+@dataclass(frozen=True)
+class Secret:
+    """What to hide, a scene or a file, and the key that opens it (methods without keys take none)."""
+
+    scene: PathLike | Scene | Gaussians | None = None  # folder of photos, or model
+    key: str = field(default="", repr=False)
+    model: PathLike | Gaussians | None = None  # plain 3DGS model of the scene, fitted if there is none
+    file: PathLike | bytes | None = None  # instead of a scene
+    name: str = ""  # of the file, shown when it is revealed; by default its own
+
+    @property
+    def source(self) -> PathLike | Scene | Gaussians:
+        """The scene. Raises UsageError if there is none."""
+        if self.scene is None:
+            raise UsageError("expected secrets with a `scene`, or all of them with a `file`")
+        return self.scene
+
+
+@dataclass(frozen=True)
+class HideResult:
+    """What `hide` made."""
+
+    stego: Gaussians | None = None  # to be published; None of a dry run
+    metrics: HideMetrics | None = None  # None of files and of a dry run
+    psnr: float | None = None  # of files: dB of the stego model's views to the cover's, at most 120
+    plan: Plan | None = None  # of a dry run
+
+
+def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
+    """A method and its options. Raises UsageError for a number of secrets or keys that it cannot have."""
+    if isinstance(chosen, MethodOptions):
+        method, options = registry.of_options(chosen), chosen
+    else:
+        method = registry.get(chosen)
+        options = method.options()
+    if not 1 <= len(secrets) <= method.most_secrets:
+        raise UsageError(
+            f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
+        )
+    keys = [secret.key for secret in secrets]
+    if method.capabilities.keys:
+        check_keys(keys)
+    elif any(keys):
+        raise UsageError(
+            f"the method {method.name} has no keys, as whoever has both files can see the secret: give none"
+        )
+    return method, options
+
+
+def sources_of(
+    cover: PathLike | Scene | Gaussians, cover_model: PathLike | Gaussians | None, secrets: Sequence[Secret]
+) -> list[Source]:
+    """The cover and the secrets, with plain models that are given or that they are. Raises UsageError."""
+    sources = [cover, *(secret.source for secret in secrets)]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    asked: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
+    for index, (source, model) in enumerate(zip(sources, models, strict=True)):
+        photos = isinstance(source, Scene) or not is_model(source)
+        if not photos:
+            if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
+                argument = "model" if index else "cover_model"
+                what = "a source in memory" if isinstance(source, Gaussians) else source
+                raise UsageError(f"{what} is a model itself: leave out `{argument}`")
+            model = source  # type: ignore[assignment]
+        asked.append((model, photos))
+    names = ["the cover"] + ["the secret"] * (len(asked) - 1)
+    # Large files take seconds each, most of them outside of Python's lock.
+    with ThreadPoolExecutor(_READERS) as readers:
+        found = readers.map(_drawable, [model for model, _ in asked], names)
+        keys = ["", *(secret.key for secret in secrets)]
+        return [
+            Source(model, photos, key) for model, (_, photos), key in zip(found, asked, keys, strict=True)
+        ]
+
+
+def _drawable(model: PathLike | Gaussians | None, what: str) -> Gaussians | None:
+    """The model, if there is one. Raises UsageError if all of it is transparent."""
+    found = None if model is None else as_3dgs_model(model, what)
+    if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
+        raise UsageError(f"{what}'s model is invisible: all of its Gaussians are transparent")
+    return found
+
+
+def check_keys(keys: Sequence[str]) -> None:
+    """Raise UsageError for invalid keys, and for two that key derivation treats as equal."""
+    cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
+    derived = [DerivedKey(key, cheap) for key in keys]
+    for (i, a), (j, b) in combinations(enumerate(derived, 1), 2):
+        if a.equals(b):
+            raise UsageError(
+                f"secrets {i} and {j} have the same key, which could open only one of them: give each its "
+                "own (see `keyss keygen`)"
+            )

@@ -1,0 +1,116 @@
+"""`convert`: a model in another format, and what that costs the model and its secrets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import write_bytes
+from keyss.files.models import (
+    check_model_output,
+    keeps_low_bits,
+    model_bytes,
+    model_of_bytes,
+)
+from keyss.files.streams import StandardOutput, is_standard
+from keyss.rendering import Backend, resolve_device
+from keyss.rendering.difference import psnr_between
+from keyss.runs.folder import check_not_published
+from keyss.runs.revealing import reveal_any
+from keyss.runs.sources import PathLike, as_model
+
+# A secret with a smaller share of its Gaussians left counts as lost.
+_KEPT = 0.99
+
+
+@dataclass(frozen=True)
+class KeptSecret:
+    """How much of a secret its key opens before and after the conversion."""
+
+    before: int  # Gaussians, or bytes of a hidden file
+    after: int
+    unit: str = "Gaussians"
+
+    @property
+    def kept(self) -> bool:
+        return self.after >= _KEPT * self.before
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A model in another format."""
+
+    gaussians: Gaussians  # as read from it
+    bytes_before: int | None  # None: read from standard input or from memory
+    bytes_after: int
+    psnr: float  # dB between renders before and after, from around the model; 120: equal
+    keeps_low_bits: bool  # whether the format keeps them
+    secrets: tuple[KeptSecret, ...]  # in the order of the keys
+
+
+@torch.no_grad()
+def convert(
+    model: PathLike | Gaussians,
+    out: PathLike,
+    keys: Sequence[str] = (),
+    *,
+    force: bool = False,
+    dry_run: bool = False,
+    overwrite: bool = False,
+    device: Backend = "auto",
+) -> Conversion:
+    """Write a model in the format of the suffix of `out`, and measure what that costs.
+
+    If a secret that one of `keys` opens would be lost, QualityError is raised and nothing is written, unless
+    with `force`. `dry_run` writes nothing at all. Without keys, the result does not tell whether something is
+    hidden. Raises WrongKeyError for a key that opens nothing, InputError, OutputError, and UsageError for an
+    unknown suffix.
+    """
+    target = resolve_device(device)
+    source = None if isinstance(model, Gaussians) else Path(model)
+    path = check_model_output(out, overwrite, [source] if source else [])
+    if not is_standard(path):
+        check_not_published(path)
+    before = as_model(model)
+    opened = [reveal_any(before, key, target) for key in keys]
+    data = model_bytes(path, before)
+    after = model_of_bytes(path, data)
+    secrets = tuple(
+        KeptSecret(each.remains.found, _left(after, key, target), "bytes" if each.file else "Gaussians")
+        for key, each in zip(keys, opened, strict=True)
+    )
+    size = None if source is None or is_standard(source) else source.stat().st_size
+    psnr = psnr_between(before.to(target), after.to(target))
+    result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
+    lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
+    if lost and not (force or dry_run):
+        raise QualityError(_refusal(path, result, lost))
+    if dry_run:
+        return result
+    if is_standard(path):
+        StandardOutput().write(memoryview(data))
+    else:
+        write_bytes(path, data)
+    return result
+
+
+def _left(model: Gaussians, key: str, device: torch.device) -> int:
+    """How much a key opens in a converted model, in Gaussians or bytes."""
+    try:
+        return reveal_any(model, key, device).remains.found
+    except (WrongKeyError, InputError, UsageError):
+        return 0
+
+
+def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
+    """Why nothing was written."""
+    first = result.secrets[lost[0] - 1]
+    which = "the secret that the key opens" if len(result.secrets) == 1 else f"the secret of key {lost[0]}"
+    left = f"{first.after:,} of its {first.before:,} {first.unit} would be left in {path}"
+    why = "" if result.keeps_low_bits else ", as this format destroys low bits"
+    return f"{which} would be lost: {left}{why}; nothing was written; `force=True` writes it anyway"

@@ -1,0 +1,89 @@
+"""`fit`: a plain 3DGS model of a scene."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+
+from keyss.api.together import begun, together
+from keyss.core.scene import Scene, ViewOptions
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import quality
+from keyss.fitting.plain import FitResult, fit_scene
+from keyss.fitting.ranks import here
+from keyss.fitting.reporting import Reporter
+from keyss.rendering import Backend, resolve_device
+from keyss.runs.config import FitRunConfig
+from keyss.runs.files import CONFIG, METRICS, MODEL, writers
+from keyss.runs.folder import RunFolder
+from keyss.runs.metrics import FitMetrics
+from keyss.runs.planning import in_a_line, plan_fit, worth_planning
+from keyss.runs.sources import Background, PathLike, as_scene, path_of
+
+
+@together
+def fit(
+    scene: PathLike | Scene,
+    *,
+    config: FitConfig | None = None,
+    width: int | None = None,
+    background: Background = None,
+    skip_missing: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> FitResult:
+    """Train plain 3DGS on a scene.
+
+    `width`, `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets `model.ply`, and `private/`
+    with `config.json`, `metrics.json` and checkpoints, from which `resume` continues. Without a seed in
+    `config` the run uses a random one, which `config.json` records. Of several processes of torchrun the
+    first one writes and reports; all return the model. Raises KeyssError, and Interrupted on Ctrl-C.
+    """
+    answers = here().first
+    interrupted = Path(out) if resume and out is not None else None
+    config = begun(config or FitConfig(), interrupted, "config")
+    target = resolve_device(device)
+    settings = FitRunConfig(
+        scene=path_of(scene),
+        views=ViewOptions.of(width, background, skip_missing),
+        config=config,
+    )
+    folder = None
+    if out is not None and answers:
+        folder = RunFolder(
+            out,
+            "fit",
+            asdict(settings),
+            writes=(MODEL, CONFIG, METRICS),
+            overwrite=overwrite,
+            resume=resume,
+        )
+    loaded = as_scene(scene, settings.views)
+    if reporter and answers and not resume and worth_planning(config):
+        reporter.note(f"fit: {in_a_line(plan_fit(loaded, config, target))}")
+    with folder.work() if folder else nullcontext():
+        result = fit_scene(
+            loaded,
+            config,
+            device=target,
+            title=f"fit {loaded.name}",
+            checkpoint=folder.checkpoints / "fit.safetensors" if folder else None,
+            resume=resume,
+            reporter=reporter,
+        )
+        if folder:
+            test = quality(result.gaussians.to(target), loaded.test, loaded.background.to(target))
+            metrics = FitMetrics(
+                **asdict(test),
+                gaussians=len(result.gaussians),
+                iterations=config.iterations,
+                seconds=round(result.seconds, 1),
+                width=loaded.train[0].camera.width,
+                seed=config.known_seed,
+            )
+            folder.write(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
+    return result

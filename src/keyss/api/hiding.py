@@ -1,0 +1,357 @@
+"""`hide`: secrets in a cover, revealed again and measured."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import msgspec
+import torch
+
+from keyss.api.asking import HideResult, Secret, method_for, sources_of
+from keyss.api.filing import hide_files
+from keyss.api.together import begun, together
+from keyss.channels import AnyChannel, Payload, Publish
+from keyss.core.errors import QualityError, UsageError
+from keyss.core.gaussians import Gaussians, same_bits
+from keyss.core.scene import Scene, ViewOptions
+from keyss.files.models import is_model_path, read_model
+from keyss.fitting.image_metrics import quality
+from keyss.fitting.ranks import here
+from keyss.fitting.reporting import Reporter
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES
+from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
+from keyss.methods.base import Context, Method, MethodOptions, Stego
+from keyss.methods.handed import pack
+from keyss.methods.opened import Opened
+from keyss.methods.plain_models import Bound, fit_bounds, with_plain_models
+from keyss.methods.registry import DEFAULT, open_handed, open_model
+from keyss.rendering import Backend, resolve_device
+from keyss.rendering.orbit import is_model
+from keyss.runs.config import RunConfig, secret_ids
+from keyss.runs.files import (
+    CONFIG,
+    METRICS,
+    MODEL,
+    STEGOS,
+    bound_names,
+    handed_names,
+    plain_names,
+    stego_name,
+    writers,
+)
+from keyss.runs.folder import RunFolder
+from keyss.runs.metrics import FitMetrics, HideMetrics
+from keyss.runs.planning import check_disk, in_a_line, plan_hiding, worth_planning
+from keyss.runs.records import read_record, record_bytes
+from keyss.runs.sources import Background, PathLike, as_scene, path_of
+
+MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
+_BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; empty renders of dark or small objects can have a high PSNR
+
+
+@together
+def hide(
+    cover: PathLike | Scene | Gaussians,
+    secrets: Sequence[Secret],
+    *,
+    method: str | MethodOptions = DEFAULT,
+    publish: Publish | None = None,
+    channel: AnyChannel | None = None,
+    width: int | None = None,
+    background: Background = None,
+    skip_missing: bool = False,
+    cover_model: PathLike | Gaussians | None = None,
+    bound: bool = False,
+    min_psnr: float = MIN_PSNR,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    dry_run: bool = False,
+    reporter: Reporter | None = None,
+) -> HideResult:
+    """Hide secrets in a cover, each under its own key, and measure the result on the test views.
+
+    Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
+    Plain models of scenes are fitted unless they are given. Secrets can also be files, in a cover that is a
+    model. `method`: a name, or the options of a method (`CarryOptions`, `KeyssOptions`). `publish` and
+    `channel`, if given, replace those of the options: "ply" hides in low bits; "spz", "sog" and
+    "compressed-ply" in the integers of such a file, which must stay unchanged; "any" in what survives
+    conversion, which is the channel "appended" (more Gaussians, which are visible in the file) or "colours"
+    (less room). `width`, `background`, `skip_missing`: see `load_scene`.
+
+    `out` (a folder) gets `publish/` with the stego model, and `private/` with plain models, `config.json`,
+    `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
+    checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
+    one, which `config.json` records. With one, the same arguments give the same bytes on a CPU with as many
+    threads.
+
+    `bound`: fit plain 3DGS of as many Gaussians and training steps to compare with; otherwise `metrics.json`
+    says which baselines had fewer steps. `dry_run`: check arguments, and return only the plan.
+
+    At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
+    below `min_psnr` (dB), or no better than that of empty pictures, nothing is published, and QualityError is
+    raised; checkpoints stay. Of several processes of torchrun the first one writes, measures and reports.
+    Raises other KeyssErrors too, and Interrupted on Ctrl-C.
+    """
+    if any(secret.file is not None for secret in secrets):
+        for name, value in {"dry_run": dry_run, "resume": resume, "bound": bound}.items():
+            if value:
+                raise UsageError(f"hiding files does not use `{name}`: leave it out")
+        if isinstance(cover, Scene):
+            raise UsageError("hiding files needs a model as the cover; `keyss.fit` makes one from photos")
+        return hide_files(
+            cover,
+            secrets,
+            publish=publish or "ply",
+            channel=channel or "colours",
+            out=out,
+            overwrite=overwrite,
+        )
+    if out is not None and is_model_path(out):
+        raise UsageError(
+            f"{out}: expected the name of a folder; the format of the model in it follows from `publish`"
+        )
+    chosen, options = method_for(method, secrets)
+    if publish or channel:
+        options = replace(options, publish=publish or options.publish, channel=channel or options.channel)
+    repeatable, ranks = options.fit.seed is not None, here()
+    interrupted = Path(out) if resume and out is not None else None
+    options = replace(options, fit=begun(options.fit, interrupted, "options", "fit"))
+    keys = [secret.key for secret in secrets]
+    target = resolve_device(device)
+    given = [cover, *(secret.source for secret in secrets)]
+    models = [cover_model, *(secret.model for secret in secrets)]
+    settings = RunConfig(
+        method=chosen.name,
+        cover=path_of(cover),
+        secrets=tuple(path_of(secret.source) for secret in secrets),
+        models_given=tuple(
+            model is not None or (not isinstance(source, Scene) and is_model(source))
+            for source, model in zip(given, models, strict=True)
+        ),
+        views=ViewOptions.of(width, background, skip_missing),
+        payloads=(),
+        options=options,
+    )
+    folder = None
+    place = None if out is None else Path(out)
+    if place is not None and ranks.first and not dry_run:
+        told = asdict(settings) | {"models": [m and path_of(m) for m in models]}
+        told |= {"bound": True} if bound else {}
+        told["keys"] = _key_checks(keys, settings)
+        folder = RunFolder(
+            place,
+            "hide",
+            told,
+            onto=("scenes",),
+            writes=(*STEGOS, CONFIG),
+            inputs=[Path(each) for each in (*given, *models) if isinstance(each, str | Path)],
+            overwrite=overwrite,
+            resume=resume,
+        )
+    sources = sources_of(cover, cover_model, secrets)
+    options = chosen.prepare(sources, options)
+    configs = options.fits(len(sources))
+    fitted = [
+        config.iterations if each.given is None else _steps_of(model)
+        for each, model, config in zip(sources, models, configs, strict=True)
+    ]
+    if place is not None and ranks.first:
+        check_disk(place, options, sources)
+    trains = not dry_run and (options.trains or any(each.given is None for each in sources))
+    sources = [
+        replace(
+            each,
+            loaded=as_scene(
+                source,
+                settings.views,
+                train_pictures=trains,
+                model=None if each.photos else each.given,
+            ),
+        )
+        for source, each in zip(given, sources, strict=True)
+    ]
+    scenes = [each.scene for each in sources]
+    if dry_run:
+        return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
+    if reporter and ranks.first and trains and not resume and worth_planning(options.fit):
+        planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
+        reporter.note(f"hide: {in_a_line(planned)}")
+    with folder.work() if folder else nullcontext():
+        context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
+        sources = with_plain_models(sources, configs, context)
+        plain = [each.model for each in sources]
+        if repeatable:
+            context = replace(context, entropy=_entropy(keys, options, plain))
+        elif ranks.count > 1:  # all processes must continue with the same model
+            context = replace(context, entropy=ranks.from_first(os.urandom(32)))
+        stego = chosen.hide(sources[0], sources[1:], options, context)
+        shown: list[Shown] = []
+        if ranks.first:
+            shown = [
+                show(model.to(target), original.to(target), scene, of_plain=not each.photos)
+                for model, original, scene, each in zip(
+                    _as_read(stego, keys, folder), plain, scenes, sources, strict=True
+                )
+            ]
+            _check_quality(shown, min_psnr)
+        photos = tuple(each.photos for each in sources)
+        bounds = list(map(Bound.of, options.training(len(scenes)), fitted))
+        longer = _longer(bounds, scenes, plain, photos, stego, options, context) if bound else {}
+        if ranks.first:
+            metrics = _measured(
+                chosen, stego, scenes, plain, photos, options, shown, target, bounds, fitted, longer
+            )
+        if folder:
+            payloads = secret_ids(options.fit.known_seed, stego.opened)
+            made = dict(zip(plain_names(len(secrets)), plain, strict=True))
+            made |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
+            settings = replace(settings, options=options, payloads=payloads)
+            folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
+    if ranks.count > 1:
+        found = json.dumps(asdict(metrics) if ranks.first else None)  # which keeps NaN
+        metrics = msgspec.convert(json.loads(ranks.from_first(found.encode())), HideMetrics)
+    return HideResult(stego.gaussians, metrics)
+
+
+def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
+    """Verifiers of the keys for resumed runs; guessing a key from one is as slow as from the stego model."""
+    salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
+    derivation = KeyDerivation(salt=salt)
+    return [DerivedKey(key, derivation).verifier().hex() for key in keys if key]
+
+
+def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
+    """32 bytes that follow from keys, options and models, and that cannot be guessed without the keys."""
+    seed = options.fit.known_seed
+    salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
+    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys if key]
+    parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
+    return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
+
+
+def _handed_files(payloads: Sequence[Payload], keys: Sequence[str]) -> dict[str, bytes]:
+    """The files to hand over, by their names in the run's folder."""
+    packed = [pack(payload, key or None) for payload, key in zip(payloads, keys, strict=bool(payloads))]
+    return dict(zip(handed_names(len(packed)), packed, strict=True))
+
+
+def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
+    """The stego model and the secrets, from the files that are given away."""
+    model, handed = stego.gaussians, _handed_files(stego.handed, keys)
+    if folder:
+        name = stego_name(model)
+        model = read_model(folder.write(writers({name: model, **handed})) / name)
+    opened: Sequence[Opened]
+    if handed:
+        opened = [open_handed(data, key or None) for data, key in zip(handed.values(), keys, strict=True)]
+    elif stego.verified and same_bits(model, stego.gaussians):
+        opened = stego.opened  # the same bits were opened before
+    else:
+        opened = [open_model(model, key) for key in keys]
+    return [model, *(each.reveal(model) for each in opened)]
+
+
+def _check_quality(shown: Sequence[Shown], min_psnr: float) -> None:
+    """Raise QualityError if the cover or a secret is too far from its plain model."""
+    for index, each in enumerate(_fidelity(shown)):
+        who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
+        if each.psnr < min_psnr:
+            raise QualityError(
+                f"{who} is at {each.psnr:.1f} dB PSNR to its plain model, below {min_psnr:g} dB: nothing was "
+                "published; `min_psnr` sets the limit, and `resume=True` skips the training that is done"
+            )
+        if min_psnr > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
+            raise QualityError(
+                f"{who} is at {each.psnr:.1f} dB PSNR to its plain model, and empty renders are at "
+                f"{each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it anyway, and "
+                "`resume=True` skips the training that is done"
+            )
+
+
+def _fidelity(shown: Sequence[Shown]) -> tuple[RenderFidelity, ...]:
+    """PSNR of cover and secrets to their plain models."""
+    return tuple(each.fidelity for each in shown if each.fidelity is not None)
+
+
+def _steps_of(model: PathLike | Gaussians | None) -> int | None:
+    """Steps of the training of a plain model that is given, if `fit` wrote it."""
+    if model is None or isinstance(model, Gaussians) or Path(model).name != MODEL:
+        return None
+    metrics = Path(model).parent / METRICS
+    return read_record(metrics, FitMetrics).iterations if metrics.is_file() else None
+
+
+def _longer(
+    bounds: Sequence[Bound],
+    scenes: Sequence[Scene],
+    plain: Sequence[Gaussians],
+    photos: Sequence[bool],
+    stego: Stego,
+    options: MethodOptions,
+    context: Context,
+) -> dict[int, Gaussians]:
+    """Plain 3DGS of scenes that were trained for longer than their plain models, by index."""
+    sizes = [len(stego.gaussians), *(len(each.reveal(stego.gaussians)) for each in stego.opened)]
+    configs = {
+        # A secret that was pruned to fit is compared with a model of that size.
+        index: each.config(options.fit, size if size < len(model) else None)
+        for index, (each, model, size) in enumerate(zip(bounds, plain, sizes, strict=True))
+        if not each.equal and each.steps is not None and photos[index]
+    }
+    return fit_bounds(scenes, configs, context)
+
+
+def _measured(
+    method: Method,
+    stego: Stego,
+    scenes: Sequence[Scene],
+    models: Sequence[Gaussians],  # plain models of the scenes
+    photos: tuple[bool, ...],  # whether scenes have any
+    options: MethodOptions,
+    shown: Sequence[Shown],  # compared with the plain models
+    device: torch.device,
+    bounds: Sequence[Bound],
+    fitted: Sequence[int | None],  # steps of the plain models
+    longer: Mapping[int, Gaussians],  # plain models with more steps
+) -> HideMetrics:
+    """The measurements of a hiding."""
+    baselines = [longer.get(index, model) for index, model in enumerate(models)]
+    beside_bounds = [
+        replace(each, plain=quality(longer[index].to(device), scene.test, scene.background.to(device)))
+        if index in longer
+        else each
+        for index, (each, scene) in enumerate(zip(shown, scenes, strict=True))
+    ]
+    measured = measure_hiding(
+        stego.gaussians.to(device),
+        stego.opened,
+        scenes,
+        baselines,
+        steps=[each.steps if index in longer else fitted[index] for index, each in enumerate(bounds)],
+        equal=[each.equal or index in longer for index, each in enumerate(bounds)],
+        seed=options.fit.known_seed,
+        shown=beside_bounds,
+    )
+    return HideMetrics(
+        **vars(measured),
+        method=method.name,
+        gaussians=len(stego.gaussians),
+        photos=photos,
+        secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
+        iterations=stego.iterations,
+        steps=tuple(each.steps for each in bounds),
+        seconds=round(stego.seconds, 1),
+        width=scenes[0].train[0].camera.width,
+        seed=options.fit.known_seed,
+        against_plain=_fidelity(shown),
+        details=stego.details,
+    )

@@ -1,0 +1,112 @@
+"""`reveal` and `verify`: from a stego model and a key to the secret."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from keyss.channels import open_content
+from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import write_bytes
+from keyss.files.models import check_model_output, is_model_path, write_model
+from keyss.files.output import check_not_an_input, check_output_file
+from keyss.files.streams import is_standard
+from keyss.methods.hidden_file import HiddenFile, OpensAFileError
+from keyss.methods.opened import Frame
+from keyss.rendering import Backend, resolve_device
+from keyss.runs.folder import check_not_published
+from keyss.runs.revealing import Revealed, reveal_model, revealed_file
+from keyss.runs.sources import PathLike, as_model
+
+if TYPE_CHECKING:
+    from keyss.runs.verifying import Verification
+
+
+def reveal(
+    stego: PathLike | Gaussians,
+    key: str | None = None,
+    *,
+    handed: PathLike | None = None,
+    frame: Frame = "secret",
+    decoy: bool = False,
+    force: bool = False,
+    device: Backend = "auto",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> Revealed:
+    """Reveal the secret that `key` opens in a stego model: a scene, as an ordinary model, or a file.
+
+    The model itself tells which method hid the secret. `frame`: "secret" gives a scene in its own frame,
+    which its cameras fit; "cover" leaves it where it was hidden, unless it was carried. Where Gaussians were
+    lost, those left are enlarged to make up for them (`keyss.core.pruning_compensation`). `force` is for
+    models that were quantised or pruned: it skips the check that a decoder belongs to the model, and accepts
+    any loss. `handed`: the file that was handed over for this secret, for methods that need one
+    (`keyss.methods.handed`). Some of those have no keys, and some give a model that a network decodes
+    (`keyss.core.decoded`), which is no 3DGS model.
+
+    `out` (a file) gets the secret: a scene if the name is that of a model (.ply, .spz, ...), else a file.
+    Raises WrongKeyError for a key that opens nothing (with `decoy` the cover is revealed instead, see
+    `keyss.methods.decoy`), and InputError for a damaged file and where less than a tenth of the secret is
+    left. Warns (KeyssWarning) where more than a hundredth is missing.
+    """
+    target = resolve_device(device)
+    inputs = [] if isinstance(stego, Gaussians) else [Path(stego)]
+    if out is not None and not is_standard(out) and not is_model_path(out):
+        if key is None or handed or decoy or force or frame != "secret":
+            raise UsageError(
+                f"{out}: expected the name of a model, such as one that ends in .ply; `handed`, `decoy`, "
+                "`force` and `frame` are not for hidden files"
+            )
+        return _reveal_file(stego, key, Path(out), overwrite, inputs)
+    path = None if out is None else check_model_output(out, overwrite, inputs)
+    if path is not None and not is_standard(path):
+        check_not_published(path)
+    try:
+        found = reveal_model(
+            as_model(stego), key, device=target, frame=frame, decoy=decoy, force=force, handed=handed
+        )
+    except OpensAFileError as error:
+        if path is None:
+            return revealed_file(error.file)
+        raise
+    if not force:
+        found.check_usable()
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
+    if path is not None:
+        write_model(path, found.gaussians)
+    return found
+
+
+def _reveal_file(
+    stego: PathLike | Gaussians, key: str, out: Path, overwrite: bool, inputs: list[Path]
+) -> Revealed:
+    """`reveal` of a hidden file into `out`."""
+    check_not_an_input(out, inputs)
+    path = check_output_file(out, overwrite)
+    check_not_published(path)
+    file = HiddenFile.of(open_content(as_model(stego), key))
+    write_bytes(path, file.data)
+    return revealed_file(file)
+
+
+def verify(
+    model: PathLike | Gaussians,
+    key: str | None = None,
+    *,
+    device: Backend = "auto",
+) -> Verification:
+    """Check that a model is sound and, with a key, that its secret is complete; writes nothing.
+
+    Without a key, the result does not tell whether something is hidden. Raises InputError for a file that is
+    not a whole and finite model, WrongKeyError for a key that opens nothing.
+    """
+    from keyss.runs.verifying import Verification, check_model, check_secret  # which renders
+
+    target = resolve_device(device)
+    name = "model" if isinstance(model, Gaussians) else str(model)
+    gaussians = as_model(model)
+    secret = None if key is None else check_secret(reveal_model(gaussians, key, device=target))
+    return Verification(name, check_model(gaussians), secret)

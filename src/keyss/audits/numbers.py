@@ -1,0 +1,69 @@
+"""Numbers as text."""
+
+from __future__ import annotations
+
+import math
+
+MINUS = "\N{MINUS SIGN}"
+NOTHING = "–"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """With a fixed number of decimals; very large numbers as powers of ten."""
+    if value is None or math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else f"{MINUS}∞"
+    plain = f"{value:,.{digits}f}" if abs(value) < 1e7 else f"{value:.{digits}e}"
+    return (plain.replace("-", "", 1) if float(plain.replace(",", "")) == 0 else plain).replace("-", MINUS)
+
+
+def significant(value: float | None) -> str:
+    """With three significant digits."""
+    if value is None or not math.isfinite(value) or value == 0:
+        return number(value, 0)
+    return f"{value:#.3g}".replace("-", MINUS)
+
+
+def difference(value: float | None, digits: int = 2) -> str:
+    """With its sign."""
+    text = number(value, digits)
+    return f"+{text}" if value is not None and value > 0 and text.strip("0.,") else text
+
+
+def decibel(value: float | None, digits: int = 2) -> str:
+    return f"{number(value, digits)} dB"
+
+
+def times(value: float | None) -> str:
+    """A ratio."""
+    return NOTHING if value is None else f"{number(value, 2 if abs(value) < 10 else 0)}×"
+
+
+def integer(value: float | None) -> str:
+    return number(value, 0)
+
+
+def numbered(name: str, index: int, count: int) -> str:
+    """A name, with its number if there is more than one."""
+    return f"{name} {index + 1}" if count > 1 else name
+
+
+def bytes_text(value: float | None) -> str:
+    """A file size, in powers of 1000."""
+    if value is None or not math.isfinite(value):
+        return number(value, 0)
+    if abs(value) < 1000:
+        return f"{number(value, 0)} B"
+    return f"{number(value / 1e3, 1)} kB" if abs(value) < 1e6 else f"{number(value / 1e6, 2)} MB"
+
+
+def seconds_text(value: float | None) -> str:
+    """A duration: 0.021 s, 3.1 s, 10.2 min, 2.5 h."""
+    if value is None or not math.isfinite(value):
+        return number(value, 0)
+    if value < 1:
+        return f"{significant(value)} s"
+    if value < 100:
+        return f"{number(value, 1)} s"
+    return f"{number(value / 60, 1)} min" if value < 6000 else f"{number(value / 3600, 1)} h"

@@ -1,0 +1,172 @@
+"""The audit of a run: all measures in turn, each stored as soon as it is finished."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from functools import partial
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+import msgspec
+
+from keyss._version import __version__
+from keyss.audits.parts import OF_3DGS_MODELS, PARTS
+from keyss.audits.progress import FinishedParts, PartProgress
+from keyss.audits.record import (
+    AUDIT_FILE,
+    AUDIT_FOLDER,
+    PICTURES,
+    Audit,
+    AuditedRun,
+    Controls,
+    WrongKeyResult,
+    read_audit,
+)
+from keyss.audits.subject import AuditSubject, subject_of
+from keyss.core import Interrupted, UsageError, import_extra, signal_of
+from keyss.files.atomic import write_bytes
+from keyss.files.layout import usual_up
+from keyss.fitting import Reporter, SilentReporter
+from keyss.methods import registry
+from keyss.rendering import Backend, resolve_device
+from keyss.runs.files import REPORT, stego_in, writers
+from keyss.runs.folder import RunFolder, write_again
+from keyss.runs.opening import HidingRun, open_run
+from keyss.runs.sources import PathLike
+
+_LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
+_EXTRA = ("jinja2", "matplotlib", "ot", "sklearn")
+KEPT = ("hide", "demo", "controls")  # stages of a run whose files an audit keeps
+
+
+def audit(
+    run: PathLike,
+    keys: Sequence[str] = (),
+    *,
+    report_only: bool = False,
+    original: PathLike | None = None,
+    controls: int = 3,
+    only: Sequence[str] = (),
+    seed: int = 0,
+    device: Backend = "auto",
+    overwrite: bool = False,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> Audit:
+    """Measure quality, stealth, leaks, robustness and speed of a folder that `hide` made.
+
+    `keys`: those of all its secrets, in any order. `report_only`: only writes `private/report.html` again,
+    from the audit that the run already has; it needs no keys. `original`: a plain model of the cover, by
+    default the run's own. `controls`: the number of plain models of the cover, from other seeds, to compare
+    with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
+
+    The folder gets `private/audit/` with `audit.json`, which is also returned, and pictures, and
+    `private/report.html`. An interrupted audit keeps its finished parts, and `resume` continues after them.
+    Raises KeyssError and its children, BackendError among them without the extra `audit`, and Interrupted on
+    Ctrl-C.
+    """
+    if report_only:
+        return _report(Path(run))
+    if controls < 2:
+        raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
+    if unknown := sorted(set(only) - set(PARTS)):
+        raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
+    for module in _EXTRA:
+        import_extra(module, "audit", "audit a run")
+    started, reporter = time.monotonic(), reporter or SilentReporter()
+    opened = open_run(run, keys)
+    standard = registry.get(opened.config.method).capabilities.standard
+    if impossible := sorted(set(only) & OF_3DGS_MODELS) if not standard else []:
+        raise UsageError(
+            f"the method {opened.config.method} does not publish a 3DGS model, which "
+            f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
+        )
+    target = resolve_device(device)
+    asked = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
+    folder = RunFolder(
+        opened.folder,
+        "audit",
+        asked | {"seed": seed, "device": target.type, "payloads": opened.config.payloads},
+        onto=KEPT,
+        writes=(f"{AUDIT_FOLDER}/{AUDIT_FILE}", REPORT),
+        overwrite=overwrite,
+        resume=resume,
+    )
+    from keyss.audits.page import report_bytes
+
+    with folder.work():
+        subject = subject_of(opened, original, controls, seed, target, reporter, folder)
+        finished = FinishedParts(folder.checkpoints, _inputs(subject, seed))
+        sections = {}
+        pictures: dict[str, bytes] = {}
+        possible = [name for name in PARTS if standard or name not in OF_3DGS_MODELS]
+        chosen = [name for name in possible if not only or name in only]
+        for index, name in enumerate(chosen):
+            if not finished.has(name):
+                progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
+                try:
+                    finished.keep(name, PARTS[name](subject, seed, progress))
+                except KeyboardInterrupt as error:
+                    raise Interrupted(finished.folder, None, signal_of(error)) from error
+                finally:
+                    progress.finish(finished.has(name))
+            sections[name], own = finished.take(name)
+            pictures |= own
+        shown = opened.metrics.wrong_key
+        wrong_key = None if shown is None else WrongKeyResult(shown, opened.metrics.chance_level)
+        found = Audit(
+            keyss=__version__,
+            seconds=round(time.monotonic() - started, 1),
+            run=_audited_run(opened),
+            controls=Controls(controls, subject.seeds),
+            wrong_key=wrong_key,
+            **sections,
+        )
+        files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
+        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": found, **files}))
+        folder.write(writers({REPORT: report_bytes(found, there, stego_in(opened.folder))}))
+    return found
+
+
+def _report(run: Path) -> Audit:
+    """Write the report of the audit that a run has; nothing else of the run changes."""
+    import_extra("jinja2", "audit", "write a report")
+    import_extra("matplotlib", "audit", "write a report")
+    from keyss.audits.page import report_bytes
+
+    found = read_audit(run)
+    data = report_bytes(found, run, stego_in(run))
+    write_again(run, "audit", REPORT, partial(write_bytes, data=data))
+    return found
+
+
+def _inputs(subject: AuditSubject, seed: int) -> dict[str, object]:
+    """Everything that the results of parts depend on."""
+    return {
+        "payloads": subject.run.config.payloads,
+        "stego": subject.stego.digest(),
+        "original": subject.original.digest(),
+        "scenes": [scene.digest() for scene in subject.scenes],
+        "seeds": [*subject.seeds, seed],
+        "version": __version__,
+    }
+
+
+def _audited_run(run: HidingRun) -> AuditedRun:
+    cover, *secrets = run.sources
+    return AuditedRun(
+        path=str(run.folder),
+        method=run.config.method,
+        cover=cover,
+        secrets=tuple(secrets),
+        width=run.config.views.width,
+        gaussians=len(run.stego),
+        photos=run.metrics.photos,
+        standard=registry.get(run.config.method).capabilities.standard,
+        config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as reading gives it back
+        up=usual_up(cover),
+        versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
+    )

@@ -1,0 +1,129 @@
+"""What an audit measures: a run opened with its keys, and plain models to compare it with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.core.similarity import Similarity
+from keyss.files.models import read_model, write_model
+from keyss.fitting.config import FitConfig
+from keyss.fitting.plain import fit_scene
+from keyss.fitting.reporting import Reporter
+from keyss.measure.hiding import frame_of
+from keyss.measure.robustness.survival import Reopener
+from keyss.runs.files import CONTROLS
+from keyss.runs.folder import RunFolder
+from keyss.runs.opening import HidingRun
+from keyss.runs.sources import as_model
+
+
+@dataclass(frozen=True)
+class AuditSubject:
+    """The input of the parts of an audit; models on `device`."""
+
+    run: HidingRun
+    scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
+    stego: Gaussians
+    revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
+    frames: tuple[Similarity, ...]  # from those to the cover's
+    original: Gaussians  # plain model of the cover
+    baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, if there are any
+    controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
+    seeds: tuple[int, ...]  # of the controls
+    device: torch.device
+
+    @property
+    def cover(self) -> Scene:
+        return self.scenes[0]
+
+    @property
+    def models(self) -> tuple[Gaussians, ...]:
+        """The published model, then the revealed secrets."""
+        return (self.stego, *self.revealed)
+
+    @property
+    def reopeners(self) -> list[Reopener]:
+        """Functions that reveal the secrets in a changed model."""
+        return self.run.reopeners
+
+    @property
+    def secrets(self) -> tuple[Scene, ...]:
+        return self.scenes[1:]
+
+
+def subject_of(
+    run: HidingRun,
+    original: Path | str | None,
+    controls: int,
+    seed: int,
+    device: torch.device,
+    reporter: Reporter,
+    folder: RunFolder,
+) -> AuditSubject:
+    """Read, reveal and fit what the audit needs; plain models are kept in the run's `folder` for reuse.
+
+    `original`: a plain model of the cover, by default the run's own. `controls`: how many to train, from
+    seeds derived from the run's own and `seed`. Raises UsageError without a plain model of the cover.
+    """
+    scenes = run.scenes()
+    plain, *_ = run.plain_models()
+    _, *baselines = run.baselines()
+    if original is not None:
+        plain = as_model(original)
+    if plain is None:
+        raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
+    stego = run.stego.to(device)
+    config = run.config.options.fit
+    if original is not None or run.config.models_given[0]:  # its size is not the run's
+        config = replace(config, max_gaussians=max(len(plain), 16))
+    seeds = tuple(run.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
+    return AuditSubject(
+        run=run,
+        scenes=tuple(scenes),
+        stego=stego,
+        revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
+        frames=tuple(
+            frame_of(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
+        ),
+        original=plain.to(device),
+        baselines=tuple(None if model is None else model.to(device) for model in baselines),
+        controls=tuple(
+            _plain_model(scenes[0], replace(config, seed=each), folder, device, reporter).to(device)
+            for each in seeds
+        ),
+        seeds=seeds,
+        device=device,
+    )
+
+
+def _plain_model(
+    scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
+) -> Gaussians:
+    """A plain model of a scene, from the run's folder if it is there under the same name."""
+    made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
+    name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
+    model = f"{CONTROLS}/{name}.ply"
+    if (folder.path / model).exists():
+        return read_model(folder.path / model)
+    checkpoint = folder.checkpoints / f"{name}.safetensors"
+    result = fit_scene(
+        scene,
+        config,
+        device=device,
+        title=f"plain model of the cover, seed {config.seed}",
+        checkpoint=checkpoint,
+        resume=True,
+        reporter=reporter,
+    )
+    folder.keep("controls", model, partial(write_model, model=result.gaussians))
+    checkpoint.unlink(missing_ok=True)
+    return result.gaussians

@@ -1,0 +1,145 @@
+"""The commands that show models: in a browser, as pictures, as a video, as facts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from keyss.cli.arguments import PHOTOS, Device, Overwrite, Photos, optional, switch
+
+
+def view(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, of any format.")],
+    *,
+    out: Annotated[
+        Path | None,
+        optional(
+            "PAGE",
+            "Write the page instead of serving it: a name that ends in .html becomes one file that opens "
+            "from disk, any other name a folder for a web server.",
+            aliases=["-o"],
+        ),
+    ] = None,
+    port: Annotated[int, optional("N", "Port to serve on.", "any free port")] = 0,
+    host: Annotated[
+        str, arg(metavar="ADDRESS", help="Address to serve on; 0.0.0.0 lets other machines connect.")
+    ] = "127.0.0.1",
+    up: Annotated[
+        Literal["-y", "z", "y"], arg(help="Initial up direction: -y as in COLMAP, z as in Blender.")
+    ] = "-y",
+    overwrite: Overwrite = False,
+) -> None:
+    """Show a published model in a browser, on a page where a key can be typed.
+
+    The page makes no network requests, and keys never leave the browser.
+
+    example: keyss view runs/hidden/publish/stego.ply
+
+    example: keyss view runs/hidden/publish/stego.ply -o page.html
+    """
+    from keyss.core.errors import UsageError
+    from keyss.viewer import ModelServer, export_html
+
+    if out is not None:
+        if port or host != "127.0.0.1":
+            raise UsageError("--port and --host are for serving: leave them out with -o")
+        written = export_html(model, out, up=up, overwrite=overwrite)
+        size = sum(path.stat().st_size for path in written) / 1e6
+        what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
+        print(f"{out}: {size:.1f} MB; {what}")
+        return
+    if overwrite:
+        raise UsageError("--overwrite is for -o: leave it out")
+    if not 0 <= port < 1 << 16:
+        raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
+    server = ModelServer(model, host, port, up)
+    who = "only this machine" if host in ("127.0.0.1", "localhost", "::1") else f"all who can reach {host}"
+    print(f"{server.address} shows {model} to {who}; press Ctrl-C to stop", flush=True)
+    server.run()
+
+
+def render(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
+    *,
+    cameras: Annotated[
+        Path | None,
+        optional("SCENE", "Scene whose cameras are used.", "for a video, a circle around the model"),
+    ] = None,
+    out: Annotated[Path | None, optional("FOLDER", "Folder for the images.", aliases=["-o"])] = None,
+    split: Annotated[Literal["test", "train", "all"], arg(help="Which cameras of the scene.")] = "test",
+    video: Annotated[Path | None, optional("FILE", "Write a video (.mp4) instead of images.")] = None,
+    path: Annotated[
+        Literal["around", "through"],
+        arg(help="Camera path of a video: around what the cameras look at, or from one to the next."),
+    ] = "around",
+    wipe: Annotated[
+        Path | None, optional("FILE", "Second model, which a wipe uncovers in the video.")
+    ] = None,
+    seconds: Annotated[float, arg(metavar="S", help="Length of the video.")] = 8.0,
+    photos: OmitArgPrefixes[Photos] = PHOTOS,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+) -> None:
+    """Render a model to images from the cameras of a scene, or to a video.
+
+    example: keyss render secret.ply --cameras SCENE_B -o images/
+
+    example: keyss render stego.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
+    """
+    import keyss
+    from keyss.core.errors import UsageError
+
+    if video is not None:
+        if out is not None or split != "test":
+            raise UsageError("--video writes no images: leave out -o and --split")
+        from keyss.api.filming import frame_count
+        from keyss.progress import reporter
+
+        keyss.render(
+            model,
+            cameras,
+            **vars(photos),
+            video=video,
+            wipe=wipe,
+            path=path,
+            seconds=seconds,
+            device=device,
+            overwrite=overwrite,
+            reporter=reporter(),
+        )
+        print(f"{video}: {frame_count(seconds)} frames")
+        return
+    if cameras is None or out is None:
+        raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
+    if wipe is not None or seconds != 8.0 or path != "around":
+        raise UsageError("--path, --wipe and --seconds are for videos: give --video FILE")
+    images = keyss.render(
+        model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
+    )
+    print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
+
+
+def info(
+    path: Annotated[
+        Positional[Path],
+        arg(metavar="FILE", help="Model (- for stdin), scene folder or result folder."),
+    ],
+    *,
+    json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
+) -> None:
+    """Describe a model, a scene or a run.
+
+    example: keyss info runs/hidden/publish/stego.ply
+    """
+    from msgspec import to_builtins
+
+    from keyss.cli.tables import print_facts, print_json
+    from keyss.runs.describe import info as describe
+
+    facts = describe(path)
+    if json_:
+        print_json(facts)
+    else:
+        print_facts(to_builtins(facts))

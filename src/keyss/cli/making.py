@@ -1,0 +1,185 @@
+"""The commands that make models, scenes and keys; `hide` has a module of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+
+from keyss.cli.arguments import (
+    PHOTOS,
+    TRAINING,
+    Device,
+    OutFolder,
+    Overwrite,
+    Photos,
+    Preset,
+    Resume,
+    Training,
+    checked_seed,
+    optional,
+    switch,
+)
+
+
+def demo(
+    *,
+    out: OutFolder = Path("out/demo"),
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    seed: Annotated[int, arg(metavar="N", help="Seed of all random numbers, the demo's key included.")] = 0,
+) -> None:
+    """Hide one made-up scene in another and open it again, in about two minutes.
+
+    Both are compared with plain 3DGS of as many Gaussians and as many training steps.
+
+    example: keyss demo -o out/demo
+    """
+    from keyss.cli.tables import print_files, print_hiding
+    from keyss.demo import WRONG_KEYS, run_demo
+    from keyss.progress import reporter
+
+    result = run_demo(out, seed=checked_seed(seed), device=device, overwrite=overwrite, reporter=reporter())
+    print_hiding(result.metrics)
+    print(f"Wrong keys refused: {result.refused} of {len(WRONG_KEYS)}.")
+    print_files(
+        out,
+        {
+            "comparison.png": "everything in one picture: look here first",
+            "index.html": "the published model in a browser: type the key there",
+            "publish/stego.ply": "the published model: opens in any 3DGS viewer",
+            "secret.ply": "the secret that the key revealed from it",
+            "web.spz": "both for the web: hidden to survive conversion, then converted",
+            "key.txt": "the key of this demo, which is public",
+            "scenes": "the photos",
+            "private/metrics.json": "the measurements",
+        },
+    )
+
+
+def fit(
+    scene: Annotated[Positional[Path], arg(metavar="SCENE", help="Folder of posed photos.")],
+    *,
+    out: OutFolder,
+    preset: Preset = "default",
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+    photos: OmitArgPrefixes[Photos] = PHOTOS,
+    training: OmitArgPrefixes[Training] = TRAINING,
+) -> None:
+    """Fit a plain 3DGS model to the photos of a scene.
+
+    example: keyss fit SCENE -o runs/cover
+
+    example: keyss fit SCENE -o runs/cover --live
+    """
+    from dataclasses import replace
+
+    import keyss
+    from keyss.cli.ranks import answers
+    from keyss.cli.reporting import reporting
+    from keyss.cli.tables import print_files, print_fit
+    from keyss.fitting.config import PRESETS
+    from keyss.runs.files import METRICS
+    from keyss.runs.metrics import FitMetrics
+    from keyss.runs.records import read_record
+
+    with reporting(out, scene, training) as reporter:
+        keyss.fit(
+            scene,
+            config=replace(PRESETS[preset], **training.schedule()),
+            **vars(photos),
+            device=device,
+            out=out,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=reporter,
+        )
+    if not answers():
+        return
+    print_fit(read_record(out / METRICS, FitMetrics))
+    print_files(out, {"model.ply": "the model", "private": "measurements and configuration"})
+
+
+def keygen(
+    *,
+    out: Annotated[
+        Path | None,
+        optional("FILE", "New key file, readable only by you.", "the standard output", aliases=["-o"]),
+    ] = None,
+    bits: Annotated[int, arg(metavar="N", help="Strength in bits; each character has 5.95.")] = 95,
+    asset: Annotated[
+        str | None,
+        optional("NAME", "Derive the key of one asset of a batch, by its name in the column out."),
+    ] = None,
+    master_key_file: Annotated[Path | None, optional("FILE", "Master key file of that batch.")] = None,
+) -> None:
+    """Make a random key, or derive the key of one asset from a master key.
+
+    example: keyss keygen -o key.txt
+
+    example: keyss keygen --asset statue-7 --master-key-file master.txt -o statue-7.key
+    """
+    from keyss.cli.keys import key_of_file, write_new_key
+    from keyss.core.errors import UsageError
+    from keyss.keys import generate_key, length_for
+
+    if (asset is None) != (master_key_file is None):
+        raise UsageError("--asset and --master-key-file need each other: give both or neither")
+    if master_key_file is not None and asset is not None:
+        if bits != 95:
+            raise UsageError("--bits is for random keys: leave it out with --asset")
+        from keyss.keys.master import MasterKey
+
+        key = MasterKey(key_of_file(master_key_file)).key_of(asset)
+        what = f"the key of {asset}"
+    else:
+        if bits < 1:
+            raise UsageError(f"--bits: expected at least 1, got {bits}")
+        key = generate_key(length_for(bits))
+        what = f"a key of {len(key)} characters; keep a copy, as without it the secret is lost"
+    if out is None:
+        print(key)
+        return
+    write_new_key(out, key)
+    print(f"{out}: {what}")
+
+
+def convert(
+    model: Annotated[Positional[Path], arg(metavar="IN", help="Model of any format, or - for stdin.")],
+    out: Annotated[Positional[Path], arg(metavar="OUT", help="Model to write (.ply, .spz, .sog, ...).")],
+    *,
+    key_file: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Key file of a secret that must survive; repeat for more."),
+    ] = (),
+    force: Annotated[bool, switch("Write the model even if a secret is lost.")] = False,
+    dry_run: Annotated[bool, switch("Report the cost, and write nothing.")] = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+) -> None:
+    """Convert a model to another format, and report what that costs.
+
+    The suffix of OUT selects the format: .ply, .compressed.ply, .spz, .sog, .glb or .splat; .ksplat and the
+    meta.json of a SOG folder can only be read. All formats but .ply round values, which destroys what is
+    hidden in low bits, and most reorder Gaussians. The cost is the PSNR between renders before and after.
+
+    example: keyss convert cover.ply cover.spz
+
+    example: keyss convert stego.ply stego.sog --key-file key.txt --dry-run
+    """
+    import sys
+
+    import keyss
+    from keyss.cli.keys import hinting_at_white_space, key_of_file
+    from keyss.cli.tables import print_conversion
+    from keyss.files.streams import is_standard
+
+    chosen = [key_of_file(path) for path in key_file]
+    with hinting_at_white_space(chosen):
+        found = keyss.convert(
+            model, out, chosen, force=force, dry_run=dry_run, overwrite=overwrite, device=device
+        )
+    print_conversion(str(out), found, dry_run=dry_run, file=sys.stderr if is_standard(out) else sys.stdout)

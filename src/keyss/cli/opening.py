@@ -1,0 +1,106 @@
+"""The commands that open a published model."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from keyss.cli.arguments import Device, Overwrite, optional, switch
+
+
+def reveal(
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, or - for stdin.")],
+    *,
+    key_file: Annotated[
+        UseAppendAction[tuple[Path, ...]], optional("FILE", "Key file.", "KEYSS_KEY or a prompt")
+    ] = (),
+    out: Annotated[
+        Path,
+        arg(
+            aliases=["-o"],
+            metavar="FILE",
+            help="Model to write (.ply, .spz, ...), or - for stdout; any other name for a hidden file.",
+        ),
+    ],
+    handed: Annotated[
+        Path | None, optional("FILE", "File handed over beside the model, for methods that need one.")
+    ] = None,
+    frame: Annotated[
+        Literal["secret", "cover"], arg(help="Coordinates: the secret's own, or those it was hidden in.")
+    ] = "secret",
+    decoy: Annotated[bool, switch("With a wrong key, write the cover instead of failing.")] = False,
+    force: Annotated[
+        bool, switch("Write what is left of the secret in a model that was quantised or pruned.")
+    ] = False,
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+) -> None:
+    """Reveal the secret that a key opens.
+
+    example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
+
+    example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
+    """
+    import keyss
+    from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.files.streams import is_standard
+    from keyss.runs.revealing import is_sealed
+
+    key: str | None = None
+    if handed is None or key_file or is_sealed(handed):
+        (key,) = keys(key_file, 1)
+    with hinting_at_white_space([key] if key else []):
+        revealed = keyss.reveal(
+            stego,
+            key,
+            handed=handed,
+            frame=frame,
+            decoy=decoy,
+            force=force,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
+    if revealed.file is not None:
+        print(f"{out}: {revealed.file.name!r}, {len(revealed.file.data):,} bytes")
+        return
+    remains = revealed.remains
+    of = f" of {remains.hidden:,}" if remains.hidden else ""
+    print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
+
+
+def verify(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
+    *,
+    key_file: Annotated[
+        Path | None, optional("FILE", "Key file, to check the secret that it opens as well.")
+    ] = None,
+    json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
+    device: Device = "auto",
+) -> None:
+    """Check that a model is sound and, with a key, that its secret is complete.
+
+    Exit status: 0 sound and complete, 3 the key opens nothing, 4 not sound or not complete.
+
+    example: keyss verify stego.ply --key-file key.txt
+    """
+    from msgspec import to_builtins
+
+    import keyss
+    from keyss.cli.keys import hinting_at_white_space, key_of_file
+    from keyss.cli.tables import print_facts, print_json
+    from keyss.core.errors import InputError
+
+    key = key_of_file(key_file) if key_file else None
+    with hinting_at_white_space([key] if key else []):
+        found = keyss.verify(model, key, device=device)
+    if json_:
+        print_json(found)
+    else:
+        facts = to_builtins(found)
+        print_facts(facts if found.secret else facts | {"secret": "not checked, as no key was given"})
+    if found.problems:
+        raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -1,0 +1,186 @@
+"""A comparison: its record, and two tables for terminals and for Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from keyss._version import __version__
+from keyss.many.measures import CONVERSIONS
+from keyss.many.tables import markdown_rows
+
+LEGEND = (
+    "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
+    "total. 3dgs is the bound: plain 3DGS of as many Gaussians and as many training steps. Picture: the time "
+    "of one of the cover and of the secret, and its ratio to that of plain 3DGS. Seconds: of hiding, after "
+    "plain models.",
+    "Wrong keys: PSNR in dB of what they show against the cover, and at most against the secret; in brackets "
+    "that of the published model itself against the secret. Classifier and StegExpose: area under the ROC "
+    "curve against plain models of the cover from other seeds, 0.5 where they cannot be told apart. p: of "
+    "the file's least likely statistic beside those. In brackets the same of a plain model of the cover.",
+    "Pruned of a random quarter, converted and back, purified (as by GSPure): change of cover and secret in "
+    "dB. Lost: the secret does not open any more.",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedMethod:
+    """One method. Without a result, `error` says why."""
+
+    name: str  # METHOD, METHOD:PRESET or METHOD:VARIANT
+    run: str | None = None  # the folder of its run, relative to that of the comparison
+    error: str | None = None
+    keys: bool = True
+    max_secrets: int = 1
+    numbers: dict[str, float] = field(default_factory=dict)  # see `keyss.many.cell.Result`
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """`comparison.json`."""
+
+    version: int = 3
+    keyss: str = __version__
+    arguments: dict[str, Any]
+    methods: tuple[ComparedMethod, ...] = ()
+
+
+Column = Callable[[ComparedMethod], str]
+
+
+def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
+    """Rows of text by title, the heads first: fidelity and cost, secrecy and survival.
+
+    Methods that failed have no row.
+    """
+    rows = [each for each in found.methods if each.error is None]
+    return {
+        title: [
+            [head.rstrip() for head in columns],
+            *([shown(row) for shown in columns.values()] for row in rows),
+        ]
+        for title, columns in (("Fidelity and cost", _FIDELITY), ("Secrecy and survival", _SECRECY))
+    }
+
+
+def impossible(found: Comparison) -> list[str]:
+    """A sentence for each method that failed."""
+    return [f"{each.name}: not possible: {each.error}" for each in found.methods if each.error is not None]
+
+
+def not_measured(found: Comparison) -> list[str]:
+    """A sentence for each reason why something was not measured."""
+    reasons: dict[str, list[str]] = {}
+    for each in found.methods:
+        for what, why in each.notes.items():
+            reasons.setdefault(f"{what.partition('.')[2]}: {why}", []).append(each.name)
+    return [f"not tried ({', '.join(names)}): {reason}" for reason, names in reasons.items()]
+
+
+def comparison_text(found: Comparison) -> str:
+    """Both tables in Markdown, and the legend."""
+    parts = [
+        "\n".join([f"## {title}", "", *markdown_rows(rows)])
+        for title, rows in comparison_tables(found).items()
+    ]
+    parts += ["\n".join(f"- {line}" for line in [*impossible(found), *not_measured(found)])]
+    return "\n\n".join(part for part in [*parts, *LEGEND] if part) + "\n"
+
+
+def _number(name: str, form: str) -> Column:
+    """The number of this name, formatted; nothing where it was not measured."""
+    return lambda each: f"{each.numbers[name]:{form}}" if name in each.numbers else ""
+
+
+def _bytes(name: str) -> Column:
+    return lambda each: f"{each.numbers[name] / 1e6:,.2f} MB" if each.numbers[name] else "nothing"
+
+
+def _picture(each: ComparedMethod) -> str:
+    times = [(each.numbers[f"pictures.{role}.{what}"] for what in ("seconds", "ratio")) for role in _ROLES]
+    return ", ".join(f"{1000 * seconds:.0f} ({ratio:.1f}x)" for seconds, ratio in times)
+
+
+def _steps(each: ComparedMethod) -> str:
+    found = [each.numbers.get(f"steps.{index}") for index in (1, 2)]
+    return ", ".join("unknown" if steps is None else f"{steps:,.0f}" for steps in found)
+
+
+def _wrong_keys(each: ComparedMethod) -> str:
+    names = ("wrong_key.vs_cover.mean", "wrong_key.vs_secrets.1.max", "chance_level.1")
+    shown = [each.numbers[name] for name in names if name in each.numbers]
+    if len(shown) == len(names):
+        return "{:.1f}, {:.1f} ({:.1f})".format(*shown)
+    return "open nothing" if each.keys else "no keys"
+
+
+def _standard(each: ComparedMethod) -> str:
+    """What other people's readers find, not what the method claims."""
+    tried, load = (int(each.numbers[f"files.{name}"]) for name in ("readers", "readers that load"))
+    word = "yes" if load == tried else "no"
+    return f"{word}, {load} of {tried} readers" if tried else "not tried"
+
+
+def _beside(name: str, shown: Callable[[float], str]) -> Column:
+    """A number of the published model, and in brackets that of a plain one."""
+
+    def column(each: ComparedMethod) -> str:
+        own, plain = (each.numbers.get(f"secrecy.{name}{end}") for end in ("", "_plain"))
+        if own is None:
+            return "no 3DGS"
+        return shown(own) if plain is None else f"{shown(own)} ({shown(plain)})"
+
+    return column
+
+
+def _area(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _probability(value: float) -> str:
+    return "<1e-16" if value < 1e-16 else f"{value:.1g}"
+
+
+def _survived(change: str) -> Column:
+    def column(each: ComparedMethod) -> str:
+        cover, secret = (each.numbers.get(f"survival.{change}.{role}") for role in _ROLES)
+        if cover is None:
+            return "not tried"
+        return f"{_gained(cover)}, {'lost' if secret is None else _gained(secret)}"
+
+    return column
+
+
+def _gained(loss: float) -> str:
+    """In decibels, without -0.0."""
+    return f"{0.0 - round(loss, 1):+.1f}"
+
+
+_ROLES = ("cover", "secret")
+_FIDELITY: dict[str, Column] = {
+    "method": lambda each: each.name,
+    "cover": _number("cover.psnr", ".2f"),
+    "SSIM": _number("cover.ssim", ".3f"),
+    "LPIPS": _number("pictures.cover.lpips", ".3f"),
+    "secret": _number("secrets.1.psnr", ".2f"),
+    "SSIM ": _number("secrets.1.ssim", ".3f"),
+    "LPIPS ": _number("pictures.secret.lpips", ".3f"),
+    "published": _bytes("files.published"),
+    "handed over": _bytes("files.handed"),
+    "picture, ms": _picture,
+    "seconds": _number("seconds", ".0f"),
+    "steps": _steps,
+}
+_SECRECY: dict[str, Column] = {
+    "method": lambda each: each.name,
+    "keys": lambda each: "yes" if each.keys else "no",
+    "secrets": lambda each: f"{each.max_secrets}",
+    "wrong keys": _wrong_keys,
+    "standard .ply": _standard,
+    "classifier": _beside("classifier", _area),
+    "p": _beside("stealth", _probability),
+    "StegExpose": _beside("stegexpose", _area),
+    **{name: _survived(name) for name in ("pruned", *(each[0] for each in CONVERSIONS), "purified")},
+}

@@ -1,0 +1,122 @@
+"""The paper's scenes: where they come from, and the photos that 3DGS is measured on."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from keyss.core.errors import BackendError, InputError, OutputError, UsageError
+from keyss.core.nearest import did_you_mean
+from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
+
+TEST_EVERY = 8
+Group = tuple[str, ...]  # names of a cover and of its secrets
+
+# Number of photos, and the folder of those that count: a quarter of their size outdoors, half indoors.
+BENCHMARK: Mapping[str, tuple[int, str]] = {
+    "bicycle": (194, "images_4"),
+    "bonsai": (292, "images_2"),
+    "room": (311, "images_2"),
+    "flowers": (173, "images_4"),
+    "treehill": (141, "images_4"),
+    "garden": (185, "images_4"),
+    "stump": (125, "images_4"),
+    "counter": (240, "images_2"),
+    "kitchen": (279, "images_2"),
+    "playroom": (225, "images"),
+}
+_REFRAW = "https://storage.googleapis.com/gresearch/refraw360"
+_INRIA = "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input"
+# Archives, and the folder of each scene in them: Mip-NeRF 360 from its authors, and Deep Blending from those
+# of 3DGS. No checksums are published.
+SOURCES: Mapping[str, tuple[str, ...]] = {
+    f"{_REFRAW}/360_v2.zip": ("bicycle", "bonsai", "counter", "garden", "kitchen", "room", "stump"),
+    f"{_REFRAW}/360_extra_scenes.zip": ("flowers", "treehill"),
+    f"{_INRIA}/tandt_db.zip": ("db/playroom",),
+}
+
+
+def download(names: Iterable[str], data: Path) -> None:
+    """Fetch those of the scenes that are missing in `data`, with the photos that count.
+
+    Archives stay in `data/archives`. Raises InputError for what cannot be fetched or unpacked, BackendError
+    without pooch.
+    """
+    try:
+        import pooch
+    except ImportError as error:
+        raise BackendError(
+            f"downloading needs the package pooch (pip install 'keyss[reproduce]'): {error}"
+        ) from error
+    missing = {name for name in names if not (data / name).exists()}
+    archives = data / "archives"
+    for url, folders in SOURCES.items():
+        wanted = {name: folder for folder in folders if (name := folder.rpartition("/")[2]) in missing}
+        parts = {name: ("sparse/0", BENCHMARK[name][1]) for name in wanted}
+        members = [f"{folder}/{part}" for name, folder in wanted.items() for part in parts[name]]
+        file = url.rpartition("/")[2]
+        if not wanted:
+            continue
+        try:
+            unzip = pooch.Unzip(members, extract_dir="unpacked")
+            pooch.retrieve(url, None, file, path=archives, processor=unzip, progressbar=True)
+            for name, folder in wanted.items():
+                (archives / "unpacked" / folder).rename(data / name)
+        except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+            advice = f"if {archives / file} is there, remove it to fetch it again"
+            raise InputError(f"{url}: cannot be fetched or unpacked: {error}; {advice}") from error
+
+
+def link(data: Path, name: str, folder: Path) -> Path:
+    """A scene of the paper in `folder`, with links to the photos that count.
+
+    Raises InputError where they are missing, or not as many as the paper's; OutputError.
+    """
+    (photos, images), scene, source = BENCHMARK[name], folder / name, data / name
+    model = next((place for place in MODEL_PLACES if colmap_model_folder(source, (place,))), None)
+    if model is None or not (source / images).is_dir():
+        raise InputError(
+            f"{data}: expected a folder {name} with {images} and a COLMAP model, a scene of Mip-NeRF 360 (or "
+            "playroom, of Deep Blending), found none; `download=True` fetches it"
+        )
+    try:
+        scene.mkdir(parents=True, exist_ok=True)
+        for link, target in (("sparse", source / model), (images, source / images)):
+            if not (scene / link).is_symlink():
+                (scene / link).symlink_to(target.resolve())
+    except OSError as error:
+        raise OutputError(f"cannot write to {scene}: {error.strerror}") from error
+    layout = read_colmap(scene)
+    counted = len(layout.train) + len(layout.test), len(layout.test)
+    if counted != (photos, -(-photos // TEST_EVERY)):
+        raise InputError(
+            f"{source}: expected {photos} photos in the COLMAP model, every {TEST_EVERY}th for testing, "
+            f"found {counted[0]}, {counted[1]} for testing"
+        )
+    return scene
+
+
+def groups_of(names: Sequence[str], secrets: int) -> list[Group]:
+    """Each scene hides the next ones, the last ones the first again. Raises UsageError for too few."""
+    if len(names) <= secrets:
+        raise UsageError(f"expected at least {secrets + 1} scenes, got {len(names)}")
+    twice = [*names, *names]
+    return [tuple(twice[index : index + secrets + 1]) for index in range(len(names))]
+
+
+def parsed_groups(pairs: Sequence[str], names: Sequence[str], secrets: int) -> list[Group]:
+    """The groups COVER,SECRET or COVER,SECRET,SECRET. Raises UsageError."""
+    found = []
+    for text in pairs:
+        group = tuple(name.strip() for name in text.split(","))
+        if len(group) != secrets + 1 or len(set(group)) < len(group):
+            raise UsageError(
+                f"`pairs`: expected a cover and {secrets} secret(s) of different names, got {text!r}"
+            )
+        for name in group:
+            if name not in names:
+                raise UsageError(f"`pairs`: no scene is called {name!r}; {did_you_mean(name, names)}")
+        found.append(group)
+    return found

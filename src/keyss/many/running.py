@@ -1,0 +1,252 @@
+"""Run cells: those that are done are skipped, the others run in processes, on a cluster or here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from keyss import progress
+from keyss._processes import how_it_ended
+from keyss.core.errors import OutputError
+from keyss.files.atomic import write_bytes
+from keyss.files.lock import lock
+from keyss.fitting.reporting import Reporter
+from keyss.keys.generation import generate_key
+from keyss.keys.key_file import read_key_file
+from keyss.keys.master import MasterKey
+from keyss.many.cell import CELL, FAILED, LOG, Cell, Failure, Result, failure_of, result_of
+from keyss.many.cluster import Cluster
+from keyss.many.processes import Processes, Resources
+from keyss.many.worker import REFUSED, attempt
+from keyss.progress import clock
+from keyss.runs.folder import check_not_published
+from keyss.runs.records import record_bytes
+
+PRIVATE, CELLS = "private", "cells"
+MASTER_KEY = f"{PRIVATE}/master-key.txt"
+RETRIES = 2  # of a cell whose process died
+_CHECK = f"{PRIVATE}/master-key-check.txt"
+_BASE_BYTES = 800_000_000  # of a process that has loaded all it needs
+_MODEL_COPIES = 12  # of the models it reads, in bytes of their files
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a cell."""
+
+    name: str
+    folder: Path
+    result: Result | None  # None: it failed
+    failure: Failure | None
+    skipped: bool = False  # was done before
+
+    @property
+    def error(self) -> str | None:
+        """Why there is no result."""
+        if self.result is not None:
+            return None
+        died = f"its process died repeatedly; see {self.folder / LOG}"
+        return self.failure.message if self.failure else died
+
+
+@dataclass(frozen=True)
+class ManyResult:
+    """What became of all cells, in their order."""
+
+    outcomes: tuple[Outcome, ...]
+    tables: tuple[str, ...] = ()  # names of files in the folder
+
+    @property
+    def failed(self) -> tuple[Outcome, ...]:
+        return tuple(each for each in self.outcomes if each.result is None)
+
+
+class InThisProcess:
+    """One cell after the other, with a reporter."""
+
+    jobs, closed = 1, False
+
+    def __init__(self, reporter: Reporter) -> None:
+        self.reporter = reporter
+
+    def attempt(self, name: str, folder: Path, memory: int) -> int:
+        """As `Processes.attempt`."""
+        from keyss.many.performing import perform
+
+        return attempt(folder, partial(perform, reporter=self.reporter), log=False)
+
+    def close(self) -> None:
+        pass
+
+
+Engine = Processes | Cluster | InThisProcess
+
+
+@contextmanager
+def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
+    """Make the folder if there is none, and keep other processes out while the block runs.
+
+    Raises OutputError, also for a folder that would be published.
+    """
+    check_not_published(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True, mode=mode)
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+    make_private(out / PRIVATE)
+    with lock(out / PRIVATE / "lock"):
+        yield
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder that others cannot read. Raises OutputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.chmod(0o700)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror}") from error
+
+
+def settle_master_key(out: Path, given: Path | None) -> None:
+    """Make a master key where none is given; all cells in a folder have keys of one master key.
+
+    Raises OutputError for another master key than that of the cells which are there.
+    """
+    own = out / MASTER_KEY
+    if given is None and not own.exists():
+        write_bytes(own, f"{generate_key(22)}\n".encode())
+    check = MasterKey(read_key_file(given or own)[0]).check()
+    kept = out / _CHECK
+    if not kept.exists():
+        write_bytes(kept, check.encode())
+    elif read_key_file(kept)[0] != check:
+        raise OutputError(
+            f"{out} holds results with keys of another master key: give the same `master_key_file`, or "
+            "choose another folder"
+        )
+
+
+def run_cells(
+    title: str,
+    cells: Iterable[tuple[Cell, Path]],
+    *,
+    jobs: int | None = None,
+    ray: str | None = None,
+    retries: int = RETRIES,
+    reporter: Reporter | None = None,
+) -> list[Outcome]:
+    """Do all cells that are not done, in a folder that is `claimed`; what became of each.
+
+    Plain fits come first: hidings use their models. `reporter`: run all in this process. Raises OutputError,
+    BackendError and UsageError.
+    """
+    every = list(cells)
+    before = [result_of(folder, cell.measures) for cell, folder in every]
+    due = [each for each, result in zip(every, before, strict=True) if result is None]
+    for cell, folder in due:
+        make_private(folder)
+        (folder / FAILED).unlink(missing_ok=True)  # the next attempt says why
+        write_bytes(folder / CELL, record_bytes(cell))
+    if due:
+        engine = InThisProcess(reporter) if reporter else _engine(due, jobs, ray)
+        try:
+            _Run(title, len(every), len(every) - len(due), engine, retries).do(due)
+        finally:
+            engine.close()
+    return [
+        Outcome(
+            cell.name,
+            folder,
+            result or result_of(folder, cell.measures),
+            failure_of(folder),
+            result is not None,
+        )
+        for (cell, folder), result in zip(every, before, strict=True)
+    ]
+
+
+class _Run:
+    """Does cells, and shows on the standard error stream how far it is."""
+
+    def __init__(self, title: str, total: int, skipped: int, engine: Engine, retries: int) -> None:
+        console = Console(stderr=True, quiet=progress.level < 0)
+        # A reporter in this process draws itself.
+        shown = console.is_terminal and not isinstance(engine, InThisProcess)
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+        self.bars = Progress(*columns, console=console, disable=not shown)
+        self.engine, self.retries, self.total = engine, retries, total
+        self.whole = self.bars.add_task(title, total=total, completed=skipped)
+        self.ended = skipped
+        if skipped:
+            self._say(f"{title}: {skipped} of {total} are done already")
+
+    def do(self, due: Sequence[tuple[Cell, Path]]) -> None:
+        """Returns when each is done, was refused, or has died once more than it may."""
+        fits = [each for each in due if each[0].fits]
+        with self.bars:
+            for group in (fits, [each for each in due if not each[0].fits]):
+                if isinstance(self.engine, InThisProcess):
+                    for each in group:
+                        self._do(*each)
+                elif group:
+                    self._do_at_once(group)
+
+    def _do_at_once(self, group: Sequence[tuple[Cell, Path]]) -> None:
+        with ThreadPoolExecutor(min(self.engine.jobs, len(group))) as pool:
+            futures = [pool.submit(self._do, *each) for each in group]
+            try:
+                for each in as_completed(futures):
+                    each.result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                self.engine.close()
+                raise
+
+    def _do(self, cell: Cell, folder: Path) -> None:
+        for number in range(self.retries + 1):
+            bar, since = self.bars.add_task(cell.name, total=None), time.monotonic()
+            try:
+                status = self.engine.attempt(cell.name, folder, _memory(cell))
+                how = how_it_ended(status)
+            except ConnectionError as error:
+                status, how = -1, f"lost: {error}"
+            self.bars.remove_task(bar)
+            if self.engine.closed:
+                return
+            if status == 0:
+                return self._end(f"{cell.name}: done in {clock(time.monotonic() - since)}")
+            if status == REFUSED:
+                failure = failure_of(folder)
+                return self._end(f"{cell.name}: failed: {failure.message if failure else 'unknown'}")
+            if number < self.retries:
+                self._say(f"{cell.name}: its process died ({how}): it is tried again")
+        self._end(f"{cell.name}: its process died ({how}): given up; see {folder / LOG}")
+
+    def _end(self, line: str) -> None:
+        self.ended += 1
+        self.bars.advance(self.whole)
+        self._say(line)
+
+    def _say(self, line: str) -> None:
+        whole = f"[{self.ended}/{self.total}] {line}"
+        self.bars.console.print(whole, markup=False, highlight=False, soft_wrap=True)
+
+
+def _engine(due: Sequence[tuple[Cell, Path]], jobs: int | None, ray: str | None) -> Engine:
+    """Raises UsageError and BackendError."""
+    resources = Resources.divided(jobs, max(_memory(cell) for cell, _ in due))
+    return Processes(resources) if ray is None else Cluster(ray, resources)
+
+
+def _memory(cell: Cell) -> int:
+    """Bytes that the process of a cell takes, roughly."""
+    paths = (Path(each) for each in cell.inputs)
+    return _BASE_BYTES + _MODEL_COPIES * sum(each.stat().st_size for each in paths if each.is_file())

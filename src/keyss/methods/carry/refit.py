@@ -1,0 +1,56 @@
+"""Refits: secrets trained on, with as many Gaussians as the cover has room for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.plain import FitResult, refit_model
+from keyss.fitting.reporting import of_secret
+from keyss.methods.base import Context
+from keyss.rendering.contributions import contributions
+
+# Where there are no photos, the start is nearly right: steps at most, and a factor on the rates.
+MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
+_SELECTION_VIEWS = 64
+
+
+def refitted(
+    secret: Gaussians,
+    scene: Scene,
+    count: int,
+    fit: FitConfig,
+    context: Context,
+    *,
+    photos: bool,
+    name: str,
+) -> FitResult:
+    """`secret` trained on with the `count` Gaussians that contribute most.
+
+    Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
+    """
+    return refit_model(
+        scene,
+        most_contributing(secret, scene, count),
+        # Each is a run of its own: it must not depend on the other secrets.
+        replace(fit, seed=fit.seed_of(name)),
+        rate=1.0 if photos else _MODEL_RATE,
+        device=context.device,
+        title=f"refit of the {name}",
+        checkpoint=context.checkpoints / f"{name.replace(' ', '-')}.safetensors"
+        if context.checkpoints
+        else None,
+        resume=context.resume,
+        reporter=of_secret(context.reporter),
+    )
+
+
+def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
+    """The `count` Gaussians that add most to what the training views show, in their order."""
+    if count >= len(plain):
+        return plain
+    cameras = [view.camera for view in subsample_views(scene.train, _SELECTION_VIEWS)]
+    return plain[contributions(plain, cameras).topk(count).indices.sort().values]

@@ -1,0 +1,1 @@
+"""KeySS, the paper's method: one model and a decoder for each key, trained jointly."""

@@ -1,0 +1,135 @@
+"""KeySS, *Key-Secured 3D Secrets within 3D Gaussian Splatting*, with the corrections in `docs/keyss.md`.
+
+All scenes are brought into one frame and trained jointly from their sparse points. Each secret has a decoder,
+which is encrypted with its key in the published model.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from keyss.channels import APPENDED, LOW_BITS, check_payload_fits
+from keyss.core.errors import KeyssError, KeyssWarning, UsageError
+from keyss.core.gaussians import DRAWN_OPACITY
+from keyss.core.scene import Scene
+from keyss.core.similarity import Similarity
+from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES, stream
+from keyss.methods.base import Capabilities, Context, Source, Stego
+from keyss.methods.joint import train_jointly
+from keyss.methods.keyss.clip_keys import MODEL, ClipKeys
+from keyss.methods.keyss.decoder import Decoder
+from keyss.methods.keyss.options import KeyssOptions
+from keyss.methods.keyss.secret import ANCHORS, HiddenSecret, choose_anchors
+from keyss.methods.keyss.training import KeyssTraining
+from keyss.methods.plan import Plan
+
+_APPENDED = "the secrets lie in appended Gaussians instead, and everybody can see that they are there"
+
+_clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
+
+
+class KeyssMethod:
+    """See `keyss.methods.base.Method`."""
+
+    name = KeyssOptions.method
+    summary = "train one model and a decoder for each key jointly, as the paper does"
+    most_secrets = 9
+    capabilities = Capabilities()
+    options = KeyssOptions
+
+    def prepare(self, sources: Sequence[Source], options: KeyssOptions) -> KeyssOptions:
+        """Sets the design's loss. Warns (KeyssWarning) of models too small for the decoders' low bits."""
+        options = replace(options, fit=options.joint_fit)
+        encoder_of(options)  # raises where CLIP is missing
+        fit = options.fit
+        try:
+            check_payload_fits(_largest_payload(options), fit.max_gaussians, len(sources) - 1, fit.sh_degree)
+        except UsageError as error:
+            warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
+        return options
+
+    def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
+        """As many Gaussians as a plain model has show all scenes."""
+        settings, secrets = options.settings, len(sources) - 1
+        decodings = secrets + (1 / settings.incorrect_every if settings.conditioning == "bias" else 0.0)
+        return options.joint_plan(secrets, gaussian_weights=decodings * options.decoder_shape.weights)
+
+    def hide(
+        self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context
+    ) -> Stego:
+        """Train the cover and the secrets together, and encrypt the decoders.
+
+        Raises Interrupted on Ctrl-C, and InputError for a checkpoint of another run.
+        """
+        keys = [each.key for each in secrets]
+        encoder = encoder_of(options)
+        if encoder is None:
+            derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.known_seed))
+            embeddings = [DerivedKey(key, derivation).embedding() for key in keys]
+        else:
+            embeddings = [encoder(key) for key in keys]
+        run, seconds = train_jointly(
+            lambda placed: KeyssTraining(placed, embeddings, options, context.device), cover, secrets, context
+        )
+        return replace(_published(run, keys, context.entropy or os.urandom(32)), seconds=seconds)
+
+
+def _published(run: KeyssTraining, keys: Sequence[str], entropy: bytes) -> Stego:
+    """All Gaussians in a random order, and in their low bits for each key the decoder of its secret.
+
+    In training, the cover's points come first and the secrets' after them. Warns (KeyssWarning) where the low
+    bits have no room, in which case the decoders are in appended Gaussians.
+    """
+    stego = run.gaussians().to("cpu")
+    numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
+    stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
+    anchors = choose_anchors(stego, torch.Generator().manual_seed(run.options.fit.known_seed))
+    payloads = []
+    for decoder, placed in zip(run.decoders, run.scenes[1:], strict=True):
+        secret = HiddenSecret(decoder.to("cpu").requires_grad_(False), placed.frame, anchors)
+        drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
+        payloads.append(replace(secret, count=int(drawn.sum())).payload())
+    keyed = list(zip(keys, payloads, strict=True))
+    details: dict[str, Any] = {}
+    try:
+        found = LOW_BITS.prepare(stego).embed(keyed, entropy=entropy)
+    except KeyssError as error:
+        found = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
+        warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
+        details["appended_because"] = str(error)
+    return Stego(found, tuple(map(HiddenSecret.of, payloads)), 0.0, run.iterations, details)
+
+
+def encoder_of(options: KeyssOptions) -> Callable[[str], Tensor] | None:
+    """From a key to the embedding [64] that conditions its decoder; None: Argon2id's. Raises BackendError."""
+    if options.key_encoder == "argon2":
+        return None
+    return _clip_keys(options.clip_model or MODEL)
+
+
+def _largest_payload(options: KeyssOptions) -> int:
+    """Bytes of a secret whose decoder cannot be compressed."""
+    decoder = Decoder(options.decoder_shape)
+    return len(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3)).payload().data)
+
+
+def training_salt(cover: Scene, seed: int) -> bytes:
+    """A salt that is the same when a run is repeated, and differs between covers and between seeds.
+
+    A salt has to be unique, not secret: derived from public inputs, it makes runs repeatable.
+    """
+    return hashlib.sha256(f"keyss/v1/salt {seed} {cover.digest()}".encode()).digest()[:SALT_BYTES]
+
+
+METHOD = KeyssMethod()

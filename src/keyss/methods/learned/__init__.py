@@ -1,1 +1,0 @@
-"""The learned method: the key-conditioned decoder, the joint training, revealing."""

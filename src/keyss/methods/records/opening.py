@@ -1,0 +1,62 @@
+"""Secrets that were carried, opened: from records or from one string of bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+
+from keyss.channels.base import Content, Records
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.pruning_compensation import compensate_pruning
+from keyss.methods.opened import Frame, Remains
+from keyss.methods.records import whole
+from keyss.methods.records.quantise import Codec
+
+COUNT = struct.Struct("<I")  # of Gaussians, before the codec in the header of records
+
+
+@dataclass(frozen=True)
+class CarriedSecret:
+    """A secret as it comes out; see `keyss.methods.opened.Opened`."""
+
+    gaussians: Gaussians  # those that are left, in the order of their carriers
+    count: int  # how many were embedded
+    bits: int  # of a record
+    frame: None = None
+    decode: None = None
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """The Gaussians that are left make up for those that were lost with their carriers."""
+        if frame == "cover":
+            raise UsageError(
+                'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
+            )
+        return compensate_pruning(self.gaussians, self.count)
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), self.count)
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
+
+
+def unpack(content: Content) -> CarriedSecret:
+    """The Gaussians that are left. Raises InputError for damage."""
+    if isinstance(content, Records):
+        return decode(content)
+    gaussians = whole.decode(content.data)
+    return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))
+
+
+def decode(records: Records) -> CarriedSecret:
+    """The secret of records in any order, some of which may be lost. Raises InputError for damage."""
+    if len(records.header) < COUNT.size:
+        raise InputError("the hidden parameters are damaged: they are too short")
+    (count,) = COUNT.unpack_from(records.header)
+    codec = Codec.unpack(records.header[COUNT.size :])
+    expected, found = codec.table.record_bytes, records.records.shape[1]
+    if found != expected:
+        raise InputError(f"the hidden parameters are damaged: records of {found} bytes, expected {expected}")
+    return CarriedSecret(codec.decode(records.records), count, codec.table.total)

@@ -1,0 +1,97 @@
+"""Tensors with a JSON header as bytes: a safetensors file whose metadata has the header as its one entry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+
+import msgspec
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from keyss.core.errors import InputError, UsageError
+from keyss.core.similarity import Similarity
+
+_ENTRY = "keyss"
+# What reading a damaged header or damaged tensors can raise.
+_LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
+_DAMAGE = (*_LIBRARY_ERRORS, KeyError, TypeError, ValueError, RuntimeError, UsageError)
+
+_Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """A `Similarity` in a header."""
+
+    scale: float
+    rotation: tuple[_Three, _Three, _Three]
+    translation: _Three
+
+    @staticmethod
+    def of(frame: Similarity) -> FrameRecord:
+        values = {"rotation": frame.rotation.tolist(), "translation": frame.translation.tolist()}
+        return msgspec.convert({"scale": frame.scale, **values}, FrameRecord)
+
+    @property
+    def similarity(self) -> Similarity:
+        """Raises ValueError for what is none."""
+        rotation, translation = (
+            torch.tensor(values, dtype=torch.float64) for values in (self.rotation, self.translation)
+        )
+        return Similarity(self.scale, rotation, translation)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What every header has."""
+
+    format: str
+    version: int
+
+
+HeaderT = TypeVar("HeaderT", bound=Header)
+
+
+def pack_tensors(tensors: Mapping[str, Tensor], header: Header) -> bytes:
+    """The same tensors and header give the same bytes."""
+    kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    return safetensors.torch.save(kept, {_ENTRY: msgspec.json.encode(header).decode()})
+
+
+def unpack_tensors(
+    data: bytes, kind: type[HeaderT], format: str, version: int
+) -> tuple[HeaderT, dict[str, Tensor]]:
+    """What `pack_tensors` got; the tensors are finite. Call it within `damage_refused`.
+
+    Raises InputError for another format or version. The header has the types and bounds of `kind`.
+    """
+    tensors = safetensors.torch.load(data)  # checks the sizes
+    size = int.from_bytes(data[:8], "little")
+    outer = msgspec.json.decode(data[8 : 8 + size], type=dict[str, msgspec.Raw])
+    text = msgspec.json.decode(outer["__metadata__"], type=dict[str, str])[_ENTRY].encode()
+    found = msgspec.json.decode(text, type=Header)
+    if found.format != format:
+        raise ValueError(f"format {found.format[:40]!r}")
+    if found.version != version:
+        raise InputError(f"secret of version {found.version}; this program reads version {version}")
+    header = msgspec.json.decode(text, type=kind)
+    if msgspec.json.encode(header) != text:
+        raise ValueError("its header has more or other fields")
+    if not all(value.isfinite().all() for value in tensors.values()):
+        raise ValueError("expected finite numbers")
+    return header, tensors
+
+
+@contextmanager
+def damage_refused(what: str) -> Iterator[None]:
+    """Whatever reading damaged bytes raises becomes an InputError that begins with `what`."""
+    try:
+        yield
+    except _DAMAGE as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0][:200]
+        raise InputError(f"{what}: {reason}") from error

@@ -1,0 +1,309 @@
+"""The whole file, from a real audit, from parts of it, and from hostile ones."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from markupsafe import Markup
+
+from audit.audited import found_in, run_with, with_all_texts
+from audit.pages import Parsed
+from keyss.audits import audit, figures
+from keyss.audits import page as page_module
+from keyss.core import InputError, OutputError
+from keyss.files.layout import usual_up
+from keyss.viewer.page import embedding_rules, page_with
+
+SECTIONS = [
+    "verdict",
+    "pictures",
+    "published",
+    "images",
+    "wrong-keys",
+    "leaks",
+    "stealth",
+    "statistics",
+    "renders",
+    "robustness",
+    "speed",
+    "not-measured",
+    "configuration",
+]
+PARTS = {  # fields of the record, and the sections that show them
+    "wrong_key": ["wrong-keys"],
+    "images": ["images", "pictures"],
+    "parameters": ["statistics"],
+    "stealth": ["stealth"],
+    "stegexpose": ["renders"],
+    "leaks": ["leaks"],
+    "robustness": ["robustness"],
+    "speed": ["speed"],
+}
+
+
+def write_report(run: Path) -> Path:
+    audit(run, report_only=True)
+    return run / "private" / "report.html"
+
+
+def parsed(run: Path) -> Parsed:
+    return Parsed(write_report(run).read_text())
+
+
+@pytest.fixture
+def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures take most of the time; what is drawn is tested elsewhere."""
+    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Markup(""))
+
+
+@pytest.fixture(scope="module")
+def page(run_folder: Path) -> Parsed:
+    return parsed(run_folder)
+
+
+def sections_of(page: Parsed) -> list[str]:
+    return [name for name in page.values("id") if name in SECTIONS]
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_every_section_is_there_once_and_linked(
+    data: dict[str, Any], run_folder: Path, tmp_path: Path
+) -> None:
+    page = parsed(run_with(run_folder, tmp_path, data))
+    ids = page.values("id")
+    assert sections_of(page) == SECTIONS
+    assert [link[1:] for link in page.values("href")][: len(SECTIONS)] == SECTIONS
+    assert {link[1:] for link in page.values("href")} <= set(ids)
+
+
+def test_what_was_hidden_where(page: Parsed, data: dict[str, Any]) -> None:
+    assert "treasure and map, hidden in garden" in page.text
+    for fact in (
+        f"{data['run']['gaussians']:,} Gaussians",
+        "40 pixels wide",
+        f"2 plain models of the cover, seeds {', '.join(map(str, data['controls']['seeds']))}",
+        f"keyss {data['keyss']}, took ",
+        "measures are within their limits.",
+        '"iterations": 20',
+        f'"torch": "{data["run"]["versions"]["torch"]}"',
+    ):
+        assert fact in page.text
+
+
+def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> None:
+    images, parameters, robustness = data["images"], data["parameters"], data["robustness"]
+    psnrs = [each["mean"]["psnr"] for each in (images["cover"], images["cover_baseline"], *images["secrets"])]
+    shown = [f"{psnr:.2f}" for psnr in psnrs]
+    shown += [f"{data['wrong_key']['shown']['vs_secrets'][1]['max']:.2f}"]
+    shown += [f"{data['leaks']['secrets'][1][0]['scores']['gradient']:.3f}"]
+    shown += [f"{parameters['sinkhorn']['stego']['sum']:.4f}", f"{parameters['sinkhorn']['score']:.2f}"]
+    shown += [f"{data['stegexpose']['stego']['plain'][3]['rs']:.4f}"]
+    shown += [f"{robustness['changes'][1]['secrets'][1]['psnr']:.2f}"]
+    shown += [f"{data['speed']['render'][0]['ratio']:.2f}×", "does not open", "Mean of 3 draws."]
+    assert [number for number in shown if number.replace("-", "−") not in page.text] == []
+    assert "half floats bits a number – 16.0" in page.text  # of low bits nothing is left
+
+
+def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]) -> None:
+    named = [item for view in data["images"]["pictures"] for item in view["items"]]
+    leaks = [row["picture"] for attacks in data["leaks"]["secrets"] for row in attacks]
+    assert page.tags.count("img") == len(named) + len(leaks)
+    assert page.tags.count("svg") == 2  # losses of two secrets
+    assert all(alt for alt in page.values("alt"))
+
+
+def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> None:
+    assert page.loads() == []
+    html = without_viewer((run_folder / "private" / "report.html").read_text())
+    assert "@import" not in html
+    assert all(url.startswith("#") for url in re.findall(r"url\(([^)]*)\)", html))
+    assert set(re.findall(r"https?://[^\"' <]*", html)) == {
+        "http://www.w3.org/2000/svg",
+        "http://www.w3.org/1999/xlink",
+    }
+
+
+def test_the_policy_allows_the_one_script_and_nothing_else(page: Parsed) -> None:
+    (policy,) = (value for value in page.values("content") if "default-src" in value)
+    (script,) = page.scripts
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    viewer = embedding_rules()
+    assert f"script-src 'sha256-{digest}' {viewer['script-src']};" in policy
+    assert policy.startswith("default-src 'none'; img-src blob: data:;")
+    assert "connect-src" not in policy  # what is in the page, the viewer included, can ask nobody
+    assert page.handlers() == []
+
+
+def without_viewer(html: str) -> str:
+    return re.sub(r'srcdoc="[^"]*"', "", html)
+
+
+def test_the_viewer_is_in_it_with_the_published_model(page: Parsed, run_folder: Path) -> None:
+    (viewer,) = page.values("srcdoc")
+    stego = run_folder / "publish" / "stego.ply"
+    assert viewer.encode() == page_with(
+        stego.read_bytes(), stego.name, usual_up(found_in(run_folder)["run"]["cover"])
+    )
+    assert page.values("sandbox") == ["allow-scripts allow-downloads"]
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_models_that_are_too_large_or_elsewhere_are_not_in_it(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_with(run_folder, tmp_path, data, published=True)
+    stego = run / "publish" / "stego.ply"
+    monkeypatch.setattr(page_module, "MAX_EMBEDDED", stego.stat().st_size - 1)
+    page = parsed(run)
+    assert "keyss view RUN/publish/stego.ply shows it." in page.text
+    harmless(page)
+    (policy,) = (value for value in page.values("content") if "default-src" in value)
+    assert "wasm" not in policy
+    monkeypatch.undo()
+    stego.unlink()
+    stego.symlink_to(run_folder / "publish" / "stego.ply")
+    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Markup(""))
+    page = parsed(run)
+    assert "It was not in RUN/publish" in page.text
+    harmless(page)
+
+
+def test_the_same_audit_gives_the_same_bytes(run_folder: Path, tmp_path: Path) -> None:
+    again = run_with(run_folder, tmp_path, found_in(run_folder), published=True)
+    assert write_report(again).read_bytes() == write_report(run_folder).read_bytes()
+
+
+@pytest.mark.usefixtures("without_drawing")
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_that_did_not_run_is_left_out(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, name: str
+) -> None:
+    data[name] = None
+    page = parsed(run_with(run_folder, tmp_path, data))
+    assert set(SECTIONS) - set(sections_of(page)) == set(PARTS[name])
+    assert "KEY measures it" in page.text
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_an_empty_audit_says_how_to_fill_it(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+    page = parsed(run_with(run_folder, tmp_path, {k: v for k, v in data.items() if k not in PARTS}))
+    assert sections_of(page) == ["published", "not-measured", "configuration"]
+    assert page.tags.count("li") == 3 + len(PARTS)  # links to the sections, and every measure
+    assert "keyss audit RUN --key-file KEY measures it" in page.text
+
+
+def test_a_broken_audit_leaves_the_old_report(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+    run = run_with(run_folder, tmp_path, data | {"images": "none"})
+    (run / "private" / "report.html").write_text("old")
+    with pytest.raises(InputError, match=r"audit\.json: .*`\$\.images`"):
+        write_report(run)
+    assert (run / "private" / "report.html").read_text() == "old"
+    assert sorted(path.name for path in (run / "private").iterdir()) == ["audit", "report.html"]
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_a_report_that_cannot_be_written(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+    run = run_with(run_folder, tmp_path, data)
+    (run / "private" / "report.html").mkdir()
+    with pytest.raises(OutputError, match=r"report\.html"):
+        write_report(run)
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_a_configuration_may_be_nested_but_not_without_end(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path
+) -> None:
+    run = run_with(run_folder, tmp_path, data)
+    text = json.dumps(data | {"run": data["run"] | {"config": "HERE"}})
+
+    def nested(depth: int) -> str:
+        return text.replace('"HERE"', '{"a": ' * depth + "1" + "}" * depth)
+
+    (run / "private" / "audit" / "audit.json").write_text(nested(300))
+    assert parsed(run).text.count('"a": {') == 299
+    (run / "private" / "audit" / "audit.json").write_text(nested(50_000))
+    with pytest.raises(InputError):
+        write_report(run)
+
+
+ATTACKS = [
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "' onmouseover='alert(1)",
+    "</style></title><svg onload=alert(1)>",
+    "--><iframe src=//example.org></iframe>",
+    "{{ 7 * 7 }}{% raw %}",
+]
+
+
+@pytest.mark.parametrize("text", ATTACKS)
+def test_texts_of_others_stay_text(run_folder: Path, data: dict[str, Any], tmp_path: Path, text: str) -> None:
+    """Every text and every free name of the audit, all at once, figures included."""
+    data = with_all_texts(data, text, lambda name: name in ("file", "picture", "first"))
+    data["parameters"]["distances"] = {text: data["parameters"]["distances"]["opacity"]}
+    data["run"]["config"] = {text: {text: text}}
+    page = parsed(run_with(run_folder, tmp_path, data))
+    harmless(page)
+    assert page.text.count(" ".join(text.split())) > 30
+
+
+def harmless(page: Parsed) -> None:
+    assert page.loads() == []
+    assert page.handlers() == []
+    assert len(page.scripts) == page.tags.count("script") == 1
+    assert page.tags.count("style") == page.tags.count("title") == 1
+    assert not {"iframe", "object", "embed", "link", "base", "form"} & set(page.tags)
+
+
+def _places(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Every place of the JSON; of lists the first entry stands for all."""
+    yield path
+    entries = (
+        value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    )
+    for name, item in entries:
+        yield from _places(item, (*path, name))
+
+
+ANYTHING = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text()
+    | st.sampled_from([*ATTACKS, 10**400]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+)
+
+
+@pytest.mark.usefixtures("without_drawing")
+@settings(
+    max_examples=150,
+    deadline=None,
+    database=None,  # every audit has other numbers: kept examples would not fit
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(where=st.integers(0, 100_000), value=ANYTHING)
+def test_any_other_value_anywhere_is_refused_or_harmless(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, where: int, value: Any
+) -> None:
+    places = [place for place in _places(data) if place and place != ("version",)]
+    place = places[where % len(places)]
+    changed = found_in(run_folder)
+    at: Any = changed
+    for step in place[:-1]:
+        at = at[step]
+    at[place[-1]] = value
+    run = run_with(run_folder, tmp_path, changed)
+    with contextlib.suppress(InputError):
+        harmless(parsed(run))

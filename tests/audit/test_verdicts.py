@@ -1,0 +1,288 @@
+"""Which word each number gets, on both sides of each threshold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from audit.audited import changed
+from keyss.audits import Audit, Verdict, headline, verdicts
+
+Data = dict[str, Any]
+Change = tuple[str, Any]
+IMAGES, ROBUSTNESS = "images.{}.mean.psnr", "robustness.changes.{}"
+LEAK = "leaks.secrets.{}.{}.best_leak.{}"
+STEGEXPOSE, CONTROL = "stegexpose.stego.fused", "stegexpose.control.fused"
+
+
+def judged(audit: Audit) -> dict[str, Verdict]:
+    return {line.measure: line for line in verdicts(audit)}
+
+
+def _auc(auc: float, low: float, high: float) -> Data:
+    return {"auc": auc, "low": low, "high": high}
+
+
+def _score(p: float) -> Data:
+    return {"name": f"candidate: {p}", "value": 0, "low": 0, "high": 0, "p": p, "exact": None}
+
+
+ALL_FINE: list[Change] = [
+    (IMAGES.format("cover"), 27.5),
+    (IMAGES.format("cover_baseline"), 27.0),
+    (IMAGES.format("secrets.0"), 30.0),
+    (IMAGES.format("secret_baselines.0"), 30.5),
+    (IMAGES.format("secrets.1"), 27.5),
+    (IMAGES.format("secret_baselines.1"), 28.0),
+    (
+        "wrong_key.shown.vs_secrets",
+        [{"mean": 7.1, "min": 7.0, "max": 7.2}, {"mean": 8, "min": 7, "max": 8.5}],
+    ),
+    ("wrong_key.chance_level", [7.0, 8.0]),
+    ("wrong_key.shown.keys", 16),
+    ("parameters.two_sample.stego", [{"auc": 0.55, "low": 0.54, "high": 0.56}]),
+    ("parameters.two_sample.control", [{"auc": 0.52, "low": 0.51, "high": 0.53}]),
+    ("parameters.two_sample.original", []),
+    ("stealth.least", 0.2),
+    ("stealth.least_of_controls", 0.5),
+    ("stealth.confirmations", [{"scores": [_score(0.1), _score(0.02)]}, None]),
+    (STEGEXPOSE, _auc(0.75, 0.3, 1.0)),
+    (CONTROL, _auc(0.5, 0.4, 0.6)),
+]
+
+
+@pytest.fixture
+def fine(data: Data) -> Data:
+    """A real audit with numbers that are all within their limits."""
+    no_leak = dict.fromkeys(data["leaks"]["secrets"][0][0]["leak"], -0.1)
+    for attacks in data["leaks"]["secrets"]:
+        for row in attacks:
+            row["leak"], row["best_leak"] = dict(no_leak), dict(no_leak)
+    data["leaks"]["secrets"][1][2]["best_leak"] |= {"psnr_fitted": 0.4, "ssim_fitted": 0.01}
+    data["leaks"]["secrets"][1][2] |= {"attack": "matched opacities", "best": "below 0.05"}
+    for each in data["parameters"]["distances"].values():
+        each |= {"ratio": 1.1, "original": None}
+    for row in data["robustness"]["changes"]:
+        pruned = (row["attack"], row["strength"]) == ("random pruning", 0.25)
+        for each in [row["cover"], *row["secrets"]] if row["cover"] else ():
+            each["loss"] = 2.5 if pruned else each["loss"]
+    data["speed"]["readers"] = [{"reader": "plyfile", "file": "stego", "loads": True}]
+    for place, value in ALL_FINE:
+        *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
+        at: Any = data
+        for step in path:
+            at = at[step]
+        at[last] = value
+    return data
+
+
+def test_the_whole_audit(fine: Data) -> None:
+    lines = judged(changed(fine, (IMAGES.format("secrets.1"), 25.5)))
+    assert {name: line.word for name, line in lines.items()} == {
+        "cover on test photos": "fine",
+        "secret 1 on test photos": "fine",
+        "secret 2 on test photos": "missed",
+        "wrong keys": "fine",
+        "leaks without the key": "fine",
+        "the file by itself": "fine",
+        "guessing the secret": "fine",
+        "attributes of the Gaussians": "fine",
+        "classifier between models": "fine",
+        "StegExpose on renders": "fine",
+        "loss of a random 25% of the Gaussians": "fine",
+        "reading by other programs": "fine",
+    }
+    assert lines["wrong keys"].value == "8.50 dB, best of 16"
+    assert lines["leaks without the key"].value == (
+        "+0.40 dB, +0.010 SSIM, −0.10 gradients (secret 2, matched opacities: below 0.05)"
+    )
+    assert lines["loss of a random 25% of the Gaussians"].value == "secret −2.50 dB"
+    assert lines["loss of a random 25% of the Gaussians"].beside == "cover −2.50 dB"
+
+
+@pytest.mark.parametrize(
+    ("measure", "place", "within", "beyond", "word"),
+    [
+        ("cover on test photos", IMAGES.format("cover"), 26.0, 25.9, "visible"),
+        ("secret 1 on test photos", IMAGES.format("secrets.0"), 29.5, 29.4, "missed"),
+        ("wrong keys", "wrong_key.shown.vs_secrets.0.max", 8.0, 8.1, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "psnr_fitted"), 1.0, 1.01, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "ssim_fitted"), 0.05, 0.051, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "gradient_coarse"), 0.1, 0.11, "visible"),
+        ("the file by itself", "stealth.least", 0.01, 0.009, "visible"),
+        ("the file by itself", "stealth.least", 0.2, 0.0, "visible"),
+        ("guessing the secret", "stealth.confirmations.0.scores.1.p", 0.005, 0.0049, "visible"),
+        ("attributes of the Gaussians", "parameters.distances.opacity.ratio", 1.5, 1.51, "visible"),
+        ("classifier between models", "parameters.two_sample.stego.0.auc", 0.6, 0.61, "visible"),
+        ("StegExpose on renders", f"{STEGEXPOSE}.low", 0.5, 0.51, "visible"),
+        ("StegExpose on renders", f"{STEGEXPOSE}.high", 0.75, 0.45, "visible"),
+        ("reading by other programs", "speed.readers.0.loads", True, False, "missed"),
+    ],
+)
+def test_each_threshold(fine: Data, measure: str, place: str, within: Any, beyond: Any, word: str) -> None:
+    assert judged(changed(fine, (place, within)))[measure].word == "fine"
+    assert judged(changed(fine, (place, beyond)))[measure].word == word
+
+
+def _pruned(fine: Data, *changes: tuple[str, Any]) -> Verdict:
+    """The line about random pruning with other values in its first draw of three."""
+    rows = fine["robustness"]["changes"]
+    first = next(i for i, row in enumerate(rows) if row["strength"] == 0.25)
+    places = [(f"{ROBUSTNESS.format(first)}.{place}", value) for place, value in changes]
+    return judged(changed(fine, *places))["loss of a random 25% of the Gaussians"]
+
+
+def test_pruning_is_judged_by_the_mean_of_its_draws(fine: Data) -> None:
+    assert _pruned(fine, ("secrets.1.loss", 2.5 + 3 * 1.49)).word == "fine"
+    beyond = _pruned(fine, ("secrets.1.loss", 2.5 + 3 * 1.51))
+    assert (beyond.word, beyond.value) == ("missed", "secret −4.01 dB")
+    lost = _pruned(fine, ("secrets.0.opens", False))
+    assert (lost.word, lost.value) == ("missed", "the secret does not open")
+
+
+def test_a_detector_near_a_half_is_fine_however_narrow_its_interval(fine: Data) -> None:
+    near, far = _auc(0.58, 0.57, 0.59), _auc(0.62, 0.61, 0.63)
+    assert judged(changed(fine, (STEGEXPOSE, near)))["StegExpose on renders"].word == "fine"
+    assert judged(changed(fine, (STEGEXPOSE, far)))["StegExpose on renders"].word == "visible"
+
+
+def test_with_the_key_the_secret_is_expected_to_show(fine: Data) -> None:
+    row = fine["leaks"]["secrets"][0][1]
+    row["best_leak"] |= {"psnr_fitted": 20.0, "ssim_fitted": 0.7}
+    assert judged(changed(fine))["leaks without the key"].word == "visible"
+    row["with_key"] = True
+    assert judged(changed(fine))["leaks without the key"].word == "fine"
+
+
+def test_a_detector_is_judged_beside_what_it_finds_between_controls(fine: Data) -> None:
+    found = (STEGEXPOSE, _auc(0.73, 0.68, 0.78))
+    assert judged(changed(fine, found))["StegExpose on renders"].word == "visible"
+    line = judged(changed(fine, found, (CONTROL, _auc(0.70, 0.65, 0.75))))["StegExpose on renders"]
+    assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")
+
+
+def test_a_file_is_as_unusual_as_plain_models_are(fine: Data) -> None:
+    found = changed(fine, ("stealth.least", 0.002), ("stealth.least_of_controls", 0.001))
+    line = judged(found)["the file by itself"]
+    assert (line.word, line.beside) == ("fine", "0.00100, between plain models")
+    assert line.value.startswith("p = 0.00200 (")
+    guessed = judged(changed(fine))["guessing the secret"]
+    assert guessed.value == "p = 0.0400 (candidate: 0.02)"
+
+
+def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
+    parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
+    assert judged(changed(fine, *((part, None) for part in parts))) == {}
+    for each in fine["parameters"]["distances"].values():
+        each["ratio"] = None
+    rows = [row for row in fine["robustness"]["changes"] if row["strength"] != 0.25]
+    left_out = [
+        ("robustness.changes", rows),
+        ("images.cover_baseline", None),
+        ("parameters.two_sample.stego", []),
+        ("stealth.statistics", []),
+        ("wrong_key.chance_level", []),
+        ("leaks.secrets", [[], []]),
+        ("speed.readers", [{"reader": "gsply", "file": "stego", "loads": None}]),
+    ]
+    assert set(judged(changed(fine, *left_out))) == {
+        "secret 1 on test photos",
+        "secret 2 on test photos",
+        "StegExpose on renders",
+        "reading by gsply",
+    }
+
+
+def test_the_headline(fine: Data) -> None:
+    assert headline([]) == "Nothing was measured that could be judged."
+    lines = verdicts(changed(fine))
+    assert headline(lines) == "All 12 measures are within their limits."
+    assert headline(lines[:1]) == "The one measure is within its limit."
+    changes = (("parameters.distances.opacity.ratio", 9.0), (IMAGES.format("secrets.1"), 25.5))
+    assert headline(verdicts(changed(fine, *changes))) == (
+        "10 of 12 measures are within their limits. Visible: attributes of the Gaussians. "
+        "Missed: secret 2 on test photos."
+    )
+
+
+def test_haze_is_not_called_visible_and_shapes_are(fine: Data) -> None:
+    """A bright cloud is nearer to most photos than darkness is, before colours are fitted."""
+    measure = "leaks without the key"
+    haze = [
+        (place.format(0, 0, score), value)
+        for place in (LEAK, LEAK.replace("best_leak", "leak"))
+        for score, value in (("psnr", 4.76), ("ssim", 0.314), ("gradient", 0.09))
+    ]
+    assert judged(changed(fine, *haze))[measure].word == "fine"
+    assert "visible" not in headline(verdicts(changed(fine, *haze))).lower()
+    line = judged(changed(fine, *haze, (LEAK.format(0, 0, "ssim_fitted"), 0.06)))[measure]
+    assert line.word == "visible"
+    assert "secret 1, restored opacities: " in line.value
+    assert "+0.060 SSIM" in line.value
+
+
+def test_the_attack_that_is_named_is_the_one_that_is_judged(fine: Data) -> None:
+    """Not the largest of each number, from attacks that no picture shows together."""
+    apart = [(LEAK.format(0, 0, "psnr_fitted"), 0.5), (LEAK.format(0, 3, "ssim_fitted"), 0.045)]
+    line = judged(changed(fine, *apart))["leaks without the key"]
+    assert line.value.startswith("−0.10 dB, +0.045 SSIM, ")
+    assert "inverted opacities" in line.value
+
+
+def _reader(name: str, loads: bool | None) -> Data:
+    return {"reader": name, "file": "stego", "loads": loads, "note": None if loads else "npm install it"}
+
+
+def test_a_reader_that_was_not_there_is_not_measured(fine: Data) -> None:
+    readers = [_reader("plyfile", True), _reader("gsply", True), _reader("splat-transform", None)]
+    found = changed(fine, ("speed.readers", readers * 2))
+    lines = judged(found)
+    assert (lines["reading by other programs"].word, lines["reading by other programs"].value) == (
+        "fine",
+        "by plyfile, gsply",
+    )
+    assert lines["reading by splat-transform"].word == "not measured"
+    assert headline(verdicts(found)) == (
+        f"All {sum(each.word == 'fine' for each in lines.values())} measures are within their limits. "
+        "Not measured: reading by splat-transform."
+    )
+    readers[0]["loads"] = False
+    line = judged(changed(fine, ("speed.readers", readers)))["reading by other programs"]
+    assert (line.word, line.value) == ("missed", "by gsply; not by plyfile")
+
+
+def test_renders_of_given_models_are_not_called_photos(fine: Data) -> None:
+    models = [("run.photos", [False, True, True]), (IMAGES.format("cover_baseline"), 120.0)]
+    line = judged(changed(fine, *models, (IMAGES.format("cover"), 46.0)))["cover on renders of its model"]
+    assert (line.word, line.beside, line.limit) == ("fine", "the given model itself", "at least 45 dB")
+
+
+def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model(fine: Data) -> None:
+    ratio, original = (f"parameters.distances.scale.{name}" for name in ("ratio", "original"))
+    measure, opacity = "attributes of the Gaussians", "parameters.distances.opacity.ratio"
+    assert judged(changed(fine, (ratio, 1.9)))[measure].word == "visible"
+    assert judged(changed(fine, (ratio, 1.9), (original, 1.9)))[measure].word == "fine"
+    line = judged(changed(fine, (ratio, 1.9), (original, 1.9), (opacity, 1.6)))[measure]
+    assert (line.word, line.value) == ("visible", "opacity 1.60×")
+
+
+def test_a_classifier_may_tell_as_much_as_of_the_covers_plain_model(fine: Data) -> None:
+    def word(original: float) -> str:
+        auc = {"low": 0.0, "high": 1.0}
+        stego = ("parameters.two_sample.stego", [auc | {"auc": 0.9}])
+        own = ("parameters.two_sample.original", [auc | {"auc": original}])
+        return judged(changed(fine, stego, own))["classifier between models"].word
+
+    assert [word(original) for original in (0.5, 0.88, 0.9)] == ["visible", "visible", "fine"]
+
+
+def test_what_nobody_sees_is_fine_however_perfect_the_baseline(fine: Data) -> None:
+    perfect = (IMAGES.format("cover_baseline"), 120.0)
+    for psnr, word in ((45.1, "fine"), (44.9, "visible")):
+        found = changed(fine, perfect, (IMAGES.format("cover"), psnr))
+        assert judged(found)["cover on test photos"].word == word
+
+
+def test_wrong_keys_that_were_tried_on_no_secret_have_no_verdict(fine: Data) -> None:
+    assert "wrong keys" not in judged(changed(fine, ("wrong_key.shown.vs_secrets", [])))

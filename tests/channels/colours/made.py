@@ -1,0 +1,32 @@
+"""Models, and bytes in their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from keyss.channels import Payload, PreparedCover, channel_for
+from keyss.core import Gaussians
+from measure.lifelike import lifelike
+
+COLOURS = channel_for("any", "colours")
+METHOD = "t"
+PACKED = 1 + len(METHOD)  # bytes beside the data
+
+
+def cover(count: int = 4000, seed: int = 0) -> Gaussians:
+    return lifelike(count, seed).with_sh_degree(0)
+
+
+def embed(
+    cover: Gaussians | PreparedCover, secrets: Sequence[tuple[str, bytes]], entropy: bytes | None = None
+) -> Gaussians:
+    prepared = COLOURS.prepare(cover) if isinstance(cover, Gaussians) else cover
+    return prepared.embed([(key, Payload(METHOD, data)) for key, data in secrets], entropy=entropy)
+
+
+def extract(stego: Gaussians, key: str) -> bytes:
+    reader = COLOURS.reader(stego)
+    assert reader is not None
+    content = reader.open(key)
+    assert isinstance(content, Payload)
+    return content.data

@@ -1,0 +1,349 @@
+"""Bytes in a model and out again, after what becomes of published models."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from channels.colours.made import COLOURS, PACKED, cover, embed, extract
+from keyss.channels import Colours, ColoursCover
+from keyss.channels.colours.carriers import CELL, Numbers
+from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
+from keyss.channels.colours.reading import ColoursReader
+from keyss.channels.colours.salts import SALTS, Salts
+from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, Similarity, UsageError, WrongKeyError
+from keyss.measure import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
+from keyss.rendering import psnr_between
+
+ENTROPY = bytes(range(32))
+STRENGTH = 45.0
+
+
+@pytest.fixture(scope="module")
+def prepared() -> ColoursCover:
+    return Colours().prepare(cover(6000))
+
+
+@pytest.fixture(scope="module")
+def payload(prepared: ColoursCover) -> bytes:
+    return np.random.default_rng(0).bytes(prepared.capacity - PACKED)
+
+
+@pytest.fixture(scope="module")
+def stego(prepared: ColoursCover, payload: bytes) -> Gaussians:
+    return embed(prepared, [("a", payload)], entropy=ENTROPY)
+
+
+def test_text_keys_open_what_they_were_given(prepared: ColoursCover) -> None:
+    """All the way from the text; other tests begin with what it becomes."""
+    stego = embed(prepared, [("Rosebud, 1941", b"snow")], entropy=ENTROPY)
+    assert extract(stego, "Rosebud, 1941") == b"snow"
+    with pytest.raises(WrongKeyError):
+        extract(stego, "Rosebud, 1942")
+
+
+@settings(max_examples=8, deadline=None)
+@given(share=st.floats(0, 1), seed=st.integers(0, 2**32))
+def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: float, seed: int) -> None:
+    data = np.random.default_rng(seed).bytes(int(share * (prepared.capacity - PACKED)))
+    stego = embed(prepared, [("a", data)], entropy=seed.to_bytes(32, "little"))
+    assert extract(stego, "a") == data
+
+
+def test_a_header_made_up_by_chance_hides_no_other(
+    prepared: ColoursCover, payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One attempt of 2^16 gives bits whose tag is right, and there are 27 for each key."""
+    made_up = (Header(bytes([number] * FILE_KEY_BYTES), bytes(2), 40, 1, 0, 63, 20, 0) for number in range(2))
+    monkeypatch.setattr(
+        "keyss.channels.colours.reading.read_header", lambda *args: next(made_up, None) or read_header(*args)
+    )
+    assert extract(stego, "a") == payload
+
+
+def test_names_are_those_that_agree_best_with_the_header(
+    prepared: ColoursCover, payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A header can be read where log scales are shifted by part of a cell, but not what it belongs to."""
+    offsets: dict[int, float] = {}
+    kept: list[Index] = []  # so that no two have the same id
+    headers: list[Header] = []
+    of_reader, shift = ColoursReader._indices, 2 * CELL / 7
+
+    def indices(reader: ColoursReader) -> Iterator[tuple[float, Index]]:
+        for offset, index in of_reader(reader):
+            offsets[id(index)] = abs(offset - round(Numbers.of(stego).size / CELL) * CELL - shift)
+            kept.append(index)
+            yield offset, index
+
+    def read(*args: Any) -> Header | None:
+        headers.extend(found for found in [read_header(*args)] if found)
+        return headers[0] if headers else None
+
+    monkeypatch.setattr(ColoursReader, "_indices", indices)
+    monkeypatch.setattr(Index, "promise", lambda index, secrets: -offsets[id(index)])
+    monkeypatch.setattr("keyss.channels.colours.reading.read_header", read)
+    assert extract(stego, "a") == payload  # finds the header
+    monkeypatch.setattr("keyss.channels.colours.reading._BEST", 7)
+    assert extract(stego, "a") == payload
+
+
+def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
+    with pytest.raises(UsageError, match=f"{prepared.capacity:,} bytes in all"):
+        embed(prepared, [("a", payload + b"x")])
+    with pytest.raises(UsageError, match="`strength`"):
+        _ = Colours(math.nan).prepare(prepared.cover).capacity
+
+
+def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, stego: Gaussians) -> None:
+    model = prepared.cover
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        assert torch.equal(getattr(model, name), getattr(stego, name))
+    assert torch.equal(model.sh[:, 0, 0], stego.sh[:, 0, 0])
+    assert torch.equal(model.sh[:, 1:], stego.sh[:, 1:])
+    assert (model.sh != stego.sh).any(dim=2).any(dim=1).float().mean() > 0.5
+
+
+def test_it_costs_no_more_than_was_asked_for(prepared: ColoursCover, stego: Gaussians) -> None:
+    assert psnr_between(prepared.cover, stego) > STRENGTH
+    sizes = [Colours(strength).prepare(prepared.cover).capacity for strength in (40.0, 50.0, 60.0)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > 1.3 * sizes[2]
+
+
+def test_a_small_payload_changes_far_less_than_a_large_one(prepared: ColoursCover, stego: Gaussians) -> None:
+    small = embed(prepared, [("a", bytes(20))], entropy=ENTROPY)
+    full, little = ((each.sh[:, 0] - prepared.cover.sh[:, 0]).square().sum() for each in (stego, small))
+    assert little < full / 30
+    assert float((small.sh != prepared.cover.sh).any(dim=2).any(dim=1).float().mean()) < 0.6
+    assert float((small.sh - prepared.cover.sh).abs().quantile(0.99)) < 0.0277
+    others = [embed(prepared, [("a", bytes(20))], entropy=bytes([seed] * 32)) for seed in range(4)]
+    psnr = np.mean([psnr_between(prepared.cover, each) for each in others])  # depends on where salts are
+    assert psnr > psnr_between(prepared.cover, stego) + 3
+
+
+def _spz(model: Gaussians) -> Gaussians:
+    return next(each for each in converters() if (each.format, each.tool) == (".spz", "gsply"))(model)
+
+
+def _turned(scale: float) -> Callable[[Gaussians], Gaussians]:
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    move = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
+    return Similarity(scale, rotation, move).apply_gaussians
+
+
+def _shuffled(model: Gaussians) -> Gaussians:
+    return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(1))]
+
+
+CHANGES: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "nothing": lambda model: model,
+    "spz": _spz,
+    "spz, order and a quarter": lambda model: random_pruning(0.25, 3)(_shuffled(_spz(model))),
+    "rotation and translation": _turned(1.0),
+    "scaling": _turned(1.37),
+    "half floats": half_floats(),
+    "noise on colour": noise("colour", 0.005),
+    "noise on log scales": noise("log scale", 0.005),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_full_model_opens_after(name: str, stego: Gaussians, payload: bytes) -> None:
+    if "spz" in name:
+        pytest.importorskip("gsply")
+    assert extract(CHANGES[name](stego), "a") == payload
+
+
+HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "one half": cropping(1),
+    "another half": cropping(2),
+    "a random half": random_pruning(0.5),
+    "without the faintest": opacity_pruning(0.25),
+    "scaling before spz": lambda model: _spz(_turned(0.4)(model)),
+    "another scene beside it": lambda model: Gaussians.cat([cover(2000, seed=5), model]),
+}
+
+
+@pytest.mark.parametrize("name", HARDER)
+def test_a_fifth_of_the_capacity_opens_after(prepared: ColoursCover, name: str) -> None:
+    if "spz" in name:
+        pytest.importorskip("gsply")
+    data = np.random.default_rng(1).bytes((prepared.capacity - PACKED) // 5)
+    stego = embed(prepared, [("a", data)], entropy=ENTROPY)
+    assert extract(HARDER[name](stego), "a") == data
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes) -> None:
+    converter = converters()[index]
+    try:
+        back = converter(stego)
+    except KeyssError as error:
+        pytest.skip(str(error))
+    assert extract(back, "a") == payload
+
+
+def test_two_keys_open_their_own_and_a_third_nothing(prepared: ColoursCover) -> None:
+    data = {name: os.urandom(prepared.unseen_capacity // 3 - PACKED) for name in "ab"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        stego = embed(prepared, [(name, data[name]) for name in "ab"], entropy=ENTROPY)
+    for name in "ab":
+        assert extract(stego, name) == data[name]
+    with pytest.raises(WrongKeyError):
+        extract(stego, "c")
+
+
+def test_who_could_notice_other_secrets_is_said(prepared: ColoursCover, payload: bytes) -> None:
+    large, small = payload[: len(payload) // 2], payload[: len(payload) // 4]
+    with pytest.warns(KeyssWarning, match="notice that there are other secrets"):
+        stego = embed(prepared, [("a", large), ("b", small)], entropy=ENTROPY)
+    assert extract(stego, "a") == large
+
+
+def test_equal_keys_and_none_are_refused(prepared: ColoursCover) -> None:
+    with pytest.raises(UsageError, match="same key"):
+        embed(prepared, [("a", b"1"), ("a", b"2")])
+    with pytest.raises(UsageError, match="at least one"):
+        embed(prepared, [])
+
+
+def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: ColoursCover) -> None:
+    """But for what lies under a salt that two files share by chance, which is told (docs/channels.md)."""
+    many = [embed(prepared, [("a", b"same")]) for _ in range(6)]
+    salts = [set(Salts.of(Numbers.of(each)).salts) for each in many]
+    shared = {pair: len(salts[pair[0]] & salts[pair[1]]) for pair in combinations(range(6), 2)}
+    assert max(shared.values()) < SALTS // 4
+    first, second = (many[index] for index in min(shared, key=lambda pair: shared[pair]))
+    assert min(shared.values()) == 0
+    written = [(each.sh[:, 0] - prepared.cover.sh[:, 0])[:, 1:].flatten() for each in (first, second)]
+    both = (written[0] != 0) & (written[1] != 0)
+    small = [each[both].clip(-0.03, 0.03) for each in written]  # salts move by more
+    assert abs(np.corrcoef(small[0], small[1])[0, 1]) < 0.1
+    assert float((written[0] == written[1])[both].float().mean()) < 0.01
+
+
+def test_entropy_decides_everything(prepared: ColoursCover) -> None:
+    one, same = (embed(prepared, [("a", b"x")], entropy=ENTROPY) for _ in range(2))
+    assert torch.equal(one.sh, same.sh)
+
+
+def test_what_was_destroyed_is_told_from_what_was_never_there(
+    stego: Gaussians, prepared: ColoursCover
+) -> None:
+    """Headers stand a little more loss than payloads; now and then one is lost first all the same."""
+    told = 0
+    for seed in range(5):
+        with pytest.raises((InputError, WrongKeyError)) as error:
+            extract(random_pruning(0.45, seed)(stego), "a")
+        told += "the key is right, but too much" in str(error.value)
+    assert told >= 3
+    with pytest.raises(WrongKeyError):
+        extract(prepared.cover, "a")
+
+
+def test_a_changed_bit_of_the_payload_is_never_handed_out(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from keyss.channels.colours.fountain import Fountain
+
+    decode = Fountain.decode
+
+    def wrong(self: Fountain, *arguments: object) -> tuple[np.ndarray, bool]:
+        bits, done = decode(self, *arguments)  # type: ignore[arg-type]
+        if self.size > 1000:
+            bits[777] ^= 1
+        return bits, done
+
+    monkeypatch.setattr(Fountain, "decode", wrong)
+    with pytest.raises(InputError, match="the key is right"):
+        extract(stego, "a")
+
+
+@pytest.mark.parametrize("count", [0, 1, 30, 200])
+def test_small_models_are_refused_or_carry(count: int) -> None:
+    model = cover(max(count, 1))[:count]
+    with pytest.raises((UsageError, InputError)):
+        embed(model, [("a", bytes(100))])
+    assert COLOURS.prepare(model).capacity < 100
+    with pytest.raises(WrongKeyError):
+        extract(model, "a")
+
+
+def test_hostile_numbers_end_in_a_typed_error(stego: Gaussians) -> None:
+    values = torch.tensor([math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-45, 0.0])
+    generator = torch.Generator().manual_seed(0)
+
+    def garbled(tensor: torch.Tensor) -> torch.Tensor:
+        hit = torch.rand(tensor.shape, generator=generator) < 0.6
+        return torch.where(hit, values[torch.randint(7, tensor.shape, generator=generator)], tensor)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(3):
+            with pytest.raises((WrongKeyError, InputError)):
+                extract(stego[:800].map(garbled), "a")
+
+
+def test_equal_gaussians_cost_nothing_but_themselves(stego: Gaussians, payload: bytes) -> None:
+    """Each a second time, as where a model is put together with itself."""
+    assert extract(Gaussians.cat([stego, stego]), "a") == payload
+
+
+def test_a_model_of_one_gaussian_many_times_is_refused() -> None:
+    model = replace(cover(1)[torch.zeros(3000, dtype=torch.int64)])
+    with pytest.raises((UsageError, InputError)):
+        embed(model, [("a", b"x")])
+
+
+def test_repeated_and_equal_colours_are_left_alone() -> None:
+    model = cover(6000)
+    sh = model.sh.clone()
+    sh[:100, 0, 1] = sh[200:300, 0, 1]  # as of clones that were never optimised again
+    sh[400:500, 0, 2] = sh[400:500, 0, 1]  # grey
+    sh[600:700, 0, 1] = 0.25
+    model = replace(model, sh=sh)
+    stego = embed(model, [("a", bytes(100))], entropy=ENTROPY)
+    kept = (stego.sh[:, 0] == sh[:, 0]).all(dim=1)
+    for rows in (slice(0, 100), slice(200, 300), slice(400, 500), slice(600, 700)):
+        assert float(kept[rows].float().mean()) > 0.98  # salts may lie there
+    low = [each.sh[:, 0].numpy().view(np.uint32) & 1023 for each in (model, stego)]
+    assert (low[0] == low[1]).mean() > 0.99
+    assert extract(stego, "a") == bytes(100)
+
+
+def test_a_rounded_model_gets_values_that_it_has() -> None:
+    model = cover(6000)
+    model = replace(model, sh=(model.sh * 60).round() / 60)
+    stego = embed(model, [("a", bytes(100))], entropy=ENTROPY)
+    assert np.isin(stego.sh[:, 0].numpy(), model.sh[:, 0].numpy()).mean() > 0.99
+    assert extract(stego, "a") == bytes(100)
+
+
+def test_a_wrong_key_does_the_work_of_a_right_one(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted in looks at parts of headers, which take no less with one key than with another."""
+    looks, parts = [0], Index.parts
+
+    def counted(self: Index, *arguments: object) -> object:
+        looks[0] += 1
+        return parts(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Index, "parts", counted)
+    extract(stego, "a")
+    right, looks[0] = looks[0], 0
+    with pytest.raises(WrongKeyError):
+        extract(stego, "b")
+    assert looks[0] == right

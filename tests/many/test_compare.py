@@ -1,0 +1,128 @@
+"""Methods side by side: one table, resumed where it was, and a sentence where something is not possible."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from keyss import compare
+from keyss.cli import main
+from keyss.core import InputError, OutputError, UsageError
+from keyss.fitting import PRESETS
+from keyss.many import Comparison, Forecast, comparing, performing, running
+from keyss.methods import Bound, registry
+from test_api import write_nerfstudio
+from tiny_scenes import tiny_scene
+
+SMALL = ["--iterations", "60", "--max-gaussians", "150", "--seed", "3"]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("scenes")
+    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
+
+
+def test_a_table_a_picture_and_a_second_start(
+    folders: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    out = tmp_path / "compared"
+    names = "3dgs,3dgs-sh,watergs,carry"
+    command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
+    assert main([*command, "--methods", names, "--dry-run"]) == 0
+    assert not out.exists()
+    assert "8 cells, 7 to do" in capsys.readouterr().out  # four plain models and three methods
+    assert main([*command, "--methods", "3dgs,3dgs-sh"]) == 0
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}
+    assert len(before) == 4 + 2
+    capsys.readouterr()
+    assert main([*command, "--methods", names]) == 0
+    assert before.items() <= {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}.items()
+    said = capsys.readouterr().out
+    assert "carry: not possible" in said  # so small a cover has no room
+    found = json.loads((out / "comparison.json").read_text())
+    rows = {row["name"]: row for row in found["methods"]}
+    assert list(rows) == names.split(",")
+    assert "any" in rows["carry"]["error"]
+    numbers = {name: row["numbers"] for name, row in rows.items() if not row["error"]}
+    assert numbers["3dgs"]["cover.psnr"] >= numbers["watergs"]["cover.psnr"] - 1
+    assert numbers["3dgs-sh"]["files.handed"] > numbers["3dgs-sh"]["gaussians"] * 16 * 3 * 4
+    assert [rows[name]["keys"] for name in ("3dgs", "3dgs-sh", "watergs")] == [False, False, True]
+    assert {(each["steps.1"], each["steps.2"]) for each in numbers.values()} == {(60, 60)}
+    # The handed files belong to every row, and those of `3dgs` have other places.
+    assert "survival.pruned.cover" in numbers["3dgs-sh"]
+    assert "survival.pruned.secret" not in numbers["3dgs-sh"]
+    kept = {name: value for name, value in numbers["3dgs"].items() if name.startswith("survival.")}
+    assert {f"survival.{name}.cover" for name in ("pruned", ".spz", "purified")} <= set(kept)
+    secrets = [value for name, value in kept.items() if name.endswith(".secret")]
+    assert secrets == pytest.approx([0] * len(secrets))
+    # What `3dgs` publishes is the plain model that others are compared with.
+    for figure in ("classifier", "stealth", "stegexpose"):
+        assert numbers["3dgs"][f"secrecy.{figure}"] == numbers["3dgs"][f"secrecy.{figure}_plain"]
+    assert numbers["watergs"]["files.readers"] == numbers["watergs"]["files.readers that load"] > 0
+    assert main([*command, "--methods", names, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "0 to do" in said
+    assert "carry: " in said
+    text = (out / "comparison.md").read_text()
+    assert text.count("\n## ") + text.startswith("## ") == 2
+    assert "- carry: not possible" in text
+    with Image.open(out / "comparison.png") as picture:
+        assert picture.height > 4 * 200  # photos and three methods
+    assert (out / "private" / "master-key.txt").stat().st_mode & 0o77 == 0
+
+
+@pytest.mark.parametrize("name", registry.METHODS)
+@pytest.mark.parametrize("iterations", [61, 3000])
+def test_every_scene_is_drawn_as_often_by_every_method(name: str, iterations: int) -> None:
+    for preset in map(registry.get(name).options.preset, PRESETS):
+        options, plain = comparing.within(iterations, preset)
+        trained = [Bound.of(each, own).steps for each, own in zip(options.training(2), plain, strict=True)]
+        assert trained == [iterations] * 2
+
+
+def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    for methods, words in ((["3dgs", "lerned"], "lerned"), (["carry:worst"], "worst")):
+        with pytest.raises(UsageError, match=words):
+            compare(*folders, methods=methods, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="models have none"):
+        compare(tmp_path / "a.ply", folders[1], out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "gs-hider", "watergs"}
+
+
+@pytest.mark.parametrize("verb", ["hide", "fit"])
+def test_where_no_method_works_the_reasons_are_said_and_there_is_no_picture(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    def full(*arguments: object, **more: object) -> None:
+        raise InputError("the disk is full")
+
+    monkeypatch.setattr(performing, verb, full)
+    sizes = {"iterations": 20, "max_gaussians": 100, "seed": 1}
+    found = compare(*folders, methods=["3dgs"], out=tmp_path / "out", **sizes)  # type: ignore[arg-type]
+    assert isinstance(found, Comparison)
+    assert [each.error for each in found.methods] == ["the disk is full"]
+    assert "the disk is full" in (tmp_path / "out" / "comparison.md").read_text()
+    assert not (tmp_path / "out" / "comparison.png").exists()
+
+
+def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """Without numbers the budget is that of the first method's preset."""
+    found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
+    assert isinstance(found, Forecast)
+    assert {each.name.partition(", ")[2] for each in found.cells} >= {"1,000 steps, seed 0"}
+    with running.claimed(tmp_path / "out"), pytest.raises(OutputError, match="is at work"):
+        compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
+
+
+def test_all_is_every_method_and_keyss_as_published() -> None:
+    assert set(comparing.EVERY) == {*registry.METHODS, "keyss:published"}
+    assert len(comparing.EVERY) == len(set(comparing.EVERY))

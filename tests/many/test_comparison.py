@@ -1,0 +1,137 @@
+"""What a comparison's tables say, of made-up records, and what they keep to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from keyss.cli.tables import parts_within
+from keyss.many import ComparedMethod, Comparison, comparison, sheet
+
+ROW = ComparedMethod(
+    name="a|b",
+    numbers={
+        "cover.psnr": 25.4,
+        "cover.ssim": 0.836,
+        "pictures.cover.lpips": 0.15,
+        "secrets.1.psnr": 25.4,
+        "secrets.1.ssim": 0.836,
+        **{f"pictures.{role}.seconds": 0.0123 for role in ("cover", "secret")},
+        **{f"pictures.{role}.ratio": 1.04 for role in ("cover", "secret")},
+        "secrecy.classifier": 0.97,
+        "secrecy.classifier_plain": 0.67,
+        "secrecy.stealth": 0.0,
+        "secrecy.stealth_plain": 0.42,
+        "secrecy.stegexpose": 0.19,
+        "secrecy.stegexpose_plain": 0.45,
+        "survival.pruned.cover": 2.53,
+        "survival.pruned.secret": 0.04,
+        "survival..spz.cover": -0.26,
+        "files.readers": 3,
+        "files.readers that load": 3,
+        "files.published": 4_900_000,
+        "files.handed": 0,
+        "seconds": 13.6,
+        "steps.1": 2000,
+    },
+    notes={"survival.purified": "no tool"},
+)
+
+
+def cells(*rows: ComparedMethod) -> list[dict[str, str]]:
+    """By head, the scenes' PSNRs under theirs."""
+    found: list[dict[str, str]] = [{} for _ in rows]
+    for table in comparison.comparison_tables(Comparison(arguments={}, methods=rows)).values():
+        for own, row in zip(found, table[1:], strict=True):
+            own.update(zip(table[0], row, strict=True))
+    return found
+
+
+def test_every_figure_stands_beside_that_of_a_plain_model() -> None:
+    (found,) = cells(ROW)
+    assert found["classifier"] == "0.97 (0.67)"
+    assert found["p"] == "<1e-16 (0.4)"
+    assert found["StegExpose"] == "0.19 (0.45)"
+    assert found["picture, ms"] == "12 (1.0x), 12 (1.0x)"
+    assert found["steps"] == "2,000, unknown"
+    assert (found["published"], found["handed over"]) == ("4.90 MB", "nothing")
+
+
+def test_what_does_not_open_is_lost_and_what_was_not_tried_is_not_said_to_be() -> None:
+    (found,) = cells(ROW)
+    assert found["pruned"] == "-2.5, +0.0"
+    assert found[".spz"] == "+0.3, lost"
+    assert found["purified"] == "not tried"
+    assert comparison.not_measured(Comparison(arguments={}, methods=(ROW,))) == [
+        "not tried (a|b): purified: no tool"
+    ]
+
+
+def test_a_standard_file_is_what_readers_read_not_what_a_method_says() -> None:
+    rows = [
+        replace(ROW, numbers=ROW.numbers | {"files.readers": tried, "files.readers that load": load})
+        for tried, load in ((3, 3), (3, 2), (1, 1), (0, 0))
+    ]
+    assert [each["standard .ply"] for each in cells(*rows)] == [
+        "yes, 3 of 3 readers",
+        "no, 2 of 3 readers",
+        "yes, 1 of 1 readers",
+        "not tried",
+    ]
+
+
+def test_wrong_keys() -> None:
+    names = ("wrong_key.vs_cover.mean", "wrong_key.vs_secrets.1.max", "chance_level.1")
+    shown = dict(zip(names, (25.31, 9.87, 9.5), strict=True))
+    rows = (replace(ROW, numbers=ROW.numbers | shown), ROW, replace(ROW, keys=False))
+    assert [each["wrong keys"] for each in cells(*rows)] == ["25.3, 9.9 (9.5)", "open nothing", "no keys"]
+
+
+def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> None:
+    none = ComparedMethod(name="c", error="no room")
+    whole = Comparison(arguments={}, methods=(ROW, none))
+    assert comparison.impossible(whole) == ["c: not possible: no room"]
+    text = comparison.comparison_text(whole)
+    for part in text.split("## ")[1:]:
+        lines = [line for line in part.splitlines() if line.startswith("|")]
+        assert len(lines) == 3  # heads, rule, the one that was possible
+        assert len({line.count("|") for line in lines}) == 1
+    assert "- c: not possible: no room" in text
+    assert "## Fidelity" in comparison.comparison_text(
+        Comparison(arguments={})
+    )  # also where nothing was possible
+
+
+def test_what_just_fits_is_one_part() -> None:
+    rows = [["a", "bbb", ""], ["aa", "b", "ccc"]]  # "aa  bbb  ccc"
+    assert parts_within(12, rows) == [[0, 1, 2]]
+    assert parts_within(11, rows) == [[0, 1], [0, 2]]
+    assert parts_within(3, rows) == [[0, 1], [0, 2]]  # no narrower than that
+
+
+@given(
+    st.integers(1, 200),
+    st.lists(st.lists(st.integers(0, 60), min_size=9, max_size=9), min_size=1, max_size=4),
+    st.integers(1, 9),
+)
+def test_parts_hold_all_columns_in_order_and_no_more_than_fit(
+    width: int, lengths: list[list[int]], columns: int
+) -> None:
+    rows = [["x" * length for length in row[:columns]] for row in lengths]
+    parts = parts_within(width, rows)
+    assert all(part[0] == 0 for part in parts)
+    assert [index for part in parts for index in part[1:]] == list(range(1, columns))
+    for part in parts:
+        line = "  ".join(max((row[index] for row in rows), key=len) for index in part)
+        assert len(line) <= width or len(part) <= 2
+
+
+def test_no_heading_of_the_picture_is_cut() -> None:
+    """However narrow the pictures are."""
+    narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
+    picture = sheet._drawn([("photos", narrow)])
+    right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
+    assert (right == 255).all()

@@ -1,0 +1,104 @@
+"""Scenes out of archives, from a server on this machine."""
+
+from __future__ import annotations
+
+import io
+import sys
+import threading
+import zipfile
+from collections.abc import Callable, Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from cli.conftest import keyss as keyss
+from cli.said import Said
+from files.scene_files import WIDTH, photo, save, write_colmap
+from keyss.core import BackendError, InputError
+from keyss.many.paper import scenes
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder that is served, with an archive of two scenes with photos of two sizes."""
+    pytest.importorskip("pooch", reason="pooch is not installed")
+    served = tmp_path / "served"
+    served.mkdir()
+    with zipfile.ZipFile(served / "scenes.zip", "w") as archive:
+        for name in ("garden", "stump"):
+            folder = write_colmap(tmp_path / "originals" / name, count=9)
+            for path in (folder / "images").iterdir():
+                save(folder / "images_4" / path.name, photo(0, size=(WIDTH // 4, 2)))
+            for path in folder.rglob("*"):
+                archive.write(path, Path("some", path.relative_to(tmp_path / "originals")))
+        archive.writestr("some/garden/images_4/../../../../evil", "evil")
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=served)) as found:
+        threading.Thread(target=found.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{found.server_address[1]}/scenes.zip"
+        monkeypatch.setattr(scenes, "SOURCES", {url: ("some/garden", "some/stump")})
+        yield served
+        found.shutdown()
+
+
+def test_every_scene_of_the_paper_has_one_source() -> None:
+    every = [folder.rpartition("/")[2] for folders in scenes.SOURCES.values() for folder in folders]
+    assert sorted(every) == sorted(scenes.BENCHMARK)
+    assert all(url.startswith("https://") for url in scenes.SOURCES)
+
+
+def test_only_what_is_needed_is_unpacked(server: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    scenes.download(["garden"], data)
+    assert {path.name for path in data.iterdir()} == {"archives", "garden"}
+    assert {path.name for path in (data / "garden").iterdir()} == {"images_4", "sparse"}
+    for path in (data / "garden").rglob("*.*"):
+        original = tmp_path / "originals" / path.relative_to(data)
+        assert path.read_bytes() == original.read_bytes()
+    (server / "scenes.zip").unlink()
+    scenes.download(["garden", "stump"], data)  # the other one, from the archive that is there
+    assert (data / "stump" / "images_4").is_dir()
+    scenes.download(["garden", "stump"], data)  # nothing is missing
+    assert not list(tmp_path.rglob("evil"))
+
+
+def test_what_cannot_be_fetched_or_unpacked_is_said(server: Path, tmp_path: Path) -> None:
+    archive = (server / "scenes.zip").read_bytes()
+    (server / "scenes.zip").unlink()
+    with pytest.raises(InputError, match="404"):
+        scenes.download(["garden"], tmp_path / "data")
+    for damaged in (archive[:-100], b"<html>not found</html>"):
+        (server / "scenes.zip").write_bytes(damaged)
+        with pytest.raises(InputError, match="remove it to fetch it again"):
+            scenes.download(["garden"], tmp_path / "data")
+        (tmp_path / "data" / "archives" / "scenes.zip").unlink()
+    other = io.BytesIO()
+    with zipfile.ZipFile(other, "w") as file:
+        file.writestr("flowers.txt", "elsewhere")
+    (server / "scenes.zip").write_bytes(other.getvalue())
+    with pytest.raises(InputError, match="cannot be fetched or unpacked"):
+        scenes.download(["garden"], tmp_path / "data")
+    assert not (tmp_path / "data" / "garden").exists()
+
+
+def test_without_pooch_one_sentence_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pooch", None)
+    with pytest.raises(BackendError, match=r"pip install 'keyss\[reproduce\]'"):
+        scenes.download(["garden"], tmp_path)
+
+
+def test_the_command_says_what_cannot_be(keyss: Callable[..., Said], tmp_path: Path) -> None:
+    full = ("reproduce", "single", "--data", tmp_path / "data", "-o", tmp_path / "out")
+    both = keyss(*full, "--download", "--dry-run")
+    assert (both.status, "--download" in both.err) == (2, True)
+    without = keyss("reproduce", "single", "a", "b", "--download", "-o", tmp_path / "out")
+    assert (without.status, "--data" in without.err) == (2, True)
+    assert not (tmp_path / "data").exists()

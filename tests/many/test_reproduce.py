@@ -1,0 +1,144 @@
+"""A table from photos to claims, at a size where it takes seconds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from cli.conftest import keyss as keyss
+from cli.said import Said, listing
+from keyss import Gaussians, read_model, reproduce
+from keyss.core import InputError
+from keyss.many import Forecast, Reproduction, measures, performing, reproducing
+from keyss.measure import opacity_pruning, random_pruning
+from test_api import write_nerfstudio
+from tiny_scenes import random_gaussians, tiny_scene
+
+SIZES = {"iterations": 20, "max_gaussians": 150}
+FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--most", 1, "--seed", 5)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    root = tmp_path_factory.mktemp("scenes")
+    return [write_nerfstudio(root / name, tiny_scene(index)) for index, name in enumerate("ab")]
+
+
+@pytest.fixture(scope="module")
+def out(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the table "pruning", which others use the run of."""
+    folder = tmp_path_factory.mktemp("tables") / "paper"
+    with pytest.warns(UserWarning, match="too small to carry"):
+        run("pruning", folders, folder)
+    return folder
+
+
+def run(table: str, folders: list[Path], out: Path, **options: Any) -> Reproduction:
+    found = reproduce(table, folders, most=1, seed=5, out=out, **SIZES, **options)
+    assert isinstance(found, Reproduction)
+    return found
+
+
+def test_a_table_lies_beside_the_papers(out: Path) -> None:
+    found = json.loads((out / "pruning.json").read_text())
+    assert found["pairs"] == ["a-b"]
+    (row,) = found["rows"]
+    here = row["here"]
+    (place,) = out.glob("cells/*/run/publish")
+    metrics = json.loads((place.parent / "private" / "metrics.json").read_text())
+    assert here["whole, cover"] == pytest.approx(metrics["cover"]["psnr"], abs=0.05)
+    assert here["whole, secret"] == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.05)
+    assert None not in here.values()
+    assert metrics["iterations"] == 20
+    assert metrics["steps"] == [20, 20]  # as many as plain 3DGS
+    assert metrics["baseline"]["equal"] == [True, True]
+    assert {each["verdict"] for each in found["claims"]} <= {"holds", "holds in part", "does not hold here"}
+    assert "| whole, cover | 25.98 |" in (out / "pruning.md").read_text()
+
+
+def test_what_is_done_is_not_done_again(
+    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = listing(out / "cells")
+
+    def refused(*arguments: object, **more: object) -> None:
+        raise AssertionError("nothing is to be run")
+
+    monkeypatch.setattr(performing, "hide", refused)
+    monkeypatch.setattr(performing, "fit", refused)
+    assert not run("pruning", folders, out).failures
+    assert listing(out / "cells") == before
+    found = reproduce("pruning", folders, most=1, seed=5, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+    assert isinstance(found, Forecast)
+    assert all(each.done for each in found.cells)
+    monkeypatch.undo()
+    with pytest.warns(UserWarning, match="too small to carry"):
+        other = reproduce("pruning", folders, most=1, seed=6, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+    assert isinstance(other, Forecast)
+    assert not any(each.done for each in other.cells)
+
+
+def test_a_run_that_fails_is_said_and_the_others_go_on(
+    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch, keyss: Callable[..., Said]
+) -> None:
+    def failing(*arguments: object, **more: object) -> None:
+        raise InputError("not today")
+
+    monkeypatch.setattr(performing, "hide", failing)
+    found = run("speed", folders, out)
+    assert found.failures == {f"{name}, a-b": "not today" for name in ("3dgs", "gs-hider", "watergs")}
+    verdicts = [each.verdict for each in found.claims]
+    assert verdicts[0] in ("holds", "holds in part", "does not hold here")  # from the first run
+    assert verdicts[1] == "not measured"
+    said = keyss("reproduce", "speed", *folders, *FLAGS, "-o", out)
+    assert (said.status, said.err.splitlines()[-1]) == (4, "keyss: error: 3 run(s) failed")
+    assert "not today" in said.out
+
+
+def test_the_command(keyss: Callable[..., Said], out: Path, folders: list[Path], tmp_path: Path) -> None:
+    said = keyss("reproduce", "pruning", *folders, *FLAGS, "-o", out)
+    assert said.status == 0, said.err
+    assert "25% random, secret" in said.out
+    assert "Random loss of a quarter" in said.out
+    planned = keyss("reproduce", "sinkhorn", *folders, *FLAGS, "--dry-run", "-o", tmp_path / "new")
+    assert planned.status == 0, planned.err
+    assert not (tmp_path / "new").exists()
+    assert [line.split()[1].strip(",") for line in planned.out.splitlines()[1:6]] == [
+        *("plain", "plain", "keyss-op", "keyss-op-ro", "keyss"),
+    ]
+    assert "5 to do" in planned.out
+    assert keyss("reproduce", "single", folders[0], "-o", tmp_path / "new").status == 2
+    said = keyss("reproduce", "single", *folders, "--width", 0, "-o", tmp_path / "new")
+    assert (said.status, "--width" in said.err) == (2, True), said
+    full = keyss("reproduce", "multi", "--data", tmp_path, "-o", tmp_path / "new")
+    assert (full.status, "Mip-NeRF 360" in full.err) == (4, True)
+
+
+def test_the_papers_scenes_have_its_sizes_and_pairs(
+    folders: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(reproducing, "link", lambda data, name, folder: folders[name < "c"])
+    found = reproduce("multi", data=tmp_path, most=2, out=tmp_path / "out", dry_run=True)
+    assert isinstance(found, Forecast)
+    assert {each.name.partition(", ")[2] for each in found.cells} >= {"bicycle-bonsai-room"}
+    assert {each.plan.stages[0].steps for each in found.cells if each.plan} == {30_000}
+    assert max(each.plan.gaussians for each in found.cells if each.plan) == 500_000
+
+
+def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
+    (place,) = out.glob("cells/*/run/publish/stego.ply")
+    stego = read_model(place)
+    own = measures.own_gaussians(stego)
+    assert 0 < len(own) <= 150 < len(stego)
+    for change in (random_pruning(0.25), opacity_pruning(0.25)):
+        left = measures.sparing(change)(stego)
+        assert len(measures.own_gaussians(left)) == len(change(own))
+        assert len(left) - len(measures.own_gaussians(left)) == len(stego) - len(own)
+        assert torch.equal(measures.own_gaussians(left).means, change(own).means)
+    plain: Gaussians = random_gaussians(100)
+    assert torch.equal(measures.own_gaussians(plain).means, plain.means)

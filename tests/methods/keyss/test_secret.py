@@ -1,0 +1,196 @@
+"""A secret's bytes, damage that ends in InputError, and models that were rounded or pruned."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from channels.low_bits.trained_like import trained_like
+from keyss.channels import Payload
+from keyss.core import InputError
+from keyss.core.similarity import Similarity
+from keyss.keys import random_embeddings
+from keyss.methods import Decoder, DecoderShape, HiddenSecret, choose_anchors
+from keyss.methods.keyss import secret as secret_module
+from methods.keyss.hiding import some_secret
+from tiny_scenes import random_gaussians
+
+FRAME = Similarity(2.0, torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+
+
+def _secret() -> HiddenSecret:
+    torch.manual_seed(0)
+    stego = random_gaussians()
+    decoder = Decoder(DecoderShape(mask=("op", "ro", "sc", "xyz"), hidden=(16, 16), branch=8))
+    decoder.prepare(stego, random_embeddings(1, torch.Generator().manual_seed(0))[0])
+    return HiddenSecret(decoder, FRAME, choose_anchors(stego, torch.Generator().manual_seed(0)))
+
+
+def _unpacked(data: bytes) -> HiddenSecret:
+    return HiddenSecret.of(Payload("keyss", data))
+
+
+PACKED = _secret().payload().data
+FRAME_JSON = {
+    "scale": FRAME.scale,
+    "rotation": FRAME.rotation.tolist(),
+    "translation": FRAME.translation.tolist(),
+}
+SHAPE = asdict(_secret().decoder.shape)
+
+
+def _with_header(**changes: object) -> bytes:
+    """The same with another JSON header, keeping the tensors."""
+    (size,) = struct.unpack("<Q", PACKED[:8])
+    outer = json.loads(PACKED[8 : 8 + size])
+    inner = json.loads(outer["__metadata__"]["keyss"])
+    inner.update(changes)
+    outer["__metadata__"]["keyss"] = json.dumps(inner)
+    header = json.dumps(outer).encode()
+    header += b" " * (-len(header) % 8)
+    return struct.pack("<Q", len(header)) + header + PACKED[8 + size :]
+
+
+def test_round_trip_in_half_precision_and_the_same_bytes_again() -> None:
+    secret, opened = _secret(), _unpacked(PACKED)
+    assert opened.decoder.shape == secret.decoder.shape
+    assert torch.equal(opened.embedding, secret.embedding)
+    assert opened.frame.scale == FRAME.scale
+    assert torch.equal(opened.frame.rotation, FRAME.rotation)
+    assert torch.equal(opened.frame.translation, FRAME.translation)
+    assert torch.equal(opened.anchors, secret.anchors)
+    for name, value in secret.decoder.state_dict().items():
+        exact = opened.decoder.state_dict()[name]
+        halved = name in dict(secret.decoder.named_parameters())
+        assert torch.equal(exact, value.half().float() if halved else value), name
+    assert opened.payload().data == PACKED
+
+
+def test_a_large_decoder_takes_the_gaussians_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its sizes are the file's: without that 3 kB could ask for 34 kB for each Gaussian at once."""
+    secret, stego = _secret(), random_gaussians()
+    with torch.no_grad():
+        for parameter in secret.decoder.parameters():
+            parameter.normal_(std=0.1)
+    at_once = secret.decode(stego, secret.embedding)
+    sizes: list[int] = []
+    secret.decoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
+    monkeypatch.setattr(secret_module, "_DECODED_NUMBERS", 7 * secret.decoder.shape.numbers)
+    with torch.no_grad():
+        in_parts = secret.decode(stego, secret.embedding)
+    assert max(sizes) == 7
+    assert sum(sizes) == len(stego)
+    for name, values in vars(at_once).items():
+        torch.testing.assert_close(getattr(in_parts, name), values.detach())
+
+
+def test_another_version_is_refused_by_number() -> None:
+    with pytest.raises(InputError, match=r"version 1.*version 8"):
+        _unpacked(_with_header(version=1))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format": "other"},
+        {"shape": None},
+        {"shape": {"mask": ["op"]}},
+        {"shape": SHAPE | {"hidden": [10**9, 16]}},
+        {"shape": SHAPE | {"hidden": [16]}},
+        {"shape": SHAPE | {"branch": 8.0}},
+        {"shape": SHAPE | {"conditioning": "eval"}},
+        {"shape": SHAPE | {"mask": ["op"]}},  # fewer branches than there are weights for
+        {"shape": SHAPE | {"extra": 1}},
+        {"shape": SHAPE | {"mask": ["xyz", "op"]}},
+        {"count": -1},
+        {"count": 2**40},
+        {"unknown": 1},
+        {"frame": 3},
+        {"frame": {"scale": 1.0}},
+        *(
+            {"frame": FRAME_JSON | change}
+            for change in (
+                {"scale": -1.0},
+                {"scale": True},
+                {"scale": "1"},
+                {"scale": 10**400},
+                {"translation": [0.0, 0.0]},
+                {"translation": [0.0, None, 0.0]},
+                {"rotation": [[1, 0, 0], [0, 1, 0]]},
+                {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
+                {"unknown": 1},
+            )
+        ),
+    ],
+)
+def test_hostile_headers_are_input_errors(changes: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        _unpacked(_with_header(**changes))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, len(PACKED) - 1), st.integers(0, 7), st.integers(0, len(PACKED)))
+def test_truncated_and_mutated_bytes_are_input_errors_or_secrets(at: int, bit: int, size: int) -> None:
+    broken = bytearray(PACKED)
+    broken[at] ^= 1 << bit
+    for data in (bytes(broken), PACKED[:size], bytes(broken[:size])):
+        with contextlib.suppress(InputError):
+            _unpacked(data)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=300))
+def test_any_bytes_are_input_errors(data: bytes) -> None:
+    with pytest.raises(InputError):
+        _unpacked(data)
+
+
+def test_weights_that_are_not_finite_are_refused() -> None:
+    secret = _secret()
+    secret.decoder.network.first.bias.data[0] = float("nan")
+    with pytest.raises(InputError, match="finite"):
+        HiddenSecret.of(secret.payload())
+
+
+def test_anchors_survive_order_and_pruning_but_not_another_model() -> None:
+    secret, stego = _secret(), random_gaussians()
+    secret.check_unchanged(stego)
+    secret.check_unchanged(stego[torch.randperm(len(stego))[: len(stego) // 2]])
+    with pytest.raises(InputError, match="moved or rounded"):
+        secret.check_unchanged(random_gaussians(seed=1))
+    with pytest.raises(InputError, match="moved or rounded"):
+        secret.check_unchanged(replace(stego, means=stego.means * 1.001))
+
+
+def test_positions_that_were_rounded_need_force() -> None:
+    stego = trained_like(200)
+    secret = some_secret(stego)
+    rounded = replace(stego, means=(stego.means * 500).round() / 500)
+    with pytest.raises(InputError, match="`force=True`"):
+        secret.reveal(rounded)
+    assert len(secret.reveal(rounded, force=True)) == 200
+
+
+def test_what_is_left_makes_up_for_what_was_lost() -> None:
+    stego = trained_like(200)
+    secret = some_secret(stego)
+    secret = HiddenSecret.of(replace(secret, count=200).payload())
+    left = secret.reveal(stego[:150])
+    alone = replace(secret, count=0).reveal(stego[:150])
+    assert (left.opacities > alone.opacities).all()
+    assert (left.log_scales > alone.log_scales).all()
+    assert torch.equal(secret.reveal(stego).sh, replace(secret, count=0).reveal(stego).sh)
+
+
+@pytest.mark.parametrize("count", [-1, 2**40, 1.5, True, None])
+def test_a_count_out_of_bounds_is_refused(count: object) -> None:
+    secret = some_secret(trained_like(100))
+    with pytest.raises(InputError, match="count"):
+        HiddenSecret.of(replace(secret, count=count).payload())  # type: ignore[arg-type]

@@ -1,0 +1,71 @@
+/** A secret of the method keyss, whose key opens a decoder; `keyss.methods.keyss.secret` in Python. */
+import { damaged, InputError, otherVersion } from '../core/errors.ts';
+import { type Gaussians, opacity, selected } from '../core/gaussians.ts';
+import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
+import { ascii } from '../core/bytes.ts';
+import { compensated } from '../records/compensation.ts';
+import { Decoder } from './decoder.ts';
+import { numbersOf, objectOf, parsed, readTensors } from './safetensors.ts';
+
+const [FORMAT, VERSION] = ['keyss-secret', 8];
+const [MOST_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
+const MOST_COUNT = 2 ** 31;
+const DRAWN_OPACITY = Math.fround(1 / 255);
+const APPENDED_OPACITY = 1.1 / 255;
+const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
+
+/** What the payload reveals of a model, and how many Gaussians there were. Raises InputError. */
+export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians: Gaussians; hidden: number } {
+  const read = readTensors(payload);
+  const header = objectOf(parsed(ascii(String(read.metadata.keyss))));
+  if (header.format !== FORMAT) throw damaged();
+  if (header.version !== VERSION) throw otherVersion();
+  const count = header.count as number;
+  if (!Number.isInteger(count) || count < 0 || count > MOST_COUNT) throw damaged();
+  const frame = frameOf(objectOf(header.frame));
+  checkAnchors(read.tensors.get('anchors'), stego);
+  const own = rowsWhere(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
+  const decoded = Decoder.of(header.shape, read).decode(own);
+  const drawn = rowsWhere(decoded, (row) => Math.fround(opacity(decoded.opacityLogits[row])) >= DRAWN_OPACITY);
+  const left = drawn.count ? compensated(drawn, count) : decoded;
+  return { gaussians: moved(inverse(frame), left), hidden: count };
+}
+
+function frameOf(described: Record<string, unknown>): Similarity {
+  const rows = described.rotation;
+  if (!Array.isArray(rows) || rows.length !== 3) throw damaged();
+  const [scale] = numbersOf([described.scale], 1);
+  const rotation = rows.flatMap((row) => numbersOf(row, 3));
+  const found = { scale, rotation, translation: numbersOf(described.translation, 3) };
+  if (!isSimilarity(found)) throw damaged();
+  return found;
+}
+
+/** Raises InputError unless enough of some positions are there: what was moved or rounded no decoder fits. */
+function checkAnchors(anchors: { shape: readonly number[]; values: Float32Array } | undefined, stego: Gaussians): void {
+  const [count, axes] = anchors?.shape ?? [];
+  if (!anchors || anchors.shape.length !== 2 || axes !== 3 || count < 1 || count > MOST_ANCHORS) throw damaged();
+  const { means } = stego;
+  const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+  means.forEach((each, at) => {
+    low[at % 3] = Math.min(low[at % 3], each);
+    high[at % 3] = Math.max(high[at % 3], each);
+  });
+  const tolerance = (ANCHOR_TOLERANCE * Math.max(...high.map((each, axis) => each - low[axis]))) ** 2;
+  let found = 0;
+  for (let anchor = 0; anchor < count; anchor++) {
+    const [x, y, z] = anchors.values.subarray(3 * anchor, 3 * anchor + 3);
+    for (let at = 0; at < means.length; at += 3) {
+      if ((means[at] - x) ** 2 + (means[at + 1] - y) ** 2 + (means[at + 2] - z) ** 2 <= tolerance) {
+        found++;
+        break;
+      }
+    }
+  }
+  if (found < ANCHORS_NEEDED * count) throw new InputError('The model was moved or rounded since its secret was trained.');
+}
+
+function rowsWhere(model: Gaussians, keep: (row: number) => boolean): Gaussians {
+  const rows = Array.from({ length: model.count }, (_, row) => row).filter(keep);
+  return rows.length === model.count ? model : selected(model, rows);
+}

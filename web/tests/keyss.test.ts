@@ -1,0 +1,57 @@
+import { expect, test } from 'vitest';
+import { inverse, moved } from '../src/core/similarity.ts';
+import { decodeKeyss } from '../src/keyss/secret.ts';
+import { hex, jsonVector, modelOf } from './vectors.ts';
+
+interface Revealed {
+  file: string;
+  payload: string;
+  count: number;
+  rows: Record<string, number[]>; // every 99th
+}
+
+const KEYSS = jsonVector<Revealed[]>('keyss.json');
+const STRIDE = 99;
+
+test.each(KEYSS)('a decoder makes of $file what Python makes of it, $count Gaussians, to 1e-5', async (expected) => {
+  const { gaussians } = decodeKeyss(hex(expected.payload), await modelOf(expected.file));
+  expect(gaussians.count).toBe(expected.count);
+  const { means, quats, logScales, opacityLogits, sh } = gaussians;
+  const columns = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
+  for (const [name, values] of Object.entries(columns)) {
+    const width = values.length / gaussians.count;
+    const found = [...values].filter((_, at) => Math.floor(at / width) % STRIDE === 0);
+    expect(found.length).toBe(expected.rows[name].length);
+    const worst = expected.rows[name].map((each, at) => Math.abs(found[at] - each) / Math.max(1, Math.abs(each)));
+    expect([name, Math.max(...worst) < 1e-5]).toEqual([name, true]);
+  }
+});
+
+test('a model that was rounded is refused, and so is damage', async () => {
+  const { file, payload } = KEYSS[0];
+  const model = await modelOf(file);
+  const rounded = { ...model, means: model.means.map((each) => Math.round(each * 1000) / 1000) };
+  expect(() => decodeKeyss(hex(payload), rounded)).toThrow(/^The model was moved or rounded/);
+  for (let at = 0; at < payload.length / 2; at += 29) {
+    for (const bytes of [hex(payload).slice(0, at), hex(payload)]) {
+      if (bytes.length > at) bytes[at] ^= 1 << at % 8;
+      try {
+        expect(decodeKeyss(bytes, model).gaussians.means.every(Number.isFinite)).toBe(true);
+      } catch (error) {
+        expect((error as Error).message).toMatch(/^(This file|What this key opens|The model was).*\.$/);
+      }
+    }
+  }
+});
+
+test('what is moved and moved back is as it was', async () => {
+  const model = await modelOf('carried.ply');
+  const turn = [0, -0.6, 0.8, 1, 0, 0, 0, 0.8, 0.6];
+  const similarity = { scale: 2.5, rotation: turn, translation: [3, -4, 0.1] };
+  const back = moved(inverse(similarity), moved(similarity, model));
+  for (const column of ['means', 'logScales', 'sh'] as const) {
+    back[column].forEach((each, at) => {
+      if (Math.abs(each - model[column][at]) > 1e-5) throw new Error(`${column} ${at}`);
+    });
+  }
+});
