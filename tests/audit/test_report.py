@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from markupsafe import Markup
 
 from audit.audited import found_in, run_with, with_all_texts
 from audit.pages import Parsed
-from keyss.audits import audit, figures
-from keyss.audits import page as page_module
+from keyss.audits import audit, figures, page as page_module
 from keyss.core import InputError, OutputError
 from keyss.files.layout import usual_up
 from keyss.viewer.page import embedding_rules, page_with

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _eval_sh_bases_fast
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 

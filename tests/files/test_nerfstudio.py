@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from files.scene_files import frames, mutations, photo, save, write_json, write_nerfstudio
 from keyss.core import InputError

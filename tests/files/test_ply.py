@@ -12,8 +12,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from keyss.core import Gaussians, InputError, OutputError
 from keyss.files.ply import read_ply, write_ply

@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from keyss.fitting import Target, photometric_loss, ssim
 from keyss.fitting.losses import ssim_torch

@@ -6,10 +6,7 @@ import hashlib
 
 import pytest
 import reedsolo
-from argon2.low_level import Type, hash_secret_raw
-from argon2.low_level import core as argon2_core
-from argon2.low_level import ffi as argon2_ffi
-from argon2.low_level import lib as argon2_lib
+from argon2.low_level import Type, core as argon2_core, ffi as argon2_ffi, hash_secret_raw, lib as argon2_lib
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from keyss.cli.tables import parts_within
 from keyss.many import ComparedMethod, Comparison, comparison, sheet

@@ -16,8 +16,16 @@ from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
 from keyss.files import write_model
 from keyss.files.ply import write_ply
-from keyss.measure import FileSize, ReaderResult, Reopened, Reopener, measure_speed, readers, render_time
-from keyss.measure import speed as module
+from keyss.measure import (
+    FileSize,
+    ReaderResult,
+    Reopened,
+    Reopener,
+    measure_speed,
+    readers,
+    render_time,
+    speed as module,
+)
 from keyss.measure.speed import reveal_seconds
 from keyss.methods import open_model
 from keyss.methods.base import Opened

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from keyss.rendering import rasterization
-from keyss.rendering.cpu import memory
-from keyss.rendering.cpu import rasterization as cpu_rasterization
+from keyss.rendering.cpu import memory, rasterization as cpu_rasterization
 from rendering.scenes import DIFFERENTIABLE, random_scene
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "colors")

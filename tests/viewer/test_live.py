@@ -15,8 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 import torch
 
-from cli.said import PROGRAM as KEYSS
-from cli.said import SMALL
+from cli.said import PROGRAM as KEYSS, SMALL
 from files.scene_files import write_nerfstudio
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import model_of_bytes

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from keyss._torchrun import processes
 from keyss.core.errors import UsageError, WrongKeyError
-from keyss.keys.key_file import read_key_file
-from keyss.keys.key_file import write_new_key as write_new_key
+from keyss.keys.key_file import read_key_file, write_new_key as write_new_key
 
 VARIABLE = "KEYSS_KEY"
 

@@ -119,8 +119,7 @@ def steganalyze(
     from keyss.cli.tables import print_steganalysis
     from keyss.files.atomic import write_bytes
     from keyss.files.output import check_output_file
-    from keyss.measure.stegexpose import csv_bytes
-    from keyss.measure.stegexpose import steganalyze as analyze
+    from keyss.measure.stegexpose import csv_bytes, steganalyze as analyze
     from keyss.progress import reporter
 
     check_output_file(csv, overwrite)

@@ -11,8 +11,7 @@ from keyss.core import UsageError
 from keyss.rendering import cuda
 from keyss.rendering.arguments import RasterizeMode, RenderMode, check_arguments
 from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
-from keyss.rendering.cpu.rasterization import Settings
-from keyss.rendering.cpu.rasterization import rasterize as rasterize_on_cpu
+from keyss.rendering.cpu.rasterization import Settings, rasterize as rasterize_on_cpu
 
 
 def rasterization(

@@ -10,8 +10,7 @@ import torch
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.reading import read_file
-from keyss.methods import handed as handing
-from keyss.methods import registry
+from keyss.methods import handed as handing, registry
 from keyss.methods.hidden_file import HiddenFile, OpensAFileError
 from keyss.methods.opened import Frame, Opened, Remains
 from keyss.runs.sources import PathLike

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from channels.codes.published import FORMATS, codes_of, model_of, opened, there_and_back, written
 from keyss.channels import METHOD_BYTES, CodesCover, CodesReader, Payload

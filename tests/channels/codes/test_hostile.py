@@ -6,8 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from channels.codes.published import FORMATS, codes_of, opened, written
 from files.formats.examples import random_compressed, random_sog, random_spz

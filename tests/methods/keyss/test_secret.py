@@ -9,8 +9,7 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from channels.low_bits.trained_like import trained_like
 from keyss.channels import Payload

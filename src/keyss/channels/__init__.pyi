@@ -1,0 +1,35 @@
+from .appended.channel import APPENDED as APPENDED, AppendedReader as AppendedReader
+from .appended.lattice import is_appended as is_appended
+from .base import (
+    METHOD_BYTES as METHOD_BYTES,
+    Channel as Channel,
+    Content as Content,
+    Payload as Payload,
+    PreparedCover as PreparedCover,
+    RecordPlan as RecordPlan,
+    RecordRequest as RecordRequest,
+    Records as Records,
+    Room as Room,
+    pack_method as pack_method,
+    unpack_method as unpack_method,
+)
+from .codes.channel import CodesChannel as CodesChannel, CodesCover as CodesCover, CodesReader as CodesReader
+from .colours.channel import Colours as Colours, ColoursCover as ColoursCover
+from .low_bits.bits import identities as identities, read_low_bits as read_low_bits
+from .low_bits.channel import LOW_BITS as LOW_BITS, LowBitsCover as LowBitsCover
+from .low_bits.reading import LowBitsReader as LowBitsReader
+from .low_bits.spread import TYPICAL_SHARE as TYPICAL_SHARE, check_payload_fits as check_payload_fits
+from .low_bits.usable import (
+    chance_of_bits as chance_of_bits,
+    is_uniform as is_uniform,
+    usable_carriers as usable_carriers,
+)
+from .opening import open_content as open_content, quick_attempt as quick_attempt
+from .publishing import (
+    STRENGTH as STRENGTH,
+    SUFFIXES as SUFFIXES,
+    AnyChannel as AnyChannel,
+    Publish as Publish,
+    channel_for as channel_for,
+    suffix_of as suffix_of,
+)

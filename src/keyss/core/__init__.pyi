@@ -1,0 +1,32 @@
+from .alignment import align as align, up_direction as up_direction
+from .decoded import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
+from .errors import (
+    BackendError as BackendError,
+    InputError as InputError,
+    Interrupted as Interrupted,
+    KeyssError as KeyssError,
+    KeyssWarning as KeyssWarning,
+    OtherProcessError as OtherProcessError,
+    OutputError as OutputError,
+    QualityError as QualityError,
+    UsageError as UsageError,
+    WrongKeyError as WrongKeyError,
+    signal_of as signal_of,
+)
+from .extras import import_extra as import_extra
+from .gaussians import (
+    DRAWN_OPACITY as DRAWN_OPACITY,
+    SH_C0 as SH_C0,
+    Gaussians as Gaussians,
+    same_bits as same_bits,
+)
+from .pruning_compensation import compensate_pruning as compensate_pruning
+from .scene import (
+    Camera as Camera,
+    Scene as Scene,
+    View as View,
+    ViewOptions as ViewOptions,
+    camera_positions as camera_positions,
+    focus_point as focus_point,
+)
+from .similarity import Similarity as Similarity

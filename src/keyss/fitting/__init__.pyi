@@ -1,0 +1,42 @@
+from .adam import RowAdam as RowAdam
+from .checkpoint import (
+    State as State,
+    load_checkpoint as load_checkpoint,
+    save_checkpoint as save_checkpoint,
+    steps_done as steps_done,
+)
+from .config import PRESETS as PRESETS, FitConfig as FitConfig
+from .density import (
+    CappedStrategy as CappedStrategy,
+    Drawn as Drawn,
+    combine_densification as combine_densification,
+    draw_views as draw_views,
+)
+from .image_metrics import (
+    ImageQuality as ImageQuality,
+    mean_psnr as mean_psnr,
+    psnr as psnr,
+    quality as quality,
+    subsample_views as subsample_views,
+)
+from .loop import Interrupted as Interrupted, TrainingRun as TrainingRun, train as train
+from .losses import Target as Target, photometric_loss as photometric_loss, ssim as ssim
+from .parameters import (
+    Optimizers as Optimizers,
+    Parameters as Parameters,
+    initial_gaussians as initial_gaussians,
+    initial_points as initial_points,
+    make_optimizers as make_optimizers,
+    to_gaussians as to_gaussians,
+    to_parameters as to_parameters,
+)
+from .plain import (
+    FitResult as FitResult,
+    PlainRun as PlainRun,
+    fit_scene as fit_scene,
+    refit_model as refit_model,
+)
+from .ranks import Ranks as Ranks, here as here, joined as joined
+from .reporting import Reporter as Reporter, SilentReporter as SilentReporter
+from .sampling import Shuffle as Shuffle, own_randomness as own_randomness
+from .side_by_side import Fit as Fit, fit_scenes as fit_scenes

@@ -1,0 +1,8 @@
+from .derivation import (
+    DerivedKey as DerivedKey,
+    KeyDerivation as KeyDerivation,
+    random_embeddings as random_embeddings,
+)
+from .generation import generate_key as generate_key, length_for as length_for
+from .master import MasterKey as MasterKey
+from .strength import key_strength_bits as key_strength_bits, weakness as weakness
