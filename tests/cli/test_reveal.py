@@ -15,6 +15,7 @@ import pytest
 
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
+from keyss import Secret, hide
 from keyss.channels import LOW_BITS, opening
 from keyss.channels.low_bits import cells, reading
 from keyss.core import Gaussians
@@ -246,8 +247,15 @@ class TestVerify:
         assert words in said.err
         assert "model.gaussians" in said.out
 
-    def test_a_secret_that_is_whole(self, keyss: Run, files: Path) -> None:
-        said = keyss("verify", files / "whole.ply", "--key-file", files / "key", "--json")
+    @pytest.mark.parametrize("where", ["file", "environment"])
+    def test_a_secret_that_is_whole(
+        self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch, where: str
+    ) -> None:
+        arguments = ["--key-file", files / "key"]
+        if where == "environment":
+            monkeypatch.setenv("KEYSS_KEY", f"{KEY}\n")
+            arguments = []
+        said = keyss("verify", files / "whole.ply", *arguments, "--json")
         assert (said.status, said.err) == (0, "")
         secret = json.loads(said.out)["secret"]
         assert (secret["found"], secret["hidden"]) == (500, 500)
@@ -259,6 +267,16 @@ class TestVerify:
             assert "pruning by opacity" in said.err
         said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
         assert_refused(said, 3, "opens nothing")
+
+
+def test_a_key_file_means_the_same_in_python(keyss: Run, files: Path, tmp_path: Path) -> None:
+    key_file, out = tmp_path / "key.txt", tmp_path / "letter.txt"
+    assert keyss("keygen", "-o", key_file).status == 0
+    letter = Secret(file=b"dear you", key=key_file.read_text())
+    hide(files / "plain.ply", [letter], out=tmp_path / "run")
+    stego = tmp_path / "run" / "publish" / "stego.ply"
+    assert keyss("reveal", stego, "--key-file", key_file, "-o", out).status == 0
+    assert out.read_text() == "dear you"
 
 
 def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given, strategies as st
 
-from keyss.cli.tables import parts_within
 from keyss.many import ComparedMethod, Comparison, comparison, sheet
 
 ROW = ComparedMethod(
@@ -64,9 +62,9 @@ def test_what_does_not_open_is_lost_and_what_was_not_tried_is_not_said_to_be() -
     assert found["pruned"] == "-2.5, +0.0"
     assert found[".spz"] == "+0.3, lost"
     assert found["purified"] == "not tried"
-    assert comparison.not_measured(Comparison(arguments={}, methods=(ROW,))) == [
+    assert comparison.comparison_notes(Comparison(arguments={}, methods=(ROW,)))[0] == (
         "not tried (a|b): purified: no tool"
-    ]
+    )
 
 
 def test_a_standard_file_is_what_readers_read_not_what_a_method_says() -> None:
@@ -92,7 +90,6 @@ def test_wrong_keys() -> None:
 def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> None:
     none = ComparedMethod(name="c", error="no room")
     whole = Comparison(arguments={}, methods=(ROW, none))
-    assert comparison.impossible(whole) == ["c: not possible: no room"]
     text = comparison.comparison_text(whole)
     for part in text.split("## ")[1:]:
         lines = [line for line in part.splitlines() if line.startswith("|")]
@@ -102,30 +99,6 @@ def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> N
     assert "## Fidelity" in comparison.comparison_text(
         Comparison(arguments={})
     )  # also where nothing was possible
-
-
-def test_what_just_fits_is_one_part() -> None:
-    rows = [["a", "bbb", ""], ["aa", "b", "ccc"]]  # "aa  bbb  ccc"
-    assert parts_within(12, rows) == [[0, 1, 2]]
-    assert parts_within(11, rows) == [[0, 1], [0, 2]]
-    assert parts_within(3, rows) == [[0, 1], [0, 2]]  # no narrower than that
-
-
-@given(
-    st.integers(1, 200),
-    st.lists(st.lists(st.integers(0, 60), min_size=9, max_size=9), min_size=1, max_size=4),
-    st.integers(1, 9),
-)
-def test_parts_hold_all_columns_in_order_and_no_more_than_fit(
-    width: int, lengths: list[list[int]], columns: int
-) -> None:
-    rows = [["x" * length for length in row[:columns]] for row in lengths]
-    parts = parts_within(width, rows)
-    assert all(part[0] == 0 for part in parts)
-    assert [index for part in parts for index in part[1:]] == list(range(1, columns))
-    for part in parts:
-        line = "  ".join(max((row[index] for row in rows), key=len) for index in part)
-        assert len(line) <= width or len(part) <= 2
 
 
 def test_no_heading_of_the_picture_is_cut() -> None:

@@ -19,6 +19,11 @@ test.each(valid)('a key becomes what it becomes in Python: $key', async (vector)
   }
 });
 
-test.each(['', 'k'.repeat(4097)])('a key of no or too many bytes is refused', async (key) => {
+test('white space around a key does not count', async () => {
+  const [{ key, salt }] = valid as [Vector];
+  expect(await master(`\uFEFF ${key}\u3000\n`, hex(salt))).toEqual(await master(key, hex(salt)));
+});
+
+test.each(['', ' \n', 'k'.repeat(4097)])('a key of no or too many bytes is refused', async (key) => {
   await expect(async () => master(key, new Uint8Array(16))).rejects.toThrow();
 });

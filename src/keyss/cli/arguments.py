@@ -22,6 +22,7 @@ def switch(help: str, name: str | None = None) -> Any:
 
 Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Device; auto uses a CUDA GPU if there is one.")]
 Seed = Annotated[int | None, optional("N", "Seed of all random numbers, to repeat a run.", "random")]
+FixedSeed = Annotated[int, arg(metavar="N", help="Seed of all random numbers.")]
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file, one for each secret.", "KEYSS_KEY or a prompt"),

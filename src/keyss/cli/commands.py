@@ -14,7 +14,7 @@ GROUPS = {
     "open": {"reveal": "opening", "verify": "opening"},
     "look": {"view": "looking", "render": "looking", "info": "looking"},
     "measure": {"evaluate": "measuring", "audit": "measuring", "steganalyze": "measuring"},
-    "many": {"compare": "comparing", "reproduce": "reproducing", "sweep": "sweeping"},
+    "many": {"compare": "many", "reproduce": "many", "sweep": "many"},
     "check": {"doctor": "doctor"},
 }
 MODULES = {name: module for group in GROUPS.values() for name, module in group.items()}

@@ -231,10 +231,10 @@ def _secrets(asked: HideArguments, method: Method) -> list[Any]:
 
 
 def _keys(asked: HideArguments, count: int) -> list[str]:
-    from keyss.cli.keys import keys, warn_of_doubtful_keys
+    from keyss.cli.keys import keys, warn_of_weak_keys
 
     found = keys(asked.key_file, count, confirm=True)
-    warn_of_doubtful_keys(found)
+    warn_of_weak_keys(found)
     return found
 
 
@@ -307,7 +307,7 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
 
 def _hide_batch(asked: HideArguments, table: Path) -> None:
     import keyss
-    from keyss.cli.keys import key_of_file, warn_of_doubtful_keys
+    from keyss.cli.keys import key_of_file, warn_of_weak_keys
     from keyss.cli.ranks import check_command
     from keyss.cli.tables import print_files, print_outcome
     from keyss.methods import registry
@@ -318,7 +318,7 @@ def _hide_batch(asked: HideArguments, table: Path) -> None:
     used += " width background skip_missing iterations max_gaussians seed"
     _refuse(asked, "--batch", used, vars(asked.own))
     if batch.master_key_file is not None:
-        warn_of_doubtful_keys([key_of_file(batch.master_key_file)])
+        warn_of_weak_keys([key_of_file(batch.master_key_file)])
     result = keyss.hide_batch(
         table,
         asked.out,

@@ -122,9 +122,10 @@ def keygen(
 
     example: keyss keygen --asset statue-7 --master-key-file master.txt -o statue-7.key
     """
-    from keyss.cli.keys import key_of_file, write_new_key
+    from keyss.cli.keys import key_of_file
     from keyss.core.errors import UsageError
     from keyss.keys import generate_key, length_for
+    from keyss.keys.key_file import write_new_key
 
     if (asset is None) != (master_key_file is None):
         raise UsageError("--asset and --master-key-file need each other: give both or neither")
@@ -153,7 +154,7 @@ def convert(
     *,
     key_file: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Key file of a secret that must survive; repeat for more."),
+        optional("FILE", "Key of a secret that must survive; repeat for more.", "KEYSS_KEY, else no key"),
     ] = (),
     force: Annotated[bool, switch("Write the model even if a secret is lost.")] = False,
     dry_run: Annotated[bool, switch("Report the cost, and write nothing.")] = False,
@@ -173,13 +174,17 @@ def convert(
     import sys
 
     import keyss
-    from keyss.cli.keys import hinting_at_white_space, key_of_file
+    from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_conversion
     from keyss.files.streams import is_standard
 
-    chosen = [key_of_file(path) for path in key_file]
-    with hinting_at_white_space(chosen):
-        found = keyss.convert(
-            model, out, chosen, force=force, dry_run=dry_run, overwrite=overwrite, device=device
-        )
+    found = keyss.convert(
+        model,
+        out,
+        given_keys(key_file),
+        force=force,
+        dry_run=dry_run,
+        overwrite=overwrite,
+        device=device,
+    )
     print_conversion(str(out), found, dry_run=dry_run, file=sys.stderr if is_standard(out) else sys.stdout)

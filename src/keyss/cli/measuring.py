@@ -32,12 +32,10 @@ def evaluate(
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     import keyss
-    from keyss.cli.keys import hinting_at_white_space, keys_of_run
+    from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding
 
-    chosen = keys_of_run(run, key_file)
-    with hinting_at_white_space(chosen):
-        metrics = keyss.evaluate(run, chosen, wrong_keys=wrong_keys, device=device)
+    metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
     print_hiding(metrics)
     print_files(run, {"private/metrics.json": "the measurements"})
 
@@ -69,27 +67,25 @@ def audit(
     example: keyss audit runs/hidden --report-only
     """
     import keyss
-    from keyss.cli.keys import hinting_at_white_space, keys_of_run
+    from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_verdicts
     from keyss.progress import reporter
 
     if report_only:
         keyss.audit(run, report_only=True)
     else:
-        chosen = keys_of_run(run, key_file)
-        with hinting_at_white_space(chosen):
-            keyss.audit(
-                run,
-                chosen,
-                original=original,
-                controls=controls,
-                only=only,
-                seed=checked_seed(seed),
-                device=device,
-                overwrite=overwrite,
-                resume=resume,
-                reporter=reporter(),
-            )
+        keyss.audit(
+            run,
+            keys_of_run(run, key_file),
+            original=original,
+            controls=controls,
+            only=only,
+            seed=checked_seed(seed),
+            device=device,
+            overwrite=overwrite,
+            resume=resume,
+            reporter=reporter(),
+        )
     print_verdicts(run)
     print_files(
         run,

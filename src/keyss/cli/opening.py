@@ -45,25 +45,24 @@ def reveal(
     example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
     """
     import keyss
-    from keyss.cli.keys import hinting_at_white_space, keys
+    from keyss.cli.keys import keys
     from keyss.files.streams import is_standard
     from keyss.runs.revealing import is_sealed
 
     key: str | None = None
     if handed is None or key_file or is_sealed(handed):
         (key,) = keys(key_file, 1)
-    with hinting_at_white_space([key] if key else []):
-        revealed = keyss.reveal(
-            stego,
-            key,
-            handed=handed,
-            frame=frame,
-            decoy=decoy,
-            force=force,
-            device=device,
-            out=out,
-            overwrite=overwrite,
-        )
+    revealed = keyss.reveal(
+        stego,
+        key,
+        handed=handed,
+        frame=frame,
+        decoy=decoy,
+        force=force,
+        device=device,
+        out=out,
+        overwrite=overwrite,
+    )
     if revealed.file is not None:
         print(f"{out}: {revealed.file.name!r}, {len(revealed.file.data):,} bytes")
         return
@@ -76,7 +75,7 @@ def verify(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
     *,
     key_file: Annotated[
-        Path | None, optional("FILE", "Key file, to check the secret that it opens as well.")
+        Path | None, optional("FILE", "Key file, to check its secret too.", "KEYSS_KEY, else no key")
     ] = None,
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
     device: Device = "auto",
@@ -90,13 +89,12 @@ def verify(
     from msgspec import to_builtins
 
     import keyss
-    from keyss.cli.keys import hinting_at_white_space, key_of_file
+    from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_facts, print_json
     from keyss.core.errors import InputError
 
-    key = key_of_file(key_file) if key_file else None
-    with hinting_at_white_space([key] if key else []):
-        found = keyss.verify(model, key, device=device)
+    key = next(iter(given_keys([key_file] if key_file else [])), None)
+    found = keyss.verify(model, key, device=device)
     if json_:
         print_json(found)
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -18,14 +18,13 @@ from keyss.runs.records import record_bytes
 
 if TYPE_CHECKING:
     from keyss.api.converting import Conversion
-    from keyss.fitting.image_metrics import ImageQuality
-    from keyss.many import Comparison, Forecast, ManyResult
+    from keyss.many import Forecast, ManyResult
     from keyss.measure.stegexpose import Steganalysis
     from keyss.methods.plan import Plan
     from keyss.runs.metrics import FitMetrics, HideMetrics
 
 
-_GAP = 2  # characters between columns
+_HEADS = ("on test views", "PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")
 
 
 class Console(RichConsole):
@@ -37,56 +36,85 @@ class Console(RichConsole):
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     """The numbers of a hiding: a row for each scene beside its baseline, wrong keys, the method's own."""
-    numbers = [f" {i}" for i in range(1, len(metrics.secrets) + 1)] if len(metrics.secrets) > 1 else [""]
-    names = ["cover", *(f"secret{number}" for number in numbers)]
-    found = [metrics.cover, *metrics.secrets]
-    plain = [metrics.baseline.cover, *metrics.baseline.secrets]
-    sizes = list(zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True))
-    differ = any(other not in (own, None) for own, other in sizes)
-    equal = metrics.baseline.equal or (False,) * len(names)
-    shorter = [not same and other is not None for same, other in zip(equal, plain, strict=True)]
-    trained = metrics.steps or (None,) * len(names)
-    before = metrics.baseline.steps or (None,) * len(names)
-    rows = [
-        _scene_row(name, own, other, less, size, others if differ else None, steps, fewer)
-        for name, own, other, less, (size, others), steps, fewer in zip(
-            names, found, plain, shorter, sizes, trained, before, strict=True
-        )
-    ]
+    secrets = ["secret"]
+    if len(metrics.secrets) > 1:
+        secrets = [f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1)]
+    rows = _scene_rows(metrics, ["cover", *secrets])
     psnrs = []
     if (wrong := metrics.wrong_key) is not None:
-        psnrs += [(f"{wrong.keys} wrong keys, mean to the cover", wrong.vs_cover.mean)]
-        psnrs += [("  lowest to the cover", wrong.vs_cover.min)]
-        psnrs += [
-            (f"  highest to the secret{number}", found.max)
-            for number, found in zip(numbers, wrong.vs_secrets, strict=True)
+        psnrs = [
+            (f"{wrong.keys} wrong keys, mean to the cover", wrong.vs_cover.mean),
+            ("  lowest to the cover", wrong.vs_cover.min),
+            *(
+                (f"  highest to the {name}", psnr.max)
+                for name, psnr in zip(secrets, wrong.vs_secrets, strict=True)
+            ),
         ]
     psnrs += [
-        (f"chance level of the secret{number}", level)
-        for number, level in zip(numbers, metrics.chance_level, strict=True)
+        (f"chance level of the {name}", level)
+        for name, level in zip(secrets, metrics.chance_level, strict=True)
     ]
-    rows += [[name, f"{psnr:.2f}", *[""] * 7] for name, psnr in psnrs]
-    heads = ("on test views", "PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")
-    filled = [column for column in zip(heads, *rows, strict=True) if any(column[1:])]
-    table = new_table(*(head for head, *_ in filled), texts=1)
-    for row in zip(*(cells for _, *cells in filled), strict=True):
-        table.add_row(*row)
+    rows += [{"on test views": name, "PSNR": f"{psnr:.2f}"} for name, psnr in psnrs]
+    heads = [head for head in _HEADS if any(head in row for row in rows)]
     console = console or Console()
-    console.print(table)
-    for line in _explanations(metrics, names, differ, shorter):
+    print_table(heads, [[row.get(head, "") for head in heads] for row in rows], console=console)
+    for line in _explanations(metrics, ["cover", *secrets], heads):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for name, value in metrics.details.items():
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False, markup=False)
 
 
+def _scene_rows(metrics: HideMetrics, names: Sequence[str]) -> list[dict[str, str]]:
+    """A row for the cover and each secret, by the heads of its columns."""
+    baseline, unknown = metrics.baseline, (None,) * len(names)
+    sizes = [metrics.gaussians, *metrics.secret_gaussians]
+    rows = []
+    for name, own, plain, equal, size, plain_size, steps, plain_steps in zip(
+        names,
+        [metrics.cover, *metrics.secrets],
+        [baseline.cover, *baseline.secrets],
+        baseline.equal or unknown,
+        sizes,
+        baseline.gaussians,
+        metrics.steps or unknown,
+        baseline.steps or unknown,
+        strict=True,
+    ):
+        row = {"on test views": name, "PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
+        row["Gaussians"] = f"{size:,}"
+        if steps is not None:
+            row["steps"] = f"{steps:,}"
+        if plain is not None and equal:
+            row |= {"bound": f"{plain.psnr:.2f}", "loss": f"{plain.psnr - own.psnr:z.2f}"}
+        elif plain is not None:
+            row["start"] = f"{plain.psnr:.2f}"
+            if steps is not None and plain_steps is not None:
+                row["steps"] += f" (start {plain_steps:,})"
+        if plain_size and _sizes_differ(metrics):
+            row["plain's"] = f"{plain_size:,}"
+        rows.append(row)
+    return rows
+
+
+def _sizes_differ(metrics: HideMetrics, tolerance: float = 0.0) -> bool:
+    """True if a plain model has another number of Gaussians than its scene, beyond a share of these."""
+    sizes = zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True)
+    return any(plain is not None and abs(plain - own) > tolerance * own for own, plain in sizes)
+
+
 def print_plan(plan: Plan) -> None:
     """Stages, room and estimates of a run that has not begun."""
-    table = new_table("stage", "steps", "Gaussians", "time, about", texts=1)
-    for stage in plan.stages:
-        steps = f"{stage.steps:,}" if stage.steps else ""
-        table.add_row(stage.name, steps, f"{stage.gaussians:,}", about(stage.seconds))
-    table.add_row("all", "", "", about(plan.seconds))
-    Console().print(table)
+    rows = [
+        (
+            stage.name,
+            f"{stage.steps:,}" if stage.steps else "",
+            f"{stage.gaussians:,}",
+            about(stage.seconds),
+        )
+        for stage in plan.stages
+    ]
+    total = ("all", "", "", about(plan.seconds))
+    print_table(("stage", "steps", "Gaussians", "time, about"), [*rows, total])
     free = "" if plan.free_bytes is None else f", {plan.free_bytes / 1e6:,.0f} MB free"
     _print_columns(
         [
@@ -105,9 +133,7 @@ def print_plan(plan: Plan) -> None:
     print("Dry run: nothing was written. Times are rough.")
 
 
-def _explanations(
-    metrics: HideMetrics, names: Sequence[str], sizes_differ: bool, shorter: Sequence[bool]
-) -> list[str]:
+def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[str]) -> list[str]:
     """A line for each term of the table of a hiding."""
     rendered = [name for name, photos in zip(names, metrics.photos, strict=True) if not photos]
     views = "photos held out of training"
@@ -116,14 +142,12 @@ def _explanations(
     elif rendered:
         views += f"; for {', '.join(rendered)} 8-bit renders of the given model"
     lines = [f"Test views: {views}. PSNR, bound, loss and start in dB."]
-    sizes = zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True)
-    near = all(other is None or abs(other - own) <= 0.02 * own for own, other in sizes)
-    size = "about as many Gaussians" if near else "its own number of Gaussians"
-    size = size if sizes_differ else "as many Gaussians"
-    plain = [metrics.baseline.cover, *metrics.baseline.secrets]
-    if any(each is not None and not less for each, less in zip(plain, shorter, strict=True)):
+    size = "as many Gaussians"
+    if _sizes_differ(metrics):
+        size = "its own number of Gaussians" if _sizes_differ(metrics, 0.02) else "about as many Gaussians"
+    if "bound" in heads:
         lines.append(f"Bound: plain 3DGS of {size} and as many training steps.")
-    if any(shorter):
+    if "start" in heads:
         lines.append(
             f"Start: a plain model of {size} and fewer training steps, which is no bound; `keyss hide "
             "--bound` fits one."
@@ -139,51 +163,17 @@ def _explanations(
 
 def print_fit(metrics: FitMetrics) -> None:
     """The numbers of a plain fit."""
-    table = new_table("PSNR", "SSIM", "Gaussians", "iterations", "seconds")
+    quality = (f"{metrics.psnr:.2f}", f"{metrics.ssim:.3f}")
     sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
-    table.add_row(f"{metrics.psnr:.2f}", f"{metrics.ssim:.3f}", *sizes)
-    Console().print(table)
+    print_table(("PSNR", "SSIM", "Gaussians", "iterations", "seconds"), [(*quality, *sizes)], texts=0)
 
 
 def print_steganalysis(found: Steganalysis) -> None:
     """The number of images, and of those flagged as stego images."""
-    table = new_table("images", "flagged", "mean fusion")
     mean = found.mean_fusion
     flagged = sum(row.flagged for row in found.rows)
-    table.add_row(f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
-    Console().print(table)
-
-
-def print_comparison(found: Comparison) -> None:
-    """The tables of `comparison.md`, in parts as wide as the terminal."""
-    from keyss.many.comparison import LEGEND, comparison_tables, impossible, not_measured
-
-    for rows in comparison_tables(found).values():
-        print_in_parts(rows)
-    for line in (*impossible(found), *not_measured(found), *LEGEND):
-        print(line)
-
-
-def print_in_parts(rows: Sequence[Sequence[str]]) -> None:
-    """A table, the heads first, in parts as wide as the terminal."""
-    console = Console()
-    for columns in parts_within(console.width, rows):
-        part = new_table(*(rows[0][index] for index in columns), texts=1)
-        for row in rows[1:]:
-            part.add_row(*(row[index] for index in columns))
-        console.print(part)
-
-
-def parts_within(width: int, rows: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Groups of columns that fit in `width` characters, each with the first column, in order."""
-    widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
-    parts: list[list[int]] = [[0]]
-    for index, own in enumerate(widths[1:], start=1):
-        taken = sum(widths[each] for each in parts[-1])
-        if len(parts[-1]) > 1 and taken + own - _GAP > width:
-            parts.append([0])
-        parts[-1].append(index)
-    return parts
+    row = (f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
+    print_table(("images", "flagged", "mean fusion"), [row], texts=0)
 
 
 def print_verdicts(run: Path) -> None:
@@ -191,12 +181,8 @@ def print_verdicts(run: Path) -> None:
     from keyss.audits import headline, read_audit, verdicts
 
     lines = verdicts(read_audit(run))
-    table = new_table("measure", "measured", "baseline or control", "limit", "verdict", texts=5)
-    for column in (table.columns[0], table.columns[-1]):
-        column.no_wrap = True
-    for line in lines:
-        table.add_row(line.measure, line.value, line.beside, line.limit, line.word)
-    Console().print(table)
+    rows = [(line.measure, line.value, line.beside, line.limit, line.word) for line in lines]
+    print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
     Console().print(headline(lines), highlight=False)
 
 
@@ -248,13 +234,13 @@ def print_forecast(found: Forecast, jobs: int | None = None) -> None:
     """Which of several cells are done, and roughly what the others take."""
     from keyss.many.processes import Resources
 
-    table = new_table("cell", "name", "time, about", "memory", texts=2)
+    rows = []
     for each in found.cells:
         time, memory = "done" if each.done else "cannot work", ""
         if each.plan is not None:
             time, memory = about(each.plan.seconds), f"{each.plan.memory_bytes / 1e9:.1f} GB"
-        table.add_row(each.id[:12], Text(each.name), time, memory)
-    Console().print(table)
+        rows.append((each.id[:12], each.name, time, memory))
+    print_table(("cell", "name", "time, about", "memory"), rows, texts=2)
     for each in found.cells:
         if each.refused:
             print(f"{each.name}: {each.refused}")
@@ -279,41 +265,16 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {text}")
 
 
-def _scene_row(
-    name: str,
-    found: ImageQuality,
-    plain: ImageQuality | None,
-    shorter: bool,  # whether the plain model had fewer training steps
-    gaussians: int,
-    others: int | None,  # Gaussians of the plain model
-    steps: int | None,
-    fewer: int | None,  # steps of the plain model
-) -> list[str]:
-    """Cells of one scene: PSNR, SSIM, bound and loss or start, numbers of Gaussians and of steps."""
-    beside = ["", "", ""]
-    if plain is not None:
-        loss = f"{plain.psnr - found.psnr:z.2f}"
-        beside = ["", "", f"{plain.psnr:.2f}"] if shorter else [f"{plain.psnr:.2f}", loss, ""]
-    trained = "" if steps is None else f"{steps:,}"
-    if shorter and steps is not None and fewer is not None:
-        trained += f" (start {fewer:,})"
-    return [
-        name,
-        f"{found.psnr:.2f}",
-        f"{found.ssim:.3f}",
-        *beside,
-        f"{gaussians:,}",
-        f"{others:,}" if others else "",
-        trained,
-    ]
-
-
-def new_table(*names: str, texts: int = 0) -> Table:
-    """An empty table with these columns: the first `texts` are left-aligned, the others hold numbers."""
+def print_table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, console: Console | None = None
+) -> None:
+    """A table whose first `texts` columns are aligned left; the others hold numbers."""
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for index, name in enumerate(names):
-        table.add_column(name, justify="left" if index < texts else "right")
-    return table
+    for index, head in enumerate(heads):
+        table.add_column(head, justify="left" if index < texts else "right")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    (console or Console()).print(table)
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

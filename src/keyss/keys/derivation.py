@@ -2,13 +2,12 @@
 
 The key itself is used once, in Argon2id (RFC 9106), which makes guessing expensive; everything else is
 derived from its result by HKDF-SHA256 (RFC 5869) with labels, so that no derived value tells anything of
-another. Keys are text, normalised to NFKC, so that one key typed on two systems is one key.
+another. A key is text as `normalized_key` gives it, so one key typed on two systems is one key.
 """
 
 from __future__ import annotations
 
 import hmac
-import unicodedata
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,12 +21,12 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 from torch import Tensor
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError
+from keyss.keys.key_file import normalized_key
 
 SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
-MAX_KEY_BYTES = 4096
 _STREAM_BLOCK = 1 << 16  # bytes that are made at a time
 
 
@@ -95,15 +94,11 @@ class DerivedKey:
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:
-        """Takes about 0.1 s. Raises UsageError for an empty or overlong key, InputError without memory."""
-        text = unicodedata.normalize("NFKC", key).encode()
-        if not text:
-            raise UsageError("the key is empty")
-        if len(text) > MAX_KEY_BYTES:
-            raise UsageError(f"the key is longer than {MAX_KEY_BYTES} bytes")
+        """Takes about 0.1 s. Raises UsageError as `normalized_key` does, InputError without memory."""
+        text = normalized_key(key)
         try:
             self._master = hash_secret_raw(
-                text,
+                text.encode(),
                 derivation.salt,
                 time_cost=derivation.time_cost,
                 memory_cost=derivation.memory_kib,

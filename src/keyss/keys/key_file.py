@@ -1,40 +1,50 @@
-"""Files that hold a key."""
+"""What counts as a key, and the files that hold one."""
 
 from __future__ import annotations
 
 import os
+import unicodedata
 from pathlib import Path
 
-from keyss.core.errors import InputError, OutputError
+from keyss.core.errors import InputError, OutputError, UsageError
 
-MAX_FILE_BYTES = 4096
+MAX_KEY_BYTES = 4096
+_SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # those of JavaScript's `trim`; NFKC replaces the others
 
 
-def read_key_file(path: Path) -> tuple[str, int]:
-    """The text of a key file without one newline at its end, and the file's mode.
+def normalized_key(text: str) -> str:
+    """The key in `text`: Unicode's form NFKC without surrounding white space.
 
-    Raises InputError for a file that holds no key.
+    Everything that takes a key applies this, so a final newline or a byte order mark never counts. Raises
+    UsageError for a key that is empty, longer than 4096 bytes, or not UTF-8; the message omits the key.
     """
+    key = unicodedata.normalize("NFKC", text).strip(_SPACES)
+    if not key:
+        raise UsageError("the key is empty")
+    try:
+        size = len(key.encode())
+    except UnicodeEncodeError:
+        raise UsageError("expected a key in UTF-8, found other bytes") from None
+    if size > MAX_KEY_BYTES:
+        raise UsageError(f"the key is longer than {MAX_KEY_BYTES} bytes")
+    return key
+
+
+def read_key_file(path: Path) -> str:
+    """The key in a file. Raises InputError for a file without a key."""
     try:
         with path.open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = file.read(2 * MAX_KEY_BYTES)
     except OSError as error:
         raise InputError(f"{path}: the key file cannot be read: {error.strerror}") from error
-    if len(data) > MAX_FILE_BYTES:
-        raise InputError(f"{path}: expected a key file of at most {MAX_FILE_BYTES} bytes, found more")
     try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a key in UTF-8, found other bytes") from error
-    key = text.removesuffix("\n").removesuffix("\r")
-    if not key:
-        raise InputError(f"{path}: the key file is empty; `keyss keygen -o FILE` writes a key")
-    return key, mode
+        return normalized_key(data.decode(errors="surrogateescape"))
+    except UsageError as error:
+        raise InputError(f"{path}: {error}; `keyss keygen -o FILE` writes a key file") from error
 
 
 def write_new_key(path: Path, key: str) -> None:
-    """Write a key file that only its owner can read. Raises OutputError where there is anything already."""
+    """Write a key file that only its owner can read. Raises OutputError if the path exists."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError as error:

@@ -115,7 +115,7 @@ def _cell(
         **common,
     )
     identity = cell.identity
-    check = "" if asset.key_file is None else _key_check(read_key_file(asset.key_file)[0], identity)
+    check = "" if asset.key_file is None else _key_check(read_key_file(asset.key_file), identity)
     cell = replace(cell, id=f"{identity}{check}")
     try:
         there = place.is_file() or (place.is_dir() and any(place.iterdir()))

@@ -10,7 +10,7 @@ from keyss._version import __version__
 from keyss.many.measures import CONVERSIONS
 from keyss.many.tables import markdown_rows
 
-LEGEND = (
+_LEGEND = (
     "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
     "total. 3dgs is the bound: plain 3DGS of as many Gaussians and as many training steps. Picture: the time "
     "of one of the cover and of the secret, and its ratio to that of plain 3DGS. Seconds: of hiding, after "
@@ -65,28 +65,24 @@ def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
     }
 
 
-def impossible(found: Comparison) -> list[str]:
-    """A sentence for each method that failed."""
-    return [f"{each.name}: not possible: {each.error}" for each in found.methods if each.error is not None]
-
-
-def not_measured(found: Comparison) -> list[str]:
-    """A sentence for each reason why something was not measured."""
+def comparison_notes(comparison: Comparison) -> list[str]:
+    """A sentence for each method that failed, and for each reason to skip a measure; the legend."""
+    failures = [f"{row.name}: not possible: {row.error}" for row in comparison.methods if row.error]
     reasons: dict[str, list[str]] = {}
-    for each in found.methods:
-        for what, why in each.notes.items():
-            reasons.setdefault(f"{what.partition('.')[2]}: {why}", []).append(each.name)
-    return [f"not tried ({', '.join(names)}): {reason}" for reason, names in reasons.items()]
+    for row in comparison.methods:
+        for measure, reason in row.notes.items():
+            reasons.setdefault(f"{measure.partition('.')[2]}: {reason}", []).append(row.name)
+    skipped = [f"not tried ({', '.join(names)}): {reason}" for reason, names in reasons.items()]
+    return [*failures, *skipped, *_LEGEND]
 
 
-def comparison_text(found: Comparison) -> str:
-    """Both tables in Markdown, and the legend."""
-    parts = [
-        "\n".join([f"## {title}", "", *markdown_rows(rows)])
-        for title, rows in comparison_tables(found).items()
-    ]
-    parts += ["\n".join(f"- {line}" for line in [*impossible(found), *not_measured(found)])]
-    return "\n\n".join(part for part in [*parts, *LEGEND] if part) + "\n"
+def comparison_text(comparison: Comparison) -> str:
+    """Both tables and the notes in Markdown."""
+    lines = []
+    for title, rows in comparison_tables(comparison).items():
+        lines += [f"## {title}", "", *markdown_rows(rows), ""]
+    lines += [f"- {note}" for note in comparison_notes(comparison)]
+    return "\n".join(lines) + "\n"
 
 
 def _number(name: str, form: str) -> Column:

@@ -97,8 +97,8 @@ def keys_of(cell: Cell) -> list[str]:
     if cell.secrets and not registry.get(cell.method).capabilities.keys:
         return [""] * len(cell.secrets)
     if cell.master_key_file is None:
-        return [read_key_file(Path(each))[0] for each in cell.key_files]
-    master = MasterKey(read_key_file(Path(cell.master_key_file))[0])
+        return [read_key_file(Path(each)) for each in cell.key_files]
+    master = MasterKey(read_key_file(Path(cell.master_key_file)))
     return [master.key_of(each) for each in cell.key_names]
 
 

@@ -123,11 +123,11 @@ def settle_master_key(out: Path, given: Path | None) -> None:
     own = out / MASTER_KEY
     if given is None and not own.exists():
         write_bytes(own, f"{generate_key(22)}\n".encode())
-    check = MasterKey(read_key_file(given or own)[0]).check()
+    check = MasterKey(read_key_file(given or own)).check()
     kept = out / _CHECK
     if not kept.exists():
         write_bytes(kept, check.encode())
-    elif read_key_file(kept)[0] != check:
+    elif read_key_file(kept) != check:
         raise OutputError(
             f"{out} holds results with keys of another master key: give the same `master_key_file`, or "
             "choose another folder"

@@ -1,6 +1,6 @@
 /**
- * From what a person types to derived keys, as docs/format.md has it: Argon2id (RFC 9106) of the key in NFKC, then
- * HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
+ * From what a person types to derived keys, as docs/format.md has it: Argon2id (RFC 9106) of the key in NFKC and
+ * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
 import { chacha20 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
@@ -14,7 +14,7 @@ const MAX_KEY_BYTES = 4096;
 
 /** The bytes of a key. Raises InputError for an empty one and one of more than 4,096 bytes. */
 export function keyBytes(key: string): Uint8Array {
-  const bytes = new TextEncoder().encode(key.normalize('NFKC'));
+  const bytes = new TextEncoder().encode(key.normalize('NFKC').trim());
   if (bytes.length === 0 || bytes.length > MAX_KEY_BYTES) {
     throw new InputError('A key has 1 to 4,096 bytes.');
   }

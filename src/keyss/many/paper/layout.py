@@ -97,11 +97,16 @@ def cells(found: Reproduction) -> list[list[str]]:
     return [[label, *line] for label, line in zip(labels, [names, *texts], strict=True)]
 
 
+def verdicts(found: Reproduction) -> list[str]:
+    """A line for each claim and for each run that failed."""
+    lines = [f"{each.verdict} ({each.holding} of {each.parts}): {each.text}" for each in found.claims]
+    return [*lines, *(f"failed: {name}: {error}" for name, error in found.failures.items())]
+
+
 def markdown(found: Reproduction) -> str:
-    """The table, its claims and how it was made."""
+    """The table, its verdicts and arguments."""
     lines = [f"# {found.title}", "", *markdown_rows(cells(found)), ""]
-    lines += [f"- **{each.verdict}** ({each.holding} of {each.parts}): {each.text}" for each in found.claims]
-    lines += [f"- failed: {name}: {why}" for name, why in found.failures.items()]
+    lines += [f"- {line}" for line in verdicts(found)]
     told = ", ".join(f"{name} {value}" for name, value in found.arguments.items() if value is not None)
     lines += ["", f"Means over {len(found.pairs)} pair(s): {', '.join(found.pairs)}. {told}.", ""]
     return "\n".join(lines)

@@ -7,7 +7,6 @@ embeddings. Revealing needs no CLIP: the encrypted payload contains the embeddin
 
 from __future__ import annotations
 
-import unicodedata
 from importlib import import_module
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from keyss.core.errors import BackendError, UsageError
 from keyss.keys.derivation import EMBEDDING_SIZE, unit_vector
+from keyss.keys.key_file import normalized_key
 
 MODEL = "openai/clip-vit-large-patch14"  # ViT-L/14, the paper's
 
@@ -51,7 +51,7 @@ class ClipKeys:
         Random projection keeps angles to about 0.1 (Johnson and Lindenstrauss); the decoder takes 64 numbers.
         Raises UsageError for a key of more tokens than CLIP reads, which it would cut off.
         """
-        tokens = self._tokenizer(unicodedata.normalize("NFKC", key), return_tensors="pt")
+        tokens = self._tokenizer(normalized_key(key), return_tensors="pt")
         most = self._text.config.max_position_embeddings
         if tokens["input_ids"].shape[1] > most:
             raise UsageError(f"the key is too long for CLIP: expected at most {most - 2} tokens")

@@ -1,0 +1,221 @@
+"""The commands for many hidings: comparisons, the paper's tables, sweeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from keyss.cli.arguments import (
+    Device,
+    FixedSeed,
+    Iterations,
+    Jobs,
+    MaxGaussians,
+    OutFolder,
+    Ray,
+    Width,
+    optional,
+    switch,
+)
+from keyss.many.paper.tables import TableName
+
+QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
+DryRun = Annotated[bool, switch("Print the runs with estimates of time and memory; write nothing.")]
+
+
+def compare(
+    *,
+    cover: Annotated[Path, arg(metavar="SCENE", help="Public scene: folder of posed photos.")],
+    secret: Annotated[Path, arg(metavar="SCENE", help="Scene to hide in it.")],
+    methods: Annotated[
+        str, optional("NAMES", "Methods, METHOD:PRESET or METHOD:VARIANT, separated by commas.", "all")
+    ] = "all",
+    out: OutFolder,
+    quick: Annotated[bool, switch("500 steps, 3,000 Gaussians and a width of 100 by default.")] = False,
+    iterations: Iterations = None,
+    max_gaussians: MaxGaussians = None,
+    width: Width = None,
+    dry_run: DryRun = False,
+    device: Device = "auto",
+    seed: FixedSeed = 0,
+) -> None:
+    """Hide a scene by each method with the same budget, and tabulate the results.
+
+    The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the bound:
+    plain 3DGS with that budget. Run the same command again to resume.
+
+    example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
+    """
+    import keyss
+    from keyss.cli.tables import print_files, print_forecast, print_table
+    from keyss.many import Forecast
+    from keyss.many.comparison import comparison_notes, comparison_tables
+    from keyss.progress import reporter
+
+    given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
+    budget = {name: QUICK[name] if value is None and quick else value for name, value in given.items()}
+    comparison = keyss.compare(
+        cover,
+        secret,
+        methods=() if methods.strip() == "all" else [name.strip() for name in methods.split(",")],
+        seed=seed,
+        device=device,
+        out=out,
+        dry_run=dry_run,
+        reporter=reporter(),
+        **budget,
+    )
+    if isinstance(comparison, Forecast):
+        print_forecast(comparison, 1)
+        return
+    for heads, *rows in comparison_tables(comparison).values():
+        print_table(heads, rows)
+    described = {
+        "comparison.png": "a row for each method: cover, secret, error; it shows the secret",
+        "comparison.md": "the table, in Markdown",
+        "comparison.json": "the numbers, for programs",
+    }
+    print(*comparison_notes(comparison), sep="\n")
+    print_files(out, described)
+
+
+def reproduce(
+    table: Annotated[Positional[TableName], arg(help="Table of the paper.")],
+    scenes: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(
+            metavar="[SCENE ...]",
+            help="Scenes, each of which hides the next one.",
+            help_behavior_hint="",
+        ),
+    ] = (),
+    *,
+    data: Annotated[
+        Path | None,
+        optional(
+            "FOLDER",
+            "Folder of the paper's scenes (Mip-NeRF 360, and playroom), for its own sizes: 30,000 steps and "
+            "500,000 Gaussians.",
+            "the given scenes, with 1,000 steps, 9,000 Gaussians, 120 pixels",
+        ),
+    ] = None,
+    pairs: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        optional(
+            "COVER,SECRET",
+            "Names of a scene and of what it hides, for multi COVER,SECRET,SECRET; repeat for more.",
+            "each hides the next; with --data as published",
+        ),
+    ] = (),
+    most: Annotated[int | None, optional("N", "Run only the first N pairs.", "all")] = None,
+    out: OutFolder,
+    download: Annotated[
+        bool, switch("Download scenes that are missing in --data from their authors, up to 12.5 GB.")
+    ] = False,
+    dry_run: DryRun = False,
+    iterations: Annotated[int | None, optional("N", "Training steps.", "see --data")] = None,
+    max_gaussians: Annotated[
+        int | None, optional("N", "Maximum number of Gaussians of a model.", "see --data")
+    ] = None,
+    width: Annotated[
+        int | None, optional("PIXELS", "Downscale wider photos to this width.", "see --data")
+    ] = None,
+    device: Device = "auto",
+    seed: FixedSeed = 0,
+) -> None:
+    """Reproduce a table of the KeySS paper, and check its claims.
+
+    A claim holds if all of its comparisons of means hold, and in part if half of them do. Tables in one
+    folder share their runs. Run the same command again to resume.
+
+    example: keyss reproduce single SCENE_A SCENE_B -o runs/paper
+
+    example: keyss reproduce multi --data 360_v2 --download -o runs/paper-full
+    """
+    import keyss
+    from keyss.cli.tables import print_files, print_forecast, print_table
+    from keyss.core.errors import InputError, UsageError
+    from keyss.many import Forecast
+    from keyss.many.paper.layout import cells, verdicts
+    from keyss.progress import reporter
+
+    if download and (dry_run or data is None):
+        raise UsageError("--download: needs --data, and no --dry-run")
+    reproduction = keyss.reproduce(
+        table,
+        scenes,
+        data=data,
+        download=download,
+        pairs=pairs,
+        most=most,
+        iterations=iterations,
+        max_gaussians=max_gaussians,
+        width=width,
+        seed=seed,
+        device=device,
+        out=out,
+        dry_run=dry_run,
+        reporter=reporter(),
+    )
+    if isinstance(reproduction, Forecast):
+        print_forecast(reproduction, 1)
+        return
+    heads, *rows = cells(reproduction)
+    print_table(heads, rows)
+    means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
+    described = {
+        f"{table}.md": "the table and the verdicts, in Markdown",
+        f"{table}.json": "the same, for programs",
+        "cells": "the runs, which other tables share",
+    }
+    print(*verdicts(reproduction), means, sep="\n")
+    print_files(out, described)
+    if reproduction.failures:
+        raise InputError(f"{len(reproduction.failures)} run(s) failed")
+
+
+def sweep(
+    spec: Annotated[
+        Positional[Path], arg(metavar="SPEC", help="YAML file: pairs, methods and their options, seeds.")
+    ],
+    *,
+    out: OutFolder,
+    jobs: Jobs = None,
+    ray: Ray = None,
+    retries: Annotated[int, arg(metavar="N", help="Retries of a cell whose process died.")] = 2,
+    master_key_file: Annotated[
+        Path | None,
+        optional("FILE", "Key file to derive the cells' keys from (`keyss keygen --asset`).", "a new one"),
+    ] = None,
+    dry_run: DryRun = False,
+) -> None:
+    """Hide over a grid of scenes, methods, options and seeds, and tabulate the results.
+
+    docs/sweeps.md describes SPEC. Run the same command again to resume.
+
+    example: keyss sweep sweep.yaml -o runs/sweep --jobs 2
+
+    example: keyss sweep sweep.yaml -o runs/sweep --dry-run
+    """
+    import keyss
+    from keyss.cli.tables import print_files, print_forecast, print_outcome
+    from keyss.core.errors import UsageError
+    from keyss.many import Forecast
+
+    if retries < 0:
+        raise UsageError(f"--retries: expected 0 or more, got {retries}")
+    options: dict[str, Any] = {"jobs": jobs, "ray": ray, "retries": retries, "dry_run": dry_run}
+    result = keyss.sweep(spec, out, master_key_file=master_key_file, **options)
+    if isinstance(result, Forecast):
+        print_forecast(result, jobs)
+        return
+    described = {
+        "results.csv": "means over seeds, with 95 % confidence intervals",
+        "results.parquet": "the same",
+        "cells.csv": "the numbers of each cell",
+        "private/master-key.txt": "the key from which those of the cells are derived",
+    }
+    print_files(out, described)
+    print_outcome(result, "cells")
