@@ -101,9 +101,9 @@ class Visit:
         return np.asarray(Image.open(io.BytesIO(before)).convert("RGB")).astype(np.float64)
 
     def try_key(self, key: str) -> float:
-        """Milliseconds that it took."""
+        """Milliseconds that the search took; returns when what it found is shown."""
         self.page.fill("#key", key)
-        return float(
+        milliseconds = float(
             self.page.evaluate(
                 """() => new Promise((resolve) => {
                     const main = document.getElementById('main');
@@ -117,6 +117,8 @@ class Visit:
                 })"""
             )
         )
+        self.settle()
+        return milliseconds
 
 
 @contextmanager

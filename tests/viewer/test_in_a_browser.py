@@ -114,6 +114,26 @@ def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, page_file: Path) -
     assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
 
 
+def test_what_can_be_timed_ends_before_the_secret_is_decoded(tab: Visit, page_file: Path) -> None:
+    """Decoding and rendering take time that depends on the secret: the form is ready again before them."""
+    tab.goto(page_file.as_uri())
+    tab.page.evaluate(
+        """() => {
+            const main = document.getElementById('main');
+            window.ready = [];
+            new MutationObserver(() => {
+                if (main.getAttribute('aria-busy') === 'true') return;
+                const open = !document.getElementById('open').disabled;
+                window.ready.push(open && document.getElementById('revealed').hidden);
+            }).observe(main, { attributeFilter: ['aria-busy'] });
+        }"""
+    )
+    tab.try_key("wrong")
+    tab.try_key(KEYS[0])
+    assert tab.page.evaluate("window.ready") == [True, True]
+    assert tab.page.locator("#revealed").is_visible()
+
+
 def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path: Path) -> None:
     tab.goto(page_file.as_uri())
     data = (page_file.parent / "stego.ply").read_bytes()

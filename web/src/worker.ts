@@ -41,6 +41,7 @@ function preparedWhereThereIsMemory(model: ReadModel): ((colours: boolean) => Re
 async function unlock(id: number, key: string, colours: boolean): Promise<void> {
   const reader = (await prepared)?.(colours);
   const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
+  answer({ id, progress: 1 }); // before the secret is decoded, which wrong keys have no part in
   const model = content && stego && secretOf(content, stego)?.gaussians;
   if (model) answer({ id, model }, buffersOf(model));
   else answer({ id, file: content ? fileOf(content) : undefined });

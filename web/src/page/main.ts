@@ -14,18 +14,17 @@ import { Viewer } from './viewer.ts';
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
 const MOST_BYTES = 2 ** 31;
 const EMBEDDED = location.protocol === 'about:'; // in another page, which has the address to itself
-const ALIKE = 0.8; // of how long the key before took: what is faster still was tried on a machine with less other work
 
 class Page {
   private name = 'model';
   private published: Gaussians | null = null;
   private secret: Gaussians | null = null;
-  private readonly opener = new Opener((share) => (page.progress.value = share));
+  private readonly opener = new Opener((share) => this.searched(share));
   private readonly controls: Controls;
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
   private addressTimer = 0;
   private loads = 0;
-  private readonly before = new Map<boolean, number>(); // milliseconds that a key took, without and with colours
+  private attempts = 0;
 
   constructor(private readonly viewer: Viewer) {
     this.controls = new Controls(page.picture, this.pose, (pose) => this.moved(pose), () => this.firstPose());
@@ -95,7 +94,6 @@ class Page {
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [name, model];
     this.hideSecret();
-    this.before.clear();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
     document.title = `${name} · keyss viewer`;
@@ -135,41 +133,42 @@ class Page {
   }
 
   /**
-   * A key that opens nothing changes nothing, and nothing is said about it. It takes as long as one that opens a scene:
-   * the worker makes the same passes, what is there is drawn anew, and no attempt ends a little sooner than the one before it.
+   * A key that opens nothing changes nothing, and nothing is said about it. The search makes the same passes for every
+   * key, and the form is ready again when it ends: how long decoding and rendering a secret take is not part of it.
    */
   private async unlock(): Promise<void> {
-    const [key, colours] = [page.key.value, page.colours.checked];
+    const [key, own] = [page.key.value, this.loads];
     if (!key || this.published === null || page.open.disabled) return;
-    const [own, start] = [this.loads, performance.now()];
-    page.open.disabled = true;
-    page.main.setAttribute('aria-busy', 'true');
+    const attempt = ++this.attempts;
+    delete page.main.dataset.picture;
     this.say('Trying the key …');
-    page.progress.value = 0;
-    page.progress.hidden = false;
-    const { model, file } = await this.opener.unlock(key, colours);
-    page.key.value = '';
-    showKey(false);
-    let found = '';
-    if (own === this.loads) {
-      if (model) this.reveal(model);
-      else if (this.secret) this.viewer.show(this.secret, 'right');
-      else this.showPublished();
-      await this.picture();
-      const [took, before] = [performance.now() - start, this.before.get(colours) ?? 0];
-      if (took < before && took > ALIKE * before) await new Promise((resolve) => setTimeout(resolve, before - took));
-      this.before.set(colours, performance.now() - start);
-      if (model) found = `The secret is shown: ${count(model.count)} Gaussians.`;
-    }
+    this.searched(0);
+    const { model, file } = await this.opener.unlock(key, page.colours.checked);
+    if (attempt === this.attempts) this.searched(1); // else the next attempt has begun
     if (file) {
       const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
       save(name, new Blob([file.data as BlobPart]));
-      found = `A hidden file is saved: ${name}`;
+      this.say(`A hidden file is saved: ${name}`);
     }
-    page.open.disabled = false;
-    page.main.setAttribute('aria-busy', 'false');
-    page.progress.hidden = true;
-    this.say(found);
+    if (model && own === this.loads) {
+      this.reveal(model);
+      this.say(`The secret is shown: ${count(model.count)} Gaussians.`);
+    }
+    await this.picture();
+  }
+
+  /** The share of the channels that an attempt has searched, 0 to 1. */
+  private searched(share: number): void {
+    const ends = share === 1;
+    if (ends && !page.open.disabled) return;
+    page.open.disabled = !ends;
+    page.main.setAttribute('aria-busy', String(!ends));
+    page.progress.value = share;
+    page.progress.hidden = ends;
+    if (!ends) return;
+    page.key.value = '';
+    showKey(false);
+    this.say('');
   }
 
   /** Seen as what was there before was. */

@@ -8,7 +8,7 @@ export class Opener {
   private readonly waiting = new Map<number, (answer: Answer) => void>();
   private next = 0;
 
-  /** `onProgress` is told what share of an attempt is done, 0 to 1: the same for every key. */
+  /** `onProgress` gets the share of an attempt that is done, 0 to 1, at the same times for every key. */
   constructor(private readonly onProgress: (share: number) => void) {
     this.worker = started(WORKER);
     this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
