@@ -42,6 +42,7 @@ class TestTheWholePath:
         assert json.loads(said.out)["gaussians"] == left
         said = keyss("info", run)
         assert "metrics.secrets.1.psnr" in said.out
+        assert ["metrics.seed", str(metrics["seed"])] in map(str.split, said.out.splitlines())
         assert "{" not in said.out
 
     def test_fit_prints_its_numbers_and_files(

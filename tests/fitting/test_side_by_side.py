@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import re
 import signal
@@ -11,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from multiprocessing import resource_tracker, spawn
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -88,12 +86,8 @@ def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pids() -> list[int]:
-    return [each.pid for each in multiprocessing.active_children() if each.pid]
-
-
-def left() -> list[int]:
-    """Processes that are left, but for the one that multiprocessing keeps."""
-    return [pid for pid in descendants(os.getpid()) if "resource_tracker" not in command_of(pid)]
+    """Processes of running fits."""
+    return [pid for pid in descendants(os.getpid()) if "keyss.fitting.worker" in command_of(pid)]
 
 
 def fits_of(
@@ -144,7 +138,7 @@ def test_an_interrupted_pair_resumes_to_the_same_models(tmp_path: Path) -> None:
         fit_scenes(fits_of(tmp_path, config, signalled(50)))
     assert caught.value.args == (signal.SIGINT,)
     assert caught.value.checkpoint == tmp_path / "0.safetensors"
-    assert left() == []
+    assert pids() == []
     reporter = Recorder()
     fits = fits_of(tmp_path, config, reporter)
     before = [steps_done(fit.checkpoint) for fit in fits]
@@ -164,7 +158,7 @@ def test_a_signal_while_processes_load_ends_it_at_once() -> None:
     assert caught.value.checkpoint is None
     assert time.monotonic() - started < 30
     assert [what for what, *_ in reporter.all[0].said] == ["start", "finish"]
-    assert left() == []
+    assert pids() == []
 
 
 @pytest.mark.parametrize(("at", "order"), [(0, 1), (0, -1), (50, -1)])
@@ -197,7 +191,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path) -> None:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-    assert left() == []
+    assert pids() == []
 
 
 def test_what_is_started_with_ctrl_c_ignored_goes_on() -> None:
@@ -220,7 +214,7 @@ def test_an_error_of_one_comes_through_and_stops_the_others(tmp_path: Path) -> N
     (tmp_path / "0.safetensors").rename(tmp_path / "1.safetensors")
     with pytest.raises(InputError, match=r"1\.safetensors: belongs to a run with other settings"):
         fit_scenes(fits_of(tmp_path, ENDLESS), resume=True)
-    assert left() == []
+    assert pids() == []
 
 
 @pytest.mark.counted
@@ -234,8 +228,8 @@ def test_errors_that_nobody_expects_are_those_of_a_fit_in_this_process() -> None
     with pytest.raises(type(alone.value)) as caught:
         fit_scenes([good, bad])
     assert str(caught.value) == str(alone.value)
-    assert "fit_scene" in str(caught.value.__cause__)  # where it came up
-    assert left() == []
+    assert "fit_scene" in caught.value.__notes__[0]  # the traceback
+    assert pids() == []
 
 
 def test_a_process_that_is_killed_is_told_and_the_others_save(tmp_path: Path) -> None:
@@ -278,7 +272,9 @@ def test_processes_end_with_whoever_started_them_and_do_not_run_its_program(tmp_
             stdout=said,
         )
     try:
-        until(lambda: sum("spawn_main" in command_of(each) for each in descendants(driver.pid)) == 2)
+        until(
+            lambda: sum("keyss.fitting.worker" in command_of(each) for each in descendants(driver.pid)) == 2
+        )
         children = descendants(driver.pid)
         time.sleep(4)
         assert all(map(command_of, children))
@@ -293,8 +289,8 @@ def test_processes_end_with_whoever_started_them_and_do_not_run_its_program(tmp_
 def test_where_no_process_can_be_started_fits_are_one_after_the_other(
     monkeypatch: pytest.MonkeyPatch, program: str
 ) -> None:
-    resource_tracker.ensure_running()
-    monkeypatch.setattr(spawn, "_python_exe", program.encode())
+    monkeypatch.setattr(sys, "executable", program)
+    monkeypatch.setattr(side_by_side._processes, "can_start", lambda: True)
     reporter = Recorder()
     with pytest.warns(KeyssWarning, match="one after the other"):
         models = fit_scenes(fits_of(None, CONFIG, reporter))

@@ -88,7 +88,7 @@ class WholeMethod:
         rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
         payload = Payload("whole", rows.numpy().tobytes())
         stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])
-        return Stego(stego, (unpack(payload),), 0.0, details={"floats": rows.numel()})
+        return Stego(stego, (unpack(payload),), details={"floats": rows.numel()})
 
 
 def unpack(content: Content) -> OpenedWhole:

@@ -174,8 +174,10 @@ def test_an_interrupted_run_is_continued_with_the_same_arguments_only(tmp_path: 
         RunFolder(tmp_path, "hide", other, resume=True)
     with pytest.raises(OutputError, match="of another kind"):
         RunFolder(tmp_path, "fit", arguments, resume=True)
+    first = RunFolder(tmp_path, "hide", arguments, resume=True).earlier_seconds
     interrupt(tmp_path, arguments, resume=True)
     folder = RunFolder(tmp_path, "hide", arguments, resume=True)
+    assert 0 < first < folder.earlier_seconds
     with folder.work():
         assert (folder.checkpoints / "fit").read_bytes() == b"state"
         folder.write({"publish/stego.ply": content(b"whole")})

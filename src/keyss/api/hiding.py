@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
@@ -122,7 +122,7 @@ def hide(
     chosen, options = method_for(method, secrets)
     if publish or channel:
         options = replace(options, publish=publish or options.publish, channel=channel or options.channel)
-    repeatable, ranks = options.fit.seed is not None, here()
+    began, ranks = time.monotonic(), here()
     interrupted = Path(out) if resume and out is not None else None
     options = replace(options, fit=begun(options.fit, interrupted, "options", "fit"))
     keys = [secret.key for secret in secrets]
@@ -157,6 +157,7 @@ def hide(
             overwrite=overwrite,
             resume=resume,
         )
+        began -= folder.earlier_seconds
     sources = sources_of(cover, cover_model, secrets)
     options = chosen.prepare(sources, options)
     configs = options.fits(len(sources))
@@ -189,10 +190,7 @@ def hide(
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources = with_plain_models(sources, configs, context)
         plain = [each.model for each in sources]
-        if repeatable:
-            context = replace(context, entropy=_entropy(keys, options, plain))
-        elif ranks.count > 1:  # all processes must continue with the same model
-            context = replace(context, entropy=ranks.from_first(os.urandom(32)))
+        context = replace(context, entropy=ranks.from_first(_entropy(keys, options, plain)))
         stego = chosen.hide(sources[0], sources[1:], options, context)
         shown: list[Shown] = []
         if ranks.first:
@@ -208,7 +206,7 @@ def hide(
         longer = _longer(bounds, scenes, plain, photos, stego, options, context) if bound else {}
         if ranks.first:
             metrics = _measured(
-                chosen, stego, scenes, plain, photos, options, shown, target, bounds, fitted, longer
+                chosen, stego, scenes, plain, photos, options, shown, target, bounds, fitted, longer, began
             )
         if folder:
             payloads = secret_ids(options.fit.known_seed, stego.opened)
@@ -322,6 +320,7 @@ def _measured(
     bounds: Sequence[Bound],
     fitted: Sequence[int | None],  # steps of the plain models
     longer: Mapping[int, Gaussians],  # plain models with more steps
+    began: float,  # time.monotonic() at the start of the run
 ) -> HideMetrics:
     """The measurements of a hiding."""
     baselines = [longer.get(index, model) for index, model in enumerate(models)]
@@ -349,7 +348,7 @@ def _measured(
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         steps=tuple(each.steps for each in bounds),
-        seconds=round(stego.seconds, 1),
+        seconds=round(time.monotonic() - began, 1),
         width=scenes[0].train[0].camera.width,
         seed=options.fit.known_seed,
         against_plain=_fidelity(shown),

@@ -285,7 +285,8 @@ def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         if isinstance(value, Mapping):
             rows += _flat(value, f"{prefix}{name}.")
         else:
-            rows.append((prefix + name, _text(value)))
+            # Without separators, a seed can be given to --seed.
+            rows.append((prefix + name, str(value) if name == "seed" else _text(value)))
     return rows
 
 

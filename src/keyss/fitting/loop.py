@@ -1,7 +1,4 @@
-"""The loop around every training run: progress, checkpoints, Ctrl-C and other signals, resume.
-
-And of several processes, see `keyss.fitting.ranks`.
-"""
+"""The loop of every training run: progress, checkpoints, signals, resume, several processes."""
 
 from __future__ import annotations
 
@@ -24,38 +21,36 @@ from keyss.fitting.ranks import here
 from keyss.fitting.reporting import Modelled, ModelReporter, Reporter, SilentReporter
 from keyss.fitting.sampling import own_randomness
 
-ENDING = tuple(
-    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
-)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# Whether a second signal changes nothing: in a process that another one ends where that must be at once.
+# True: a second signal changes nothing. For processes that another one kills where that must be at once.
 patient = False
 
 REMEDY = "continue with the same command and `resume=True`"
 
 
 class TrainingRun(Protocol):
-    """A training run: everything that `state` returns decides its future completely."""
+    """A training run, whose future depends on nothing but what `state` returns."""
 
     iterations: int
     iteration: int  # steps done
 
     @property
     def loss(self) -> float | Tensor:
-        """That of the last step."""
+        """The loss of the last step."""
 
     def step(self) -> None:
-        """One optimisation step; increases `iteration`.
+        """Take one optimisation step, which increases `iteration`.
 
-        What waits for other processes comes before parameters change: where one has ended, only the order
-        of views and `iteration` are ahead.
+        It waits for other processes before it changes parameters: if one has ended, only the order of views
+        and `iteration` have changed.
         """
 
     def evaluate(self) -> dict[str, float]:
-        """The numbers a person watches, on held-out views."""
+        """Quality on held-out views, by name."""
 
     def state(self) -> tuple[State, dict[str, Any]]:
-        """Its tensors are those of the run, not copies, but for the order of views."""
+        """Tensors, which are not copied except for the order of views, and JSON-able numbers."""
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None: ...
 
@@ -64,9 +59,8 @@ class TrainingRun(Protocol):
 
 
 _SPINNING = (
-    "torch was imported before keyss, and its idle threads keep processors from others: on a CPU, training "
-    "takes up to 1.5 times as long; import keyss first, or set the environment variable OMP_WAIT_POLICY to "
-    "passive"
+    "torch was imported before keyss, and its idle threads keep cores busy: training on a CPU takes up to "
+    "1.5 times as long; import keyss first, or set the environment variable OMP_WAIT_POLICY to passive"
 )
 
 
@@ -81,18 +75,17 @@ def train(
     checkpoint_seconds: float = 180.0,
     evaluate_every: int = 500,
     reporter: Reporter | None = None,
-) -> float:
-    """Take `run` to its last iteration; returns the seconds spent, those before a resume included.
+) -> None:
+    """Take `run` to its last iteration.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds`, on Ctrl-C, SIGTERM and SIGHUP
-    (raises Interrupted) and at the end; with `resume`, it continues from there if the file exists.
-    `fingerprint` (JSON-able) is what must be the same for a resumed run to mean the same; a checkpoint of
-    another one raises InputError. The same seed gives the same run on a CPU, interrupted or not: the global
-    random state, which gsplat's densification draws from, is seeded here, kept in the checkpoint, and given
-    back to the caller.
+    (raises Interrupted), and at the end; with `resume`, training continues from it if the file exists.
+    Raises InputError for a checkpoint with another `fingerprint`: JSON-able settings and digests of inputs.
+    On a CPU, the same seed gives the same model, interrupted or not. The global random state, from which
+    gsplat's densification samples, is seeded, saved in the checkpoint, and restored for the caller.
 
-    Of several processes the first has the `checkpoint`, the `reporter` and the numbers; the others begin with
-    its state. A signal to one of them interrupts all. Where one ends, the first saves, and all raise
+    Of several processes, the first one has the `checkpoint` and the `reporter`; the others start from its
+    state. A signal to one of them interrupts all. When one ends, the first saves, and all raise
     OtherProcessError.
     """
     ranks = here()
@@ -101,77 +94,80 @@ def train(
     reporter = reporter or SilentReporter()
     if _threads.spinning and torch.get_num_threads() > 1:
         warnings.warn(_SPINNING, KeyssWarning, stacklevel=2)
-    spent = 0.0
+
+    def save(state: tuple[State, dict[str, Any]]) -> None:
+        if checkpoint is not None:
+            save_checkpoint(checkpoint, state[0], state[1] | {"fingerprint": fingerprint})
+
     saves = checkpoint is not None or ranks.count > 1
     with deferred(saves=saves) as interrupted, own_randomness(seed):
         if checkpoint is not None and resume and checkpoint.exists():
-            tensors, meta = load_checkpoint(checkpoint)
-            if meta.get("fingerprint") != fingerprint:
-                remedy = "give the same ones, or start anew with `overwrite=True`"
-                raise InputError(f"{checkpoint}: belongs to a run with other settings or inputs; {remedy}")
-            try:
-                torch.set_rng_state(tensors.pop("rng"))
-                run.load(tensors, meta)
-                spent = float(meta["seconds"])
-            except KeyError as error:
-                raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
+            _resume(run, checkpoint, fingerprint)
         if ranks.count > 1:
-            tensors, meta = run.state()
-            given = ranks.from_first(pack_state(tensors | {"rng": torch.get_rng_state()}, meta))
-            if not ranks.first:
-                tensors, meta = unpack_state(given)
-                torch.set_rng_state(tensors.pop("rng"))
-                run.load(tensors, meta)
-        started = saved = time.monotonic()
+            _load(run, *unpack_state(ranks.from_first(pack_state(*_state(run)))))
+        saved = time.monotonic()
         numbers: dict[str, float] = {}
+        before = None  # the state before a step that needs other processes
         look = reporter.look if isinstance(reporter, ModelReporter) else None
         model = run.gaussians if isinstance(run, Modelled) else None
         reporter.start(title, run.iterations, run.iteration)
-
-        def save(state: tuple[State, dict[str, Any]] | None = None) -> None:
-            if checkpoint is None:
-                return
-            tensors, meta = state or run.state()
-            tensors["rng"] = torch.get_rng_state()
-            seconds = spent + time.monotonic() - started
-            save_checkpoint(checkpoint, tensors, {**meta, "fingerprint": fingerprint, "seconds": seconds})
-
-        before = None  # a step that needs other processes
         try:
             while run.iteration < run.iterations:
-                before = run.state() if ranks.count > 1 else None
+                before = _state(run) if ranks.count > 1 else None
                 run.step()
                 before = None
                 if evaluate_every and run.iteration % evaluate_every == 0:
                     numbers = run.evaluate()
-                told = numbers
-                if reporter.loss_every and run.iteration % reporter.loss_every == 0:
-                    told = numbers | {"loss": float(run.loss)}
-                reporter.update(run.iteration, len(run), told)
+                with_loss = reporter.loss_every and run.iteration % reporter.loss_every == 0
+                loss = {"loss": float(run.loss)} if with_loss else {}
+                reporter.update(run.iteration, len(run), numbers | loss)
                 if look and model:
                     look(model)
                 if signum := ranks.agree(interrupted() or 0, len(run)):
-                    save()
+                    save(_state(run))
                     raise Interrupted(checkpoint, run.iteration, signal.Signals(signum))
                 if time.monotonic() - saved > checkpoint_seconds:
-                    save()
+                    save(_state(run))
                     saved = time.monotonic()
-            save()
+            save(_state(run))
         except OtherProcessError as error:
-            save(before)
-            saved_to = "nothing was saved" if checkpoint is None else REMEDY
-            raise OtherProcessError(f"{error}; {saved_to}") from error
+            save(before or _state(run))
+            remedy = "nothing was saved" if checkpoint is None else REMEDY
+            raise OtherProcessError(f"{error}; {remedy}") from error
         finally:
             reporter.finish()
-        return spent + time.monotonic() - started
+
+
+def _state(run: TrainingRun) -> tuple[State, dict[str, Any]]:
+    """The state of a run and of torch's global generator."""
+    tensors, meta = run.state()
+    return tensors | {"rng": torch.get_rng_state()}, meta
+
+
+def _load(run: TrainingRun, tensors: State, meta: dict[str, Any]) -> None:
+    """Restore what `_state` returned. Raises KeyError if something is missing."""
+    torch.set_rng_state(tensors.pop("rng"))
+    run.load(tensors, meta)
+
+
+def _resume(run: TrainingRun, checkpoint: Path, fingerprint: dict[str, Any]) -> None:
+    """Load a checkpoint. Raises InputError for one of another run or another version."""
+    tensors, meta = load_checkpoint(checkpoint)
+    if meta.get("fingerprint") != fingerprint:
+        remedy = "give the same ones, or start anew with `overwrite=True`"
+        raise InputError(f"{checkpoint}: belongs to a run with other settings or inputs; {remedy}")
+    try:
+        _load(run, tensors, meta)
+    except KeyError as error:
+        raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
 
 
 @contextmanager
 def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
-    """Turn signals into a flag that is looked at between steps; a second one acts at once.
+    """Turn signals into a flag that is checked between steps; a second signal acts at once.
 
-    Those that end a process are left to do so unless something `saves` then. Signals that the process ignores
-    stay ignored, as those of a program that `nohup` started.
+    SIGTERM and SIGHUP are left alone unless something `saves` then. Signals that the process ignores stay
+    ignored, as under `nohup`.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
@@ -191,7 +187,7 @@ def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
             signal.signal(signum, handler)
 
     handlers = {signum: signal.getsignal(signum) for signum in (ENDING if saves else (signal.SIGINT,))}
-    # None: a handler that is not Python's, which could not be put back.
+    # None: a handler that is not Python's and could not be restored.
     previous = {signum: old for signum, old in handlers.items() if old not in (signal.SIG_IGN, None)}
     try:
         for signum in previous:
@@ -199,5 +195,5 @@ def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
         yield lambda: seen
     finally:
         restore()
-    if seen is not None:  # nobody looked any more
+    if seen is not None:  # it came after the last check
         signal.raise_signal(seen)

@@ -38,8 +38,7 @@ class FitResult:
     """A fitted model and how it came about."""
 
     gaussians: Gaussians  # on the CPU
-    config: FitConfig
-    seconds: float
+    config: FitConfig  # with the seed
 
 
 class PlainRun:
@@ -141,8 +140,8 @@ def fit_scene(
     """
     config = (config or FitConfig()).seeded()
     run = PlainRun(scene, config, torch.device(device))
-    seconds = _train(run, title, {"scene": scene.digest()}, checkpoint, resume, reporter)
-    return FitResult(without_faint(run.gaussians().to("cpu"), config.prune_opacity), replace(config), seconds)
+    _train(run, title, {"scene": scene.digest()}, checkpoint, resume, reporter)
+    return FitResult(without_faint(run.gaussians().to("cpu"), config.prune_opacity), config)
 
 
 def refit_model(
@@ -156,7 +155,7 @@ def refit_model(
     checkpoint: Path | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
-) -> FitResult:
+) -> Gaussians:
     """Train `model` on to the training views of `scene`, with as many Gaussians as it has.
 
     `rate`: a factor on all rates of `config`, whose degree and cap do not count. Raises as `fit_scene`.
@@ -165,8 +164,8 @@ def refit_model(
     config = replace(config.seeded(), sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
     run = PlainRun(scene, config, torch.device(device), model)
     inputs = {"scene": scene.digest(), "model": model.digest()}
-    seconds = _train(run, title, inputs, checkpoint, resume, reporter)
-    return FitResult(run.gaussians().to("cpu"), config, seconds)
+    _train(run, title, inputs, checkpoint, resume, reporter)
+    return run.gaussians().to("cpu")
 
 
 def _train(
@@ -176,10 +175,10 @@ def _train(
     checkpoint: Path | None,
     resume: bool,
     reporter: Reporter | None,
-) -> float:
-    """Seconds that it took; see `train`. `inputs`: digests of what the run starts from."""
+) -> None:
+    """See `train`. `inputs`: digests of what the run starts from."""
     config = run.config
-    return train(
+    train(
         run,
         title,
         fingerprint={**inputs, "config": asdict(config)},

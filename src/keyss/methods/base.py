@@ -77,7 +77,6 @@ class Stego:
 
     gaussians: Gaussians  # to be published
     opened: tuple[Opened, ...]  # the secrets as they come out again with their keys
-    seconds: float  # of hiding alone, without plain models
     iterations: int = 0  # of the method's own training
     details: Mapping[str, Any] = field(default_factory=dict)  # numbers of its own, for metrics.json
     verified: bool = False  # whether `opened` was read from `gaussians` with the keys

@@ -229,8 +229,8 @@ def train_jointly(
     cover: Source,
     secrets: Sequence[Source],
     context: Context,
-) -> tuple[TrainingT, float]:
-    """Train what `begin` makes of the scenes, all placed in the cover's frame; also returns the seconds.
+) -> TrainingT:
+    """Train what `begin` makes of the scenes, all placed in the cover's frame.
 
     Raises Interrupted, and InputError for a checkpoint of another run.
     """
@@ -241,7 +241,7 @@ def train_jointly(
         [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
     )
     fit = run.options.fit
-    seconds = train(
+    train(
         run,
         "hide",
         fingerprint={
@@ -257,4 +257,4 @@ def train_jointly(
         evaluate_every=fit.evaluate_every,
         reporter=context.reporter,
     )
-    return run, seconds
+    return run

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -35,7 +36,8 @@ class Running:
     """Work that has begun and has not ended."""
 
     stage: str
-    arguments: dict[str, Any]  # what must be the same for it to be continued
+    arguments: dict[str, Any]  # must be equal to resume
+    seconds: float = 0.0  # of its interrupted parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,8 @@ class RunFolder:
         check_not_published(self.path)
         self._was_there = self.path.exists()
         self._continues = False
+        self._started = time.monotonic()
+        self.earlier_seconds = 0.0  # of the interrupted parts of a resumed run
         if self.path.is_symlink() or self._was_there:
             if not self.path.is_dir():
                 raise OutputError(f"{self.path} exists and is not a folder")
@@ -100,6 +104,7 @@ class RunFolder:
             if resume:
                 self._check_same(running)
                 self._continues = True
+                self.earlier_seconds = running.seconds
             elif not overwrite and (in_use or self._has_checkpoints()):
                 raise OutputError(
                     f"{self.path} holds an interrupted run ({running.stage}): `resume=True` with the same "
@@ -151,7 +156,7 @@ class RunFolder:
                 if not self._continues:
                     _drop_unfinished(self.path, before)
                 shutil.rmtree(self.path / _STAGING, ignore_errors=True)
-                self._save(replace(before, running=Running(stage=self.stage, arguments=self.arguments)))
+                self._save(replace(before, running=self._running()))
                 self._names: list[str] = []
                 try:
                     yield self
@@ -224,6 +229,7 @@ class RunFolder:
         shutil.rmtree(self.path / _STAGING, ignore_errors=True)
         there = read_manifest(self.path)
         if self._has_checkpoints():
+            self._save(replace(there, running=self._running()))
             return
         _drop_unfinished(self.path, there)
         there = replace(there, running=None)
@@ -231,6 +237,10 @@ class RunFolder:
             self._save(there)
         else:
             (self.path / MANIFEST).unlink(missing_ok=True)
+
+    def _running(self) -> Running:
+        seconds = self.earlier_seconds + time.monotonic() - self._started
+        return Running(stage=self.stage, arguments=self.arguments, seconds=seconds)
 
     def _has_checkpoints(self) -> bool:
         folder = self.path / _CHECKPOINTS

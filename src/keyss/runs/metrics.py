@@ -25,7 +25,7 @@ class HideMetrics(HidingQuality):
     # In which the cover and each secret were drawn, those of the plain model included where training went on
     # from it; None: that one was given, and nothing is known of it.
     steps: tuple[int | None, ...] = ()
-    seconds: float  # of hiding, without fitting plain models and measuring
+    seconds: float  # of the whole run, interrupted parts included
     width: int  # pixels of the cover's test views
     seed: int
     against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, as they open from the written files
@@ -40,6 +40,6 @@ class FitMetrics(ImageQuality):
     keyss: str = __version__
     gaussians: int
     iterations: int
-    seconds: float
+    seconds: float  # of the whole run, interrupted parts included
     width: int  # pixels of the photos
     seed: int

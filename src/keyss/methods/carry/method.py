@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -103,14 +102,14 @@ class CarryMethod:
         room = room_for(cover.model, options, context.entropy)
         plain = [each.model for each in secrets]
         viewpoints = [Viewpoints.of(each.scene) for each in secrets]
-        models, seconds = list(plain), 0.0
+        models = list(plain)
         if any(options.refits):
             sizes = room.refit_sizes(plain, viewpoints)
             for index, (secret, steps, (count, degree)) in enumerate(
                 zip(secrets, options.refits, sizes, strict=True)
             ):
                 if steps:
-                    found = refitted(
+                    models[index] = refitted(
                         secret.model.with_sh_degree(degree),
                         secret.scene,
                         count,
@@ -119,15 +118,11 @@ class CarryMethod:
                         photos=secret.photos,
                         name=role_of(index + 1, len(secrets) + 1),
                     )
-                    models[index], seconds = found.gaussians, seconds + found.seconds
-        start = time.monotonic()
         embedded = room.embed([each.key for each in secrets], models, viewpoints, context.entropy)
-        seconds += time.monotonic() - start
         details = embedded.details | _losses(room, cover.model, plain, models, embedded)
         return Stego(
             embedded.stego,
             embedded.opened,
-            seconds,
             max(options.refits),
             details,
             verified=True,

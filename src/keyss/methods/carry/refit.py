@@ -8,7 +8,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
-from keyss.fitting.plain import FitResult, refit_model
+from keyss.fitting.plain import refit_model
 from keyss.fitting.reporting import of_secret
 from keyss.methods.base import Context
 from keyss.rendering.contributions import contributions
@@ -27,7 +27,7 @@ def refitted(
     *,
     photos: bool,
     name: str,
-) -> FitResult:
+) -> Gaussians:
     """`secret` trained on with the `count` Gaussians that contribute most.
 
     Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.

@@ -79,10 +79,10 @@ class KeyssMethod:
             embeddings = [DerivedKey(key, derivation).embedding() for key in keys]
         else:
             embeddings = [encoder(key) for key in keys]
-        run, seconds = train_jointly(
+        run = train_jointly(
             lambda placed: KeyssTraining(placed, embeddings, options, context.device), cover, secrets, context
         )
-        return replace(_published(run, keys, context.entropy or os.urandom(32)), seconds=seconds)
+        return _published(run, keys, context.entropy or os.urandom(32))
 
 
 def _published(run: KeyssTraining, keys: Sequence[str], entropy: bytes) -> Stego:
@@ -108,7 +108,7 @@ def _published(run: KeyssTraining, keys: Sequence[str], entropy: bytes) -> Stego
         found = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
         warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
         details["appended_because"] = str(error)
-    return Stego(found, tuple(map(HiddenSecret.of, payloads)), 0.0, run.iterations, details)
+    return Stego(found, tuple(map(HiddenSecret.of, payloads)), run.iterations, details)
 
 
 def encoder_of(options: KeyssOptions) -> Callable[[str], Tensor] | None:

@@ -47,7 +47,7 @@ class BoundMethod(Peer):
         (secret,) = secrets
         tensors = {name: getattr(secret.model, name) for name in _NAMES}
         payload = HandedTensors(tensors).payload(self.name)
-        return Stego(cover.model, (self.unpack(payload),), 0.0, handed=(payload,))
+        return Stego(cover.model, (self.unpack(payload),), handed=(payload,))
 
     def open(self, handed: HandedTensors) -> HandedSecret:
         model = Gaussians(*handed.taken(_NAMES))

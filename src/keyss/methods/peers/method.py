@@ -87,9 +87,9 @@ class JointPeer(Peer):
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
         """Train both scenes together. Raises Interrupted, and InputError for another run's checkpoint."""
-        run, seconds = train_jointly(
+        run = train_jointly(
             lambda placed: self.training(placed, options, context.device), cover, secrets, context
         )
         stego, handed = self.publish(run)
         payload = handed.payload(self.name)
-        return Stego(stego, (self.unpack(payload),), seconds, run.iterations, handed=(payload,))
+        return Stego(stego, (self.unpack(payload),), run.iterations, handed=(payload,))
