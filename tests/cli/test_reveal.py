@@ -229,7 +229,7 @@ class TestVerify:
             (lambda m: m.log_scales[3].fill_(30), "as large"),
             (lambda m: m.quats[3].zero_(), "quaternion of length 0"),
             (lambda m: m.sh[3].fill_(1e6), "harmonics beyond"),
-            (lambda m: m.opacity_logits.fill_(-12), "too transparent"),
+            (lambda m: m.opacity_logits.fill_(-12), "all Gaussians are invisible"),
             (
                 lambda m: [values[:300].copy_(values[300:600]) for values in vars(m).values()],
                 "equal to others",

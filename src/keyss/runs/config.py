@@ -1,4 +1,4 @@
-"""`config.json`: what a run was told, and by which a later one finds its scenes again."""
+"""`config.json`: the arguments of a run, from which later commands load its scenes again."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ OptionsT = TypeVar("OptionsT", bound=MethodOptions)
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Generic[OptionsT]):
-    """Of a hiding. Scenes are absolute paths of folders or models, None for what was in memory only."""
+    """Arguments of a hiding. Scenes are absolute paths of folders or models, None for scenes in memory."""
 
     version: int = 1
     keyss: str = __version__  # the program that wrote it
     method: str
     cover: str | None
     secrets: tuple[str | None, ...]
-    models_given: tuple[bool, ...]  # of the cover, then of the secrets: a plain model, and not fitted
+    models_given: tuple[bool, ...]  # of the cover and the secrets; False: the plain model is fitted
     views: ViewOptions
     payloads: tuple[str, ...]  # `secret_ids` of the secrets
     options: OptionsT  # of the method
@@ -37,7 +37,7 @@ class RunConfig(Generic[OptionsT]):
 
 @dataclass(frozen=True, kw_only=True)
 class FitRunConfig:
-    """Of a plain fit."""
+    """Arguments of a plain fit."""
 
     version: int = 1
     keyss: str = __version__
@@ -48,11 +48,10 @@ class FitRunConfig:
 
 def read_config(path: Path) -> RunConfig[MethodOptions]:
     """The configuration of a hiding, with the options of its method. Raises InputError."""
-    # Fields that a class does not have are passed over: so every method's can be read as far as its name.
+    # Unknown fields are skipped, so the name can be read whatever the method.
     name = read_record(path, RunConfig[MethodOptions]).method
     if name not in registry.METHODS:
-        known = ", ".join(registry.METHODS)
-        raise InputError(f"{path}: method {name!r} is not known; this program has {known}")
+        raise InputError(f"{path}: expected a method of {', '.join(registry.METHODS)}, got {name!r}")
     generic: Any = RunConfig
     config: RunConfig[MethodOptions] = read_record(path, generic[registry.get(name).options])
     if config.options.fit.seed is None:
@@ -61,6 +60,6 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
 
 
 def secret_ids(seed: int, opened: Iterable[Opened]) -> tuple[str, ...]:
-    """By what a run of this seed knows its secrets; the same secret has another name in every run."""
-    made_of = (f"keyss/v1/secret {seed} {each.fingerprint()}".encode() for each in opened)
-    return tuple(hashlib.sha256(data).hexdigest()[:16] for data in made_of)
+    """Names of the secrets in a run of this seed; the same secret has another name in every run."""
+    texts = (f"keyss/v1/secret {seed} {secret.fingerprint()}" for secret in opened)
+    return tuple(hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts)

@@ -1,25 +1,20 @@
 """The verb `info`: what is in a file or a folder.
 
-What one kind of them needs is imported where it is used: all of it together takes seconds.
+Libraries are imported where they are used: loading all of them takes seconds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from keyss.core.errors import InputError
 from keyss.files.foreign import what_it_is
 from keyss.files.streams import is_standard
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import numpy as np
-    from numpy.typing import NDArray
-    from torch import Tensor
-
     from keyss.core.scene import Scene
     from keyss.runs.metrics import FitMetrics, HideMetrics
 
@@ -37,11 +32,11 @@ class RunInfo:
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """A model's file; it does not tell whether something is hidden in it."""
+    """A model's file, with or without a secret."""
 
     kind: str
     path: str
-    bytes: int | None  # None: of standard input
+    bytes: int | None  # None for standard input
     gaussians: int
     sh_degree: int
     bounding_box: tuple[Corner, Corner]
@@ -63,34 +58,19 @@ class SceneInfo:
 
 
 def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
-    """What is in a model, "-" for standard input, a scene folder or a folder of results. Raises InputError.
+    """Describe a model ("-" for standard input), a scene folder, or a folder of results. Raises InputError.
 
-    Photos that a scene names but that are not there are left out, with a KeyssWarning.
+    Skips photos that a scene names but that do not exist, with a KeyssWarning.
     """
+    path = Path(path)
     try:
-        return _info(Path(path))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
-    if not is_standard(path):
+        if is_standard(path):
+            return _model_info(path)
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
-        if path.is_dir():
-            return _folder_info(path)
-
-    if path.suffix.lower() == ".ply" and (rows := _ply_rows(path)) is not None:
-        return _table_info(path, *rows)
-
-    from keyss.files.models import is_model_path, known_suffixes
-
-    if not (is_standard(path) or is_model_path(path)):
-        raise InputError(
-            f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
-            f"{what_it_is(path)}"
-        )
-    return _model_info(path)
+        return _folder_info(path) if path.is_dir() else _model_info(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _folder_info(path: Path) -> RunInfo | SceneInfo:
@@ -106,45 +86,43 @@ def _folder_info(path: Path) -> RunInfo | SceneInfo:
     return _scene_info(load_scene(path, skip_missing=True))
 
 
-def _ply_rows(path: Path) -> tuple[list[str], NDArray[np.float32]] | None:
-    """Of a model in plain PLY the properties' names and values; None for whatever else has its name."""
-    from keyss.files.ply_rows import is_compressed, read_rows
-
-    with path.open("rb") as file:
-        begins = file.read(3) == b"ply"
-    return read_rows(path) if begins and not is_compressed(path) else None
-
-
-def _table_info(path: Path, names: list[str], rows: NDArray[np.float32]) -> ModelInfo:
-    """Without torch, which takes longer to load than all the rest; other formats are unpacked with it."""
+def _model_info(path: Path) -> ModelInfo:
     import numpy as np
 
-    logits = rows[:, names.index("opacity")]
-    low, high = rows[:, :3].min(axis=0), rows[:, :3].max(axis=0)
-    return ModelInfo(
-        kind="3DGS model",
-        path=str(path),
-        bytes=path.stat().st_size,
-        gaussians=len(rows),
-        sh_degree=round(((len(names) - 11) // 3) ** 0.5) - 1,
-        bounding_box=(_rounded(low), _rounded(high)),
-        nearly_transparent=round(float((logits < np.log(0.05 / 0.95)).mean()), 4),
-    )
+    if rows := _ply_rows(path):
+        means, logits, sh_degree = rows
+    else:
+        from keyss.files.models import is_model_path, known_suffixes, read_model
 
-
-def _model_info(path: Path) -> ModelInfo:
-    from keyss.files.models import read_model
-
-    model = read_model(path)
+        if not (is_standard(path) or is_model_path(path)):
+            raise InputError(
+                f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
+                f"{what_it_is(path)}"
+            )
+        model = read_model(path)
+        means, logits, sh_degree = model.means.numpy(), model.opacity_logits.numpy(), model.sh_degree
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
         bytes=None if is_standard(path) else path.stat().st_size,
-        gaussians=len(model),
-        sh_degree=model.sh_degree,
-        bounding_box=(_rounded(model.means.amin(0)), _rounded(model.means.amax(0))),
-        nearly_transparent=round(float((model.opacities < 0.05).float().mean()), 4),
+        gaussians=len(means),
+        sh_degree=sh_degree,
+        bounding_box=(_rounded(means.min(axis=0)), _rounded(means.max(axis=0))),
+        nearly_transparent=round(float((logits < np.log(0.05 / 0.95)).mean()), 4),
     )
+
+
+def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
+    """Means, opacity logits and SH degree of a plain PLY file, without torch; None for other files."""
+    from keyss.files.ply_rows import is_compressed, read_rows
+
+    if path.suffix.lower() != ".ply" or is_compressed(path):
+        return None
+    with path.open("rb") as file:
+        if file.read(3) != b"ply":
+            return None
+    names, rows = read_rows(path)
+    return rows[:, :3], rows[:, names.index("opacity")], round(((len(names) - 11) // 3) ** 0.5) - 1
 
 
 def _scene_info(scene: Scene) -> SceneInfo:
@@ -161,5 +139,5 @@ def _scene_info(scene: Scene) -> SceneInfo:
     )
 
 
-def _rounded(values: Tensor | Iterable[float]) -> tuple[float, ...]:
+def _rounded(values: Iterable[Any]) -> tuple[float, ...]:
     return tuple(round(float(x), 4) for x in values)

@@ -1,4 +1,4 @@
-"""What lies in a folder of results: names of files, and what writes and reads them."""
+"""Names of the files in a folder of results, and writers for them."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ from keyss.runs.folder import PRIVATE, PUBLISH
 from keyss.runs.records import record_bytes
 
 STEGO = f"{PUBLISH}/stego.ply"
-# Whatever the format.
+# In any format.
 STEGOS = (STEGO, *(f"{PUBLISH}/stego{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
 MODEL = "model.ply"  # of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
-HANDED = f"{PRIVATE}/hand-over"  # for those who are to see a secret, and nobody else
+HANDED = f"{PRIVATE}/hand-over"  # for those who may see a secret
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder is that of a run; not, where that cannot be seen."""
+    """True for the folder of a run; False if it cannot be read."""
     return os.path.isfile(folder / CONFIG)
 
 
 def model_in(folder: Path) -> Path | None:
-    """The model that a run came to, where `folder` is that of a run or the part of it that is published."""
-    names = (*STEGOS, MODEL, *(Path(each).name for each in (*STEGOS, MODEL)))
+    """The resulting model of a run; `folder` is the run's, or its `publish/`."""
+    names = (*STEGOS, MODEL, *(Path(name).name for name in (*STEGOS, MODEL)))
     return next((folder / name for name in names if os.path.isfile(folder / name)), None)
 
 
 def stego_name(stego: Gaussians) -> str:
-    """What the file of a published model is called in the folder of a run."""
+    """The name of the file of a published model in the folder of a run."""
     if isinstance(stego, DecodedGaussians):
         return f"{PUBLISH}/stego{DECODED_SUFFIX}"
     return f"{PUBLISH}/stego{suffix_of(stego)}"
 
 
 def stego_in(folder: Path) -> Path:
-    """The published model of a run; where there is none, where it usually is."""
+    """The path of a run's published model, or its usual path if there is none."""
     return folder / next((name for name in STEGOS if os.path.isfile(folder / name)), STEGO)
 
 
 def run_folder(path: Path) -> Path:
     """`path`, if it is the folder of a run.
 
-    Raises InputError, which names the run that `path` lies in, where there is one.
+    Otherwise raises InputError, which names the run that contains `path` if there is one.
     """
     if is_run(path):
         return path
@@ -65,30 +65,30 @@ def run_folder(path: Path) -> Path:
     expected = f"{path}: expected the folder of a run, as `keyss hide` writes it"
     if not os.path.lexists(path):
         raise InputError(f"{expected}; there is nothing of that name")
-    found = "a folder" if os.path.isdir(path) else "a file"
-    run = next((each for each in path.absolute().parents[:2] if is_run(each)), None)
+    kind = "a folder" if os.path.isdir(path) else "a file"
+    run = next((parent for parent in path.absolute().parents[:2] if is_run(parent)), None)
     if run is not None:
-        raise InputError(f"{expected}, found {found} in one; give {run}")
-    raise InputError(f"{expected}, found {found} that is none: {CONFIG} is missing there")
+        raise InputError(f"{expected}, found {kind} in one; give {run}")
+    raise InputError(f"{expected}, found {kind} without {CONFIG}")
 
 
 def plain_names(secrets: int) -> list[str]:
-    """Files of the plain models of the cover and of so many secrets."""
+    """Files of the plain models of the cover and of the secrets."""
     return [f"{PRIVATE}/cover.ply"] + [f"{PRIVATE}/secret-{index}.ply" for index in range(1, secrets + 1)]
 
 
 def bound_names(secrets: int) -> list[str]:
-    """Files of plain 3DGS with as many steps as the scenes had, where that is more than plain models had."""
+    """Files of plain 3DGS with as many steps as the scenes, if these are more than those of plain models."""
     return [f"{PRIVATE}/bound-{index}.ply" for index in ("cover", *range(1, secrets + 1))]
 
 
 def handed_names(secrets: int) -> list[str]:
-    """Files that are handed over for so many secrets, by methods that do so."""
+    """Files to hand over for the secrets, with methods that need them."""
     return [f"{HANDED}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]
 
 
 def writers(contents: Mapping[str, Any]) -> dict[str, Callable[[Path], None]]:
-    """For `RunFolder.write`, of each file's content: a model, bytes as they are, or a record."""
+    """Writers for `RunFolder.write` of models, bytes and records, by name."""
     return {name: _writer(content) for name, content in contents.items()}
 
 

@@ -1,8 +1,8 @@
-"""The folder of a run: what it holds, who is at work in it, and what of it this program may remove.
+"""The folder of a run: its files, the process at work in it, and which files keyss may remove.
 
-`publish/` holds what may be given away and nothing else; `private/` (mode 0700) holds what this program keeps
-to itself, in files of mode 0600: among them the manifest, which lists every file that was written here, and
-while something runs the lock, the checkpoints and the files that are not finished.
+`publish/` holds what may be given away and nothing else. `private/` (mode 0700, files 0600) holds the rest:
+the manifest, which lists every file that keyss wrote, and while a run is at work its lock, checkpoints and
+unfinished files.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ PUBLISH, PRIVATE = "publish", "private"
 MANIFEST = f"{PRIVATE}/manifest.json"
 _LOCK, _CHECKPOINTS, _STAGING = (f"{PRIVATE}/{name}" for name in ("lock", "checkpoint", "unfinished"))
 
-_LONGEST_SHOWN = 60  # characters of an argument in a message
+_MAX_SHOWN = 60  # characters of an argument in a message
 
 
 @dataclass(frozen=True, kw_only=True)
 class Running:
-    """Work that has begun and has not ended."""
+    """A stage that has begun and has not ended."""
 
     stage: str
     arguments: dict[str, Any]  # must be equal to resume
@@ -42,25 +42,24 @@ class Running:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What this program wrote into a folder."""
+    """The files that keyss wrote into a folder."""
 
     version: int = 1
     keyss: str = __version__
     running: Running | None = None
-    files: dict[str, tuple[str, ...]] = field(default_factory=dict)  # paths in the folder, by stage
+    files: dict[str, tuple[str, ...]] = field(default_factory=dict)  # relative paths, by stage
 
 
 class RunFolder:
-    """A folder for the results of one stage: of hiding, or of an audit of what was hidden, for example.
+    """A folder for the results of one stage, such as hiding, or an audit of a finished hiding.
 
-    `arguments`: JSON-able, what `resume` compares. `onto`: stages whose results are there already and stay;
-    those of all other stages are replaced, which takes `overwrite`. `writes`: names of files to come, as far
-    as they are known; one that is somebody else's is never replaced. `inputs`: what is read; none of it may
-    be among what is replaced.
+    `arguments`: JSON-able, must be equal to resume. `onto`: stages whose results stay; replacing those of
+    other stages takes `overwrite`. `writes`: names of files to come, as far as they are known; files of
+    others with these names are refused. `inputs`: files that are read and must not be replaced.
 
-    Nothing is created before `work`. Raises OutputError when the folder is not empty and neither `overwrite`
-    nor `resume` is given, when there is nothing to resume, and when another process is at work in it;
-    UsageError for both at once.
+    Nothing is created before `work`. Raises OutputError if the folder is not empty and neither `overwrite`
+    nor `resume` is given, if there is nothing to resume, and if another process is at work in it; UsageError
+    for both at once.
     """
 
     def __init__(
@@ -76,34 +75,34 @@ class RunFolder:
         resume: bool = False,
     ) -> None:
         self.path, self.stage, self.onto = Path(path), stage, frozenset(onto)
-        # As they will be read again: tuples become lists.
+        # As a manifest returns them: tuples become lists.
         self.arguments: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(dict(arguments or {})))
         if overwrite and resume:
             raise UsageError("`overwrite=True` starts anew and `resume=True` continues: give one of them")
         check_not_published(self.path)
-        self._was_there = self.path.exists()
-        self._continues = False
+        self._existed = self.path.exists()
+        self._resumes = False
         self._started = time.monotonic()
         self.earlier_seconds = 0.0  # of the interrupted parts of a resumed run
-        if self.path.is_symlink() or self._was_there:
+        if self.path.is_symlink() or self._existed:
             if not self.path.is_dir():
                 raise OutputError(f"{self.path} exists and is not a folder")
             self._check(overwrite, resume)
-            if overwrite:
-                self._refuse_inputs(inputs)
+            for name in self._replaced(read_manifest(self.path)) if overwrite else ():
+                check_not_an_input(self.path / name, inputs)
         for name in writes:
             _refuse_foreign(self.path, name)
 
     def _check(self, overwrite: bool, resume: bool) -> None:
-        """Raise OutputError where this stage must not begin."""
+        """Raise OutputError if this stage must not begin."""
         if (pid := held_by(self.path / _LOCK)) is not None:
             raise OutputError(f"{self.path}: process {pid} is at work in this folder")
-        there = read_manifest(self.path)
-        in_use = set(there.files) - self.onto or (there == Manifest() and any(self.path.iterdir()))
-        if (running := there.running) is not None:
+        manifest = read_manifest(self.path)
+        in_use = set(manifest.files) - self.onto or (manifest == Manifest() and any(self.path.iterdir()))
+        if (running := manifest.running) is not None:
             if resume:
                 self._check_same(running)
-                self._continues = True
+                self._resumes = True
                 self.earlier_seconds = running.seconds
             elif not overwrite and (in_use or self._has_checkpoints()):
                 raise OutputError(
@@ -111,29 +110,25 @@ class RunFolder:
                     "arguments continues it, `overwrite=True` drops it"
                 )
         elif in_use and resume:
-            found = f"a finished run ({self.stage})" if self.stage in there.files else "something else"
-            raise OutputError(f"{self.path} holds {found}, and no interrupted run that could be resumed")
+            content = f"a finished run ({self.stage})" if self.stage in manifest.files else "something else"
+            raise OutputError(f"{self.path} holds {content}, and no interrupted run that could be resumed")
         elif in_use and not overwrite:
             raise OutputError(
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
             )
 
-    def _refuse_inputs(self, inputs: Collection[Path]) -> None:
-        """Raise UsageError if one of them would be replaced."""
-        for stage, names in read_manifest(self.path).files.items():
-            for name in names if stage not in self.onto else ():
-                check_not_an_input(self.path / name, inputs)
+    def _replaced(self, manifest: Manifest) -> list[str]:
+        """Names of the files that this stage replaces."""
+        return [name for stage, names in manifest.files.items() if stage not in self.onto for name in names]
 
     def _check_same(self, running: Running) -> None:
-        """Raise OutputError unless this is the run that was interrupted."""
+        """Raise OutputError unless `running` has the stage and the arguments of this run."""
         if running.stage != self.stage:
             raise OutputError(
                 f"{self.path} holds an interrupted run of another kind ({running.stage}, not {self.stage})"
             )
-        old, new = running.arguments, self.arguments
-        differ = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
-        if differ:
-            changes = "; ".join(f"{name}: {_differences(old.get(name), new.get(name))}" for name in differ)
+        if running.arguments != self.arguments:
+            changes = _differences(running.arguments, self.arguments, "; ", ": ")
             raise OutputError(
                 f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
                 "or start anew with `overwrite=True`"
@@ -141,53 +136,53 @@ class RunFolder:
 
     @contextmanager
     def work(self) -> Iterator[RunFolder]:
-        """Claims the folder while the block runs.
+        """Claim the folder while the block runs.
 
-        At its end the files that were written appear, all or none, those that they replace are removed, and
-        checkpoints too. When the block fails, checkpoints stay if there are any, to be resumed from; else the
-        folder is left as it was. Raises OutputError.
+        At its end, the written files appear, all or none; the files that they replace and checkpoints are
+        removed. If the block fails, checkpoints stay to resume from; without checkpoints, the folder is left
+        as it was. Raises OutputError.
         """
         try:
-            with _typed(self.path):
+            with _os_errors(self.path):
                 self.path.mkdir(parents=True, exist_ok=True)
-                _keep_private(self.path)
+                _make_private(self.path)
             with lock(self.path / _LOCK):
-                before = read_manifest(self.path)  # again: now nobody else changes it
-                if not self._continues:
-                    _drop_unfinished(self.path, before)
+                manifest = read_manifest(self.path)  # again: from now on, no other process changes it
+                if not self._resumes:
+                    _drop_unfinished(self.path, manifest)
                 shutil.rmtree(self.path / _STAGING, ignore_errors=True)
-                self._save(replace(before, running=self._running()))
+                self._save(replace(manifest, running=self._running()))
                 self._names: list[str] = []
                 try:
                     yield self
-                    with _typed(self.path):
+                    with _os_errors(self.path):
                         self._finish()
                 except BaseException:
                     self._give_up()
                     raise
         finally:
             _remove_empty(self.path / PRIVATE)
-            if not self._was_there:
+            if not self._existed:
                 _remove_empty(self.path)
 
     @property
     def checkpoints(self) -> Path:
         """The folder for checkpoints, created."""
         folder = self.path / _CHECKPOINTS
-        with _typed(folder):
+        with _os_errors(folder):
             folder.mkdir(exist_ok=True, mode=0o700)
         return folder
 
     def write(self, writers: Mapping[str, Callable[[Path], None]]) -> Path:
-        """Call each writer with a path to write a file or a folder to; returns where they lie until the end.
+        """Call each writer with a path to write a file or a folder to; returns the folder that holds them.
 
-        Names are paths in the run's folder. Raises OutputError.
+        Names are paths in the run's folder, where the files appear at the end. Raises OutputError.
         """
         staging = self.path / _STAGING
-        with _typed(self.path):
+        with _os_errors(self.path):
             for name, write in writers.items():
                 _refuse_foreign(self.path, name)
-                _make_folders(self.path, f"{_STAGING}/{name}")
+                _make_parents(self.path, f"{_STAGING}/{name}")
                 write(staging / name)
                 written = [staging / name]
                 if written[0].is_dir():
@@ -196,45 +191,42 @@ class RunFolder:
         return staging
 
     def keep(self, stage: str, name: str, write: Callable[[Path], None]) -> None:
-        """Write a file of another stage; it stays whatever becomes of this one. Raises OutputError."""
-        with _typed(self.path):
-            _write_entered(self.path, stage, name, write)
+        """Write a file of another stage, which stays even if this stage fails. Raises OutputError."""
+        with _os_errors(self.path):
+            _write_listed(self.path, stage, name, write)
 
     def _finish(self) -> None:
-        there = read_manifest(self.path)
-        kept = {stage: names for stage, names in there.files.items() if stage in self.onto}
-        for stage, names in there.files.items():
-            if stage not in kept:
-                _remove(self.path, names)
-        # Listed before they appear: whatever happens in between, the manifest knows them.
-        there = replace(there, files=kept | {self.stage: tuple(self._names)})
-        self._save(there)
+        manifest = read_manifest(self.path)
+        kept = {stage: names for stage, names in manifest.files.items() if stage in self.onto}
+        _remove(self.path, self._replaced(manifest))
+        # Listed before they appear: the manifest knows them, whatever happens in between.
+        manifest = replace(manifest, files=kept | {self.stage: tuple(self._names)})
+        self._save(manifest)
         try:
             for name in self._names:
-                staged, target = self.path / _STAGING / name, self.path / name
-                _make_folders(self.path, name)
+                staged = self.path / _STAGING / name
+                _make_parents(self.path, name)
                 if name.startswith(f"{PUBLISH}/"):
                     staged.chmod(0o666 & ~_umask())
-                os.replace(staged, target)
+                os.replace(staged, self.path / name)
         except BaseException:
             _remove(self.path, self._names)
-            self._save(replace(there, files=kept))
+            self._save(replace(manifest, files=kept))
             raise
-        # Last: what lies there is known as our own for as long as the manifest says that something runs.
-        _drop_unfinished(self.path, there)
-        self._save(replace(there, running=None))
+        # Last: unfinished files are known as our own only while the manifest says that a stage is running.
+        _drop_unfinished(self.path, manifest)
+        self._save(replace(manifest, running=None))
 
     def _give_up(self) -> None:
         """Leave what can be resumed, or the folder as it was."""
         shutil.rmtree(self.path / _STAGING, ignore_errors=True)
-        there = read_manifest(self.path)
+        manifest = read_manifest(self.path)
         if self._has_checkpoints():
-            self._save(replace(there, running=self._running()))
+            self._save(replace(manifest, running=self._running()))
             return
-        _drop_unfinished(self.path, there)
-        there = replace(there, running=None)
-        if there.files:
-            self._save(there)
+        _drop_unfinished(self.path, manifest)
+        if manifest.files:
+            self._save(replace(manifest, running=None))
         else:
             (self.path / MANIFEST).unlink(missing_ok=True)
 
@@ -244,7 +236,7 @@ class RunFolder:
 
     def _has_checkpoints(self) -> bool:
         folder = self.path / _CHECKPOINTS
-        # What begins with a dot is what a killed process did not write to its end.
+        # A name with a leading dot is a file that a killed process did not finish.
         return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
 
     def _save(self, manifest: Manifest) -> None:
@@ -252,41 +244,39 @@ class RunFolder:
 
 
 def check_not_published(path: Path | str) -> None:
-    """Raise OutputError for a place in a run's `publish/`, which is given away."""
+    """Raise OutputError for a path in a run's `publish/`, which is given away."""
     real = Path(os.path.realpath(path))
     for folder in (real, *real.parents):
         if folder.name == PUBLISH and (folder.parent / MANIFEST).exists():
-            raise OutputError(
-                f"{path} would be given away with all that is in {folder}: choose another place"
-            )
+            raise OutputError(f"{path} would be given away with everything in {folder}: choose another place")
 
 
 def clear(folder: Path) -> None:
-    """Remove all that this program wrote into a folder, and the folder if nothing else is in it."""
+    """Remove all files that keyss wrote into a folder, and the folder if it is empty then."""
     if not (folder / PRIVATE).is_dir():
         return
-    with _typed(folder):
+    with _os_errors(folder):
         with lock(folder / _LOCK):
-            there = read_manifest(folder)
-            _drop_unfinished(folder, there)
-            _remove(folder, [name for names in there.files.values() for name in names])
+            manifest = read_manifest(folder)
+            _drop_unfinished(folder, manifest)
+            _remove(folder, [name for names in manifest.files.values() for name in names])
             (folder / MANIFEST).unlink(missing_ok=True)
         _remove_empty(folder / PRIVATE)
         _remove_empty(folder)
 
 
 def write_again(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
-    """Write a file of a finished stage anew. Raises OutputError, also where a process is at work."""
-    with _typed(folder):
-        _keep_private(folder)
+    """Replace a file of a finished stage. Raises OutputError, also if a process is at work in the folder."""
+    with _os_errors(folder):
+        _make_private(folder)
         with lock(folder / _LOCK):
-            _write_entered(folder, stage, name, write)
+            _write_listed(folder, stage, name, write)
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """What this program wrote into a folder; empty where there is no manifest.
+    """The manifest of a folder, empty if there is none.
 
-    Raises OutputError for a damaged one, and for one that names what is not in the folder.
+    Raises OutputError for a damaged one, and for names outside the folder.
     """
     path = folder / MANIFEST
     if not path.exists():
@@ -294,7 +284,9 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         manifest = read_record(path, Manifest)
     except InputError as error:
-        raise OutputError(f"{error}; what keyss wrote in {folder} is not known any more") from error
+        raise OutputError(
+            f"{error}; without it, keyss does not know which files in {folder} it wrote"
+        ) from error
     for name in (name for names in manifest.files.values() for name in names):
         parts = PurePosixPath(name).parts
         if not parts or ".." in parts or parts[0] == "/" or "\0" in name or name == MANIFEST:
@@ -303,58 +295,59 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def recorded_number(folder: Path, *names: str) -> int | None:
-    """An argument of the interrupted run in a folder, by the names that lead to it; None: it has none."""
+    """An argument of the interrupted run in a folder, by the names that lead to it; None if it has none."""
     running = read_manifest(folder).running
-    found: Any = running and running.arguments
+    value: Any = running and running.arguments
     for name in names:
-        found = found.get(name) if isinstance(found, dict) else None
-    return found if isinstance(found, int) else None
+        value = value.get(name) if isinstance(value, dict) else None
+    return value if isinstance(value, int) else None
 
 
-def _drop_unfinished(folder: Path, there: Manifest) -> None:
-    """Remove the traces of a run that `there` knows to be unfinished.
+def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
+    """Remove checkpoints and unfinished files.
 
-    Raises OutputError for folders of these names where it knows of none: they are somebody else's.
+    Raises OutputError if they exist although no stage is running: then keyss did not write them.
     """
     for name in (_CHECKPOINTS, _STAGING):
-        if there.running is None and os.path.lexists(folder / name):
+        if manifest.running is None and os.path.lexists(folder / name):
             raise OutputError(f"{folder / name} is in the way, and keyss did not write it: move it")
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
-def _write_entered(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
+def _write_listed(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
+    """Write a file, and list it in the manifest first."""
     _refuse_foreign(folder, name)
-    there = read_manifest(folder)
-    if not any(name in names for names in there.files.values()):
-        names = {**there.files, stage: (*there.files.get(stage, ()), name)}
-        write_record(folder / MANIFEST, replace(there, files=names))
-    _make_folders(folder, name)
+    manifest = read_manifest(folder)
+    if not any(name in names for names in manifest.files.values()):
+        files = {**manifest.files, stage: (*manifest.files.get(stage, ()), name)}
+        write_record(folder / MANIFEST, replace(manifest, files=files))
+    _make_parents(folder, name)
     write(folder / name)
 
 
-def _keep_private(folder: Path) -> None:
-    """Make the part of a run's folder that is its owner's alone; one of others gets so."""
+def _make_private(folder: Path) -> None:
+    """Make `private/`, or take away the access of others to it."""
     (folder / PRIVATE).mkdir(mode=0o700, exist_ok=True)
     (folder / PRIVATE).chmod(0o700)
 
 
-def _make_folders(folder: Path, name: str) -> None:
-    """The folders of a file in a run's folder: those in `private/` are its owner's alone, wherever moved."""
+def _make_parents(folder: Path, name: str) -> None:
+    """Make the parent folders of a file; in `private/`, only the owner has access to them."""
     mode = 0o700 if name.startswith(f"{PRIVATE}/") else 0o777
     for parent in reversed(PurePosixPath(name).parents[:-1]):
         (folder / parent).mkdir(mode=mode, exist_ok=True)
 
 
 def _refuse_foreign(folder: Path, name: str) -> None:
-    """Raise OutputError if what is in the way of a file is not this program's."""
+    """Raise OutputError if there is a file of this name that keyss did not write."""
     target = folder / name
     if any((folder / parent).is_symlink() for parent in PurePosixPath(name).parents if parent.name):
         raise OutputError(
             f"{target.parent} leads out of {folder}: remove this link, or choose another folder"
         )
-    if not (target.is_symlink() or target.exists()):
+    if not os.path.lexists(target):
         return
-    ours = {each for names in read_manifest(folder).files.values() for each in names}
+    ours = {name for names in read_manifest(folder).files.values() for name in names}
     inside = target.rglob("*") if target.is_dir() and not target.is_symlink() else ()
     files = [str(path.relative_to(folder)) for path in inside if path.is_symlink() or not path.is_dir()]
     if name not in ours and not (files and ours.issuperset(files)):
@@ -364,13 +357,12 @@ def _refuse_foreign(folder: Path, name: str) -> None:
 
 
 def _remove(folder: Path, names: Collection[str]) -> None:
-    """Remove files, and folders below `folder` that are empty then; links to elsewhere are not followed."""
+    """Remove files, and parent folders that are empty then. Links out of `folder` are not followed."""
     for name in names:
         path = folder / name
         parents = list(path.relative_to(folder).parents)[:-1]
-        if any((folder / parent).is_symlink() for parent in parents) or (
-            path.is_dir() and not path.is_symlink()
-        ):
+        linked = any((folder / parent).is_symlink() for parent in parents)
+        if linked or (path.is_dir() and not path.is_symlink()):
             continue
         path.unlink(missing_ok=True)
         for parent in parents:
@@ -378,21 +370,19 @@ def _remove(folder: Path, names: Collection[str]) -> None:
 
 
 def _remove_empty(folder: Path) -> None:
-    with suppress(OSError):  # not there, or something is in it
+    with suppress(OSError):  # missing or not empty
         folder.rmdir()
 
 
-def _differences(old: Any, new: Any) -> str:
-    """What differs, down to the innermost fields."""
+def _differences(old: Any, new: Any, between: str = ", ", after_name: str = " ") -> str:
+    """The values that differ, down to the innermost fields."""
     if isinstance(old, dict) and isinstance(new, dict):
         names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
-        return ", ".join(f"{name} {_differences(old.get(name), new.get(name))}" for name in names)
-    shown = _shown(old), _shown(new)
-    return "not the same" if max(map(len, shown)) > _LONGEST_SHOWN else f"{shown[0]} then, {shown[1]} now"
-
-
-def _shown(value: Any) -> str:
-    return "none" if value is None else msgspec.json.encode(value).decode()
+        return between.join(
+            f"{name}{after_name}{_differences(old.get(name), new.get(name))}" for name in names
+        )
+    shown = ["none" if value is None else msgspec.json.encode(value).decode() for value in (old, new)]
+    return "not the same" if max(map(len, shown)) > _MAX_SHOWN else f"{shown[0]} then, {shown[1]} now"
 
 
 def _umask() -> int:
@@ -402,8 +392,8 @@ def _umask() -> int:
 
 
 @contextmanager
-def _typed(path: Path) -> Iterator[None]:
-    """The system's errors as OutputErrors."""
+def _os_errors(path: Path) -> Iterator[None]:
+    """Turn errors of the system into OutputErrors."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""`metrics.json`: what a run came to."""
+"""`metrics.json`: the measured results of a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from keyss.measure.hiding import HidingQuality, RenderFidelity
 
 @dataclass(frozen=True, kw_only=True)
 class HideMetrics(HidingQuality):
-    """A hiding, whatever its method: PSNRs in dB and SSIMs on test views, through the written files."""
+    """Results of a hiding: PSNRs in dB and SSIMs on test views, measured through the written files."""
 
     version: int = 1
     keyss: str = __version__  # the program that wrote it
@@ -22,19 +22,19 @@ class HideMetrics(HidingQuality):
     photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # of the revealed secrets
     iterations: int  # of the method's own training, 0 without one
-    # In which the cover and each secret were drawn, those of the plain model included where training went on
-    # from it; None: that one was given, and nothing is known of it.
+    # Training steps of the cover and of each secret, those of the plain model included if it was trained on;
+    # None: unknown, since the plain model was given.
     steps: tuple[int | None, ...] = ()
     seconds: float  # of the whole run, interrupted parts included
     width: int  # pixels of the cover's test views
     seed: int
-    against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, as they open from the written files
-    details: Mapping[str, Any] = field(default_factory=dict)  # numbers of the method's own
+    against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, opened from the written files
+    details: Mapping[str, Any] = field(default_factory=dict)  # further numbers of the method
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitMetrics(ImageQuality):
-    """A plain model on the test views."""
+    """Results of a plain fit on the test views."""
 
     version: int = 1
     keyss: str = __version__

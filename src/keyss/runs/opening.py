@@ -1,4 +1,4 @@
-"""A folder that `hide` made, opened with its keys: what evaluating and auditing start from."""
+"""The folder of a hiding, opened with its keys for evaluation and audits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from keyss.runs.sources import PathLike, as_scene
 
 @dataclass(frozen=True)
 class HidingRun:
-    """What a run published, what its keys open in it, and from what it was made."""
+    """The published model of a run, its secrets, and its sources."""
 
     folder: Path
     config: RunConfig[MethodOptions]
@@ -45,26 +45,26 @@ class HidingRun:
 
     @property
     def reopeners(self) -> list[Reopener]:
-        """What opens the secrets in a changed model; what was handed over does not change."""
+        """What opens the secrets in a changed model; files that are handed over do not change."""
         if registry.get(self.config.method).capabilities.hands_over:
             return [Reopener("", lambda stego, key, own=own: own) for own in self.opened]  # type: ignore[misc]
         return [Reopener(key, registry.open_model) for key in self.keys]
 
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
-        """The cover and the secrets with their photos, or with pictures of the models that they are."""
+        """The cover and the secrets with their photos, or with renders of given models."""
         return [as_scene(source, self.config.views, train_pictures=train_pictures) for source in self.sources]
 
     def plain_models(self) -> list[Gaussians | None]:
-        """Plain models of the cover and of the secrets, in their own frames; None where there is none."""
-        found: list[Gaussians | None] = []
+        """Plain models of the cover and of the secrets, in their own frames, if there are any."""
+        models: list[Gaussians | None] = []
         for name, source in zip(plain_names(len(self.opened)), self.sources, strict=True):
             path = self.folder / name
             path = Path(source) if not path.exists() and is_model(source) else path
-            found.append(read_model(path) if path.exists() else None)
-        return found
+            models.append(read_model(path) if path.exists() else None)
+        return models
 
     def baselines(self) -> list[Gaussians | None]:
-        """What cover and secrets are compared with: `plain_models`, or those that were trained for longer."""
+        """Models to compare with: `plain_models`, or bounds that were trained for longer."""
         bounds = [self.folder / name for name in bound_names(len(self.opened))]
         return [
             read_model(bound) if bound.exists() else plain
@@ -73,10 +73,10 @@ class HidingRun:
 
 
 def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
-    """A folder that `hide` made, with what `keys` open in it: those of all its secrets, in any order.
+    """Open a folder of `hide` with the keys of all its secrets, in any order.
 
-    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key and for a run on
-    scenes that were in memory only, InputError for a folder that is not one of `hide`.
+    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key and for a run
+    whose scenes were in memory, InputError for other folders.
     """
     folder = run_folder(Path(run))
     config, metrics = read_config(folder / CONFIG), read_record(folder / METRICS, HideMetrics)
@@ -90,17 +90,17 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
             raise UsageError(f"the method {config.method} has no keys: give none")
         keys = [""] * len(config.payloads)
     if capabilities.hands_over:
-        every = [
+        opened = [
             read_handed(folder / name, key or None)
             for name, key in zip(handed_names(len(config.payloads)), keys, strict=False)
         ]
     else:
-        every = [registry.open_model(stego, key) for key in keys]
-    names = secret_ids(config.options.fit.known_seed, every)
-    found = dict(zip(names, zip(every, keys, strict=False), strict=True))
-    if set(found) != set(config.payloads):
+        opened = [registry.open_model(stego, key) for key in keys]
+    names = secret_ids(config.options.fit.known_seed, opened)
+    by_name = dict(zip(names, zip(opened, keys, strict=False), strict=True))
+    if set(by_name) != set(config.payloads):
         raise UsageError(
-            f"expected the keys of all {len(config.payloads)} secret(s), got {len(found)} of them"
+            f"expected the keys of all {len(config.payloads)} secret(s), got {len(by_name)} of them"
         )
-    secrets, own = zip(*(found[each] for each in config.payloads), strict=True)
-    return HidingRun(folder, config, metrics, stego, secrets, own, sources)
+    secrets, ordered = zip(*(by_name[name] for name in config.payloads), strict=True)
+    return HidingRun(folder, config, metrics, stego, secrets, ordered, sources)

@@ -1,7 +1,6 @@
-"""What a run will take, before it begins: steps, room, time, memory, disk.
+"""What a run takes, before it begins: room, disk, memory, and a rough time.
 
-Sizes follow from the models and the options. Times come from constants and are rough; the progress of a run
-knows better as soon as it has begun.
+Sizes follow from the models and the options. Times come from constants.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import resource
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -27,151 +26,95 @@ from keyss.progress import about
 
 _LONG = 1000  # steps
 _KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and opening it again
-_STATE_COPIES = 3  # numbers in a checkpoint for each one of a model: itself and two moments
-_APPENDED = 7  # Gaussians that one of a secret of SH degree 3 becomes, at most, where they are appended
-_OTHER_BYTES = 4 << 20  # records in JSON, locks, and what a file system adds
-
-
-@dataclass(frozen=True)
-class _Speed:
-    """Seconds of a training step, forward and backward; rendering alone takes a third."""
-
-    step: float
-    gaussian: float
-    pixel: float
-    weight: float  # of a network
-
-    @staticmethod
-    def of(device: torch.device) -> _Speed:
-        if device.type != "cpu":
-            return _Speed(5e-3, 1e-8, 5e-9, 1e-12)
-        threads = 0.5 + 0.5 * torch.get_num_threads()
-        return _Speed(3e-3, 8e-7 / threads, 3e-7 / threads, 3e-10 / threads)
-
-    def steps(self, gaussians: float, pixels: int, plan: Plan | None = None) -> float:
-        """Seconds of a step with one view."""
-        weights = 0.0
-        if plan is not None:
-            weights = plan.gaussian_weights * plan.gaussians + plan.pixel_weights * pixels
-        return self.step + self.gaussian * gaussians + self.pixel * pixels + self.weight * weights
+_RENDERS = 6  # of each test view, to measure
+_STATE_COPIES = 3  # numbers in a checkpoint for each number of a model: itself and two moments
+_MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
+_OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
 def plan_hiding(
     method: Method,
     options: MethodOptions,  # prepared
-    sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test pictures
+    sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test images
     device: torch.device,
     out: Path | None,
     *,
     bound: bool = False,
 ) -> Plan:
-    """What a hiding will take. Writes nothing.
+    """The plan of a hiding. Writes nothing.
 
-    `bound`: with plain 3DGS of as many steps as scenes have, where that is more than plain models have.
+    `bound`: fit plain 3DGS of as many steps as each scene has, if these are more than its plain model has.
     """
-    plan, speed, fit = method.plan(sources, options), _Speed.of(device), options.fit
-    sizes, configs = _sizes(options, sources), options.fits(len(sources))
-    roles = [role_of(index, len(sources)) for index in range(len(sources))]
-    scenes = [each.scene for each in sources]
-    stages = [
-        _fitting(plain_stage(role), config, each.scene, size, speed)
-        for role, each, config, size in zip(roles, sources, configs, sizes, strict=True)
-        if each.given is None
-    ]
-    if plan.steps:
-        drawn = sum(plan.drawn)
-        views = [_pixels(scene) for scene, count in zip(scenes, plan.drawn, strict=True) if count]
-        each_step = sum(speed.steps(drawn / len(views), pixels, plan) for pixels in views)
-        stages.append(Stage("hiding", plan.steps, drawn, plan.steps * _views(fit) * each_step))
-    for role, each, config, size, training in zip(
-        roles, sources, configs, sizes, options.training(len(sources)), strict=True
+    plan, fit, count = method.plan(sources, options), options.fit, len(sources)
+    sizes, configs = _sizes(options, sources), options.fits(count)
+    stages, bounds = [], []
+    for index, (source, config, size, training) in enumerate(
+        zip(sources, configs, sizes, options.training(count), strict=True)
     ):
-        longer = Bound.of(training, config.iterations if each.given is None else None)
-        if bound and each.photos and not longer.equal and longer.steps is not None:
-            stages.append(_fitting(f"bound of the {role}", longer.config(fit), each.scene, size, speed))
-    views_measured = 6 * sum(
-        len(scene.test) * speed.steps(size, _pixels(scene)) / 3
-        for scene, size in zip(scenes, sizes, strict=True)
+        role = role_of(index, count)
+        if source.given is None:
+            stages.append(_fit_stage(plain_stage(role), config, source.scene, size, device))
+        longer = Bound.of(training, config.iterations if source.given is None else None)
+        if bound and source.photos and not longer.equal and longer.steps is not None:
+            bounds.append(_fit_stage(f"bound of the {role}", longer.config(fit), source.scene, size, device))
+    if plan.steps:
+        step = sum(
+            _step_seconds(device, drawn, source.scene, plan)
+            for source, drawn in zip(sources, plan.drawn, strict=True)
+            if drawn
+        )
+        stages.append(Stage("hiding", plan.steps, sum(plan.drawn), plan.steps * _views(fit) * step))
+    measuring = sum(
+        _RENDERS * len(source.scene.test) * _step_seconds(device, size, source.scene) / 3
+        for source, size in zip(sources, sizes, strict=True)
     )
-    keys = _KEY_SECONDS * len(sources[1:])
-    stages.append(Stage("encrypting, opening, measuring", 0, plan.gaussians, keys + views_measured))
-    trains = options.trains or any(each.given is None for each in sources)
+    measuring += _KEY_SECONDS * (count - 1)
+    stages += [*bounds, Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring)]
+    trains = options.trains or any(source.given is None for source in sources)
     return replace(
         plan,
         method=method.name,
         stages=tuple(stages),
         file_bytes=_file_bytes(plan.gaussians, plan.sh_degree),
-        disk_bytes=disk_bytes(options, sources),
-        free_bytes=None if out is None else free_bytes(out),
+        disk_bytes=_disk_bytes(options, sources),
+        free_bytes=None if out is None else _free_bytes(out),
         memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, trains),
     )
 
 
 def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
-    """What a plain fit will take."""
-    most, degree = config.max_gaussians, config.sh_degree
-    disk = 2 * _STATE_COPIES * most * _floats(degree) * 4 + _file_bytes(most, degree) + _OTHER_BYTES
+    """The plan of a plain fit."""
+    gaussians, degree = config.max_gaussians, config.sh_degree
+    file_bytes = _file_bytes(gaussians, degree)
     return Plan(
-        gaussians=most,
+        gaussians=gaussians,
         sh_degree=degree,
         asked=0,
         capacity=0,
         steps=config.iterations,
-        stages=(_fitting("fit", config, scene, most, _Speed.of(device)),),
-        file_bytes=_file_bytes(most, degree),
-        disk_bytes=disk,
-        memory_bytes=_memory_bytes(most, degree, trains=True),
+        stages=(_fit_stage("fit", config, scene, gaussians, device),),
+        file_bytes=file_bytes,
+        disk_bytes=(1 + 2 * _STATE_COPIES) * file_bytes + _OTHER_BYTES,
+        memory_bytes=_memory_bytes(gaussians, degree, trains=True),
     )
 
 
 def worth_planning(config: FitConfig) -> bool:
-    """Whether a training is so long that its estimate is worth a line."""
+    """True if a training is so long that its estimate is worth a line."""
     return config.iterations >= _LONG
 
 
 def in_a_line(plan: Plan) -> str:
-    """Time, memory and disk of a run that begins."""
+    """Time, memory and disk of a run."""
     return (
         f"about {about(plan.seconds)}, {plan.memory_bytes / 1e9:.1f} GB of memory, up to "
         f"{plan.disk_bytes / 1e6:,.0f} MB of disk"
     )
 
 
-def _sizes(options: MethodOptions, sources: Sequence[Source]) -> list[int]:
-    """Gaussians of each plain model, at most."""
-    return [
-        config.max_gaussians if each.given is None else len(each.given)
-        for each, config in zip(sources, options.fits(len(sources)), strict=True)
-    ]
-
-
-def disk_bytes(options: MethodOptions, sources: Sequence[Source]) -> int:
-    """The most bytes that a hiding has on disk at once: results, plain models, checkpoints being replaced."""
-    sizes = _sizes(options, sources)
-    degrees = [options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources]
-    plain = [_file_bytes(*each) for each in zip(sizes, degrees, strict=True)]
-    fitted = [size for size, each in zip(plain, sources, strict=True) if each.given is None]
-    appended = _APPENDED * sum(sizes[1:]) if options.place.grows else 0
-    published = _file_bytes(sizes[0] + appended, degrees[0])
-    if not options.trains:
-        return sum(plain) + published + 2 * _STATE_COPIES * sum(fitted) + _OTHER_BYTES
-    trained = min(_file_bytes(sum(sizes), options.fit.sh_degree), sum(plain) + max(plain))
-    published = max(trained, published)
-    checkpoints = 2 * _STATE_COPIES * max(trained, sum(fitted)) + _STATE_COPIES * min(trained, sum(fitted))
-    return sum(plain) + published + checkpoints + _OTHER_BYTES
-
-
-def free_bytes(out: Path) -> int:
-    """Bytes that are free where `out` is or will be."""
-    folder = Path(os.path.realpath(out))
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
-
-
 def check_disk(out: Path, options: MethodOptions, sources: Sequence[Source]) -> None:
-    """Raise OutputError unless there is room for all that a hiding writes."""
-    needed, free = disk_bytes(options, sources), free_bytes(out)
+    """Raise OutputError unless there is room for all files of a hiding."""
+    needed, free = _disk_bytes(options, sources), _free_bytes(out)
     if free < needed:
         raise OutputError(
             f"{out}: expected {needed / 1e6:,.0f} MB of free space for models and checkpoints, found "
@@ -179,11 +122,51 @@ def check_disk(out: Path, options: MethodOptions, sources: Sequence[Source]) -> 
         )
 
 
-def _fitting(name: str, config: FitConfig, scene: Scene, most: int, speed: _Speed) -> Stage:
-    """A plain fit, whose Gaussians grow to the cap while it densifies."""
-    mean = 0.75 * most
-    seconds = config.iterations * _views(config) * speed.steps(mean, _pixels(scene))
-    return Stage(name, config.iterations, most, seconds)
+def _sizes(options: MethodOptions, sources: Sequence[Source]) -> list[int]:
+    """Upper limits of the Gaussians of the plain models."""
+    return [
+        config.max_gaussians if source.given is None else len(source.given)
+        for source, config in zip(sources, options.fits(len(sources)), strict=True)
+    ]
+
+
+def _disk_bytes(options: MethodOptions, sources: Sequence[Source]) -> int:
+    """An upper limit of the bytes on disk at once: results, plain models, and checkpoints being replaced."""
+    fit, sizes = options.fit, _sizes(options, sources)
+    degrees = [fit.sh_degree if source.given is None else source.given.sh_degree for source in sources]
+    models = list(map(_file_bytes, sizes, degrees))
+    trained = [size for size, source in zip(models, sources, strict=True) if source.given is None]
+    if options.trains:
+        models.append(_file_bytes(fit.max_gaussians, fit.sh_degree))
+        trained = models
+    appended = _MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0
+    published = max(models[0], models[-1]) + _file_bytes(appended, degrees[0])
+    return sum(models) + published + 2 * _STATE_COPIES * sum(trained) + _OTHER_BYTES
+
+
+def _free_bytes(out: Path) -> int:
+    """Free bytes on the disk of `out`, which need not exist."""
+    folder = Path(os.path.realpath(out))
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
+
+
+def _fit_stage(name: str, config: FitConfig, scene: Scene, gaussians: int, device: torch.device) -> Stage:
+    """A plain fit that grows to so many Gaussians."""
+    step = _step_seconds(device, 0.75 * gaussians, scene)
+    return Stage(name, config.iterations, gaussians, config.iterations * _views(config) * step)
+
+
+def _step_seconds(device: torch.device, gaussians: float, scene: Scene, plan: Plan | None = None) -> float:
+    """A training step with one view, and with the networks of a plan; rendering alone takes a third."""
+    camera = scene.test[0].camera
+    pixels = camera.width * camera.height
+    weights = plan.gaussian_weights * plan.gaussians + plan.pixel_weights * pixels if plan else 0.0
+    if device.type != "cpu":
+        return 5e-3 + 1e-8 * gaussians + 5e-9 * pixels + 1e-12 * weights
+    threads = 0.5 + 0.5 * torch.get_num_threads()
+    return 3e-3 + (8e-7 * gaussians + 3e-7 * pixels + 3e-10 * weights) / threads
 
 
 def _views(config: FitConfig) -> int:
@@ -192,7 +175,7 @@ def _views(config: FitConfig) -> int:
 
 
 def _memory_bytes(gaussians: int, sh_degree: int, trains: bool) -> int:
-    """Parameters, gradients and moments, twice more what a checkpoint holds, and what is there already."""
+    """Parameters, gradients and moments, two checkpoints, and the present size of this process."""
     state = gaussians * _floats(sh_degree) * 4
     unit = 1 if sys.platform == "darwin" else 1024
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
@@ -200,15 +183,10 @@ def _memory_bytes(gaussians: int, sh_degree: int, trains: bool) -> int:
 
 
 def _floats(sh_degree: int) -> int:
-    """Numbers of a Gaussian that are trained."""
+    """Trained numbers of a Gaussian."""
     return 11 + 3 * (sh_degree + 1) ** 2
 
 
 def _file_bytes(gaussians: int, sh_degree: int) -> int:
-    """Of a PLY, which has normals too."""
+    """Size of a PLY file, which has normals too."""
     return 4 * gaussians * (3 + _floats(sh_degree)) + 2048
-
-
-def _pixels(scene: Scene) -> int:
-    camera = scene.test[0].camera
-    return camera.width * camera.height

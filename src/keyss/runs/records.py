@@ -25,25 +25,25 @@ class _Versioned(msgspec.Struct):
 
 
 def read_record(path: Path, type: type[T], *, at_most: int = MAX_BYTES) -> T:
-    """The record of a dataclass in a JSON file of at most so many bytes.
+    """Read the record of a dataclass from a JSON file of at most `at_most` bytes.
 
-    Raises InputError that names the file and the place in it: for a file that is missing, too large or no
-    JSON, for another version, and for values of other types than the class states.
+    Raises InputError, which names the file and the place in it, for a file that is missing, too large or not
+    JSON, for another version, and for values of wrong types.
     """
     try:
-        there = path.exists()
+        exists = path.exists()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not there:
+    if not exists:
         raise InputError(f"{path}: missing; expected a file that keyss wrote")
     data = read_file(path, at_most)
     generic: Any = type
     expected = int(generic.version)  # a field's default is an attribute of its class
     try:
-        found = msgspec.json.decode(data, type=_Versioned).version
-        if found != expected:
+        version = msgspec.json.decode(data, type=_Versioned).version
+        if version != expected:
             raise InputError(
-                f"{path}: expected version {expected}, got {found}; "
+                f"{path}: expected version {expected}, got {version}; "
                 "make it again with this version of keyss, or read it with the one that wrote it"
             )
         return msgspec.json.decode(data, type=type)
@@ -57,9 +57,9 @@ def write_record(path: Path, record: Any) -> None:
 
 
 def record_bytes(record: Any) -> bytes:
-    """JSON of a dataclass, for people and programs; NaN and infinite numbers become null.
+    """JSON of a dataclass, indented; NaN and infinite numbers become null.
 
-    Of a file's name that is not text in this locale, UTF-8 is taken, and other bytes become U+FFFD.
+    File names that are not text in this locale are decoded as UTF-8, and other bytes become U+FFFD.
     """
     try:
         data = msgspec.json.encode(record)
@@ -73,7 +73,7 @@ def _as_text(value: Any) -> Any:
         case str():
             return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
         case dict():
-            return {_as_text(key): _as_text(each) for key, each in value.items()}
+            return {_as_text(key): _as_text(item) for key, item in value.items()}
         case list() | tuple():
-            return [_as_text(each) for each in value]
+            return [_as_text(item) for item in value]
     return value

@@ -1,4 +1,4 @@
-"""From a published model and a key to a secret: where it is looked for, and how much of it is left."""
+"""From a published model and a key to a secret, and how much of it is left."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from keyss.methods.hidden_file import HiddenFile, OpensAFileError
 from keyss.methods.opened import Frame, Opened, Remains
 from keyss.runs.sources import PathLike
 
-# Pruning compensation makes up for nine tenths at most (`keyss.core.pruning_compensation`): below that the
-# pictures of what is left get emptier and emptier.
+# Pruning compensation makes up for the loss of nine tenths at most (`keyss.core.pruning_compensation`): with
+# less left, renders become emptier and emptier.
 MIN_LEFT = 0.1
-# A loss that compensation takes notice of.
+# A loss that is compensated.
 NOTICED_LOSS = 0.01
 
 
 @dataclass(frozen=True)
 class Revealed:
-    """What a key opened: a scene or a file."""
+    """The scene or the file that a key opened."""
 
     scene: Gaussians | None  # on the CPU
     remains: Remains  # of a file in bytes
-    warnings: tuple[str, ...] = ()  # what is missing and why
+    warnings: tuple[str, ...] = ()  # of missing Gaussians
     file: HiddenFile | None = None
 
     @property
@@ -39,11 +39,11 @@ class Revealed:
         return self.scene
 
     def check_usable(self) -> None:
-        """Raise InputError if so little is left that its pictures would be all but empty."""
+        """Raise InputError if so little is left that renders would be nearly empty."""
         if self.remains.share < MIN_LEFT:
             raise InputError(
-                f"{_count(self.remains)}, too little to be seen (at least {MIN_LEFT:.0%} expected): the "
-                f"others {_CAUSE}; take the file as it was published, or `force=True` gives what there is"
+                f"{_count(self.remains)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
+                f"{_CAUSE}; use the file as it was published, or `force=True` to get the rest"
             )
 
 
@@ -63,13 +63,13 @@ def reveal_model(
     force: bool = False,
     handed: PathLike | None = None,
 ) -> Revealed:
-    """What `key` opens in a stego model, however little it is; see `keyss.reveal`, also for errors."""
+    """What `key` opens in a stego model, however little is left; see `keyss.reveal`, also for errors."""
     if handed is not None:
         if decoy:
-            raise UsageError("there are no decoys of what was handed over: leave out `decoy=True`")
+            raise UsageError("files that are handed over have no decoys: leave out `decoy=True`")
         opened = read_handed(handed, key)
     elif key is None:
-        raise UsageError("nothing to open it with: give `key`, or `handed` for a file that was handed over")
+        raise UsageError("expected `key`, or `handed` for a file that was handed over")
     else:
         opened = registry.open_model(model, key, decoy=decoy)
     revealed = opened.reveal(model.to(device), frame=frame, force=force)
@@ -78,7 +78,7 @@ def reveal_model(
 
 
 def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
-    """What `key` opens in a model: a scene, however little is left of it, or a file."""
+    """The scene, however little is left, or the file that `key` opens in a model."""
     try:
         return reveal_model(model, key, device=device)
     except OpensAFileError as error:
@@ -86,16 +86,16 @@ def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
 
 
 def revealed_file(file: HiddenFile) -> Revealed:
-    """A hidden file, which is revealed whole or not at all."""
+    """The result for a hidden file, which is always whole."""
     return Revealed(None, Remains(len(file.data), len(file.data)), file=file)
 
 
 def _loss(remains: Remains) -> list[str]:
-    """What to tell a person whose secret is not whole, if anything."""
+    """A warning for a secret that is not whole."""
     if remains.share < 1 - NOTICED_LOSS:
         return [
-            f"{_count(remains)}: the others {_CAUSE}; those left were made larger and denser to make up for "
-            "them; the file as it was published gives the whole secret"
+            f"{_count(remains)}: the others {_CAUSE}; the rest was made larger and denser to compensate; the "
+            "file as it was published gives the whole secret"
         ]
     if remains.share > 1 + NOTICED_LOSS:
         return [f"{_count(remains)}: Gaussians were copied or changed in the published file"]
@@ -109,7 +109,7 @@ def _count(remains: Remains) -> str:
 
 
 def read_handed(path: PathLike, key: str | None) -> Opened:
-    """The secret in a file that was handed over; see `registry.open_handed`."""
+    """Open the secret in a file that was handed over; see `registry.open_handed`."""
     data = read_file(Path(path), handing.MAX_BYTES)
     try:
         return registry.open_handed(data, key)
@@ -118,5 +118,5 @@ def read_handed(path: PathLike, key: str | None) -> Opened:
 
 
 def is_sealed(path: PathLike) -> bool:
-    """Whether it takes a key to open a file that was handed over. Raises InputError."""
+    """True if a file that was handed over needs a key. Raises InputError."""
     return handing.is_sealed(read_file(Path(path), handing.MAX_BYTES))

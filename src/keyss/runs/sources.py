@@ -1,4 +1,4 @@
-"""What a person gives to be read: models and scenes, in files or in memory."""
+"""Arguments that stand for models and scenes, in files or in memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Background = Tensor | Sequence[float] | None
 
 
 def path_of(source: PathLike | Scene | Gaussians) -> str | None:
-    """Where a scene can be found again, None for one in memory."""
+    """The absolute path of a scene, None for one in memory."""
     return None if isinstance(source, Scene | Gaussians) else os.path.realpath(source)
 
 
@@ -32,20 +32,19 @@ def as_scene(
     train_pictures: bool = True,
     model: Gaussians | None = None,
 ) -> Scene:
-    """A scene, the photos in a folder, or what a model or the one in its file shows from all around.
+    """A given scene, the photos in a folder, or renders of a model from all around.
 
-    `train_pictures`: see `scene_of_model`. `model`: what is in the file of a model, where it has been read.
+    `train_pictures`: see `scene_of_model`. `model`: the content of a model's file, if it has been read.
     """
     if isinstance(source, Scene):
         return source
     if not isinstance(source, Gaussians) and not is_model_path(source):
-        # A model is opened without what reads photos.
         from keyss.files.scenes import load_scene
 
         if os.path.exists(source) and not os.path.isdir(source):
-            found = what_it_is(Path(source))
             raise InputError(
-                f"{source}: expected a scene folder or a 3DGS model ({known_suffixes()}), found {found}"
+                f"{source}: expected a scene folder or a 3DGS model ({known_suffixes()}), found "
+                f"{what_it_is(Path(source))}"
             )
         try:
             return load_scene(source, **vars(views))
@@ -56,14 +55,14 @@ def as_scene(
     from keyss.rendering.orbit import scene_of_model
 
     name = "model" if isinstance(source, Gaussians) else Path(source).stem
-    shown = as_model(source) if model is None else model
+    model = as_model(source) if model is None else model
     return scene_of_model(
-        shown, name, size=views.width, background=views.background, train_pictures=train_pictures
+        model, name, size=views.width, background=views.background, train_pictures=train_pictures
     )
 
 
 def as_model(source: PathLike | Gaussians) -> Gaussians:
-    """A model, or the one in a file, on the CPU. Raises InputError, which knows folders of runs."""
+    """A model, or the content of its file, on the CPU. Raises InputError."""
     if isinstance(source, Gaussians):
         return source.to("cpu")
     if inside := model_in(Path(source)):
@@ -72,8 +71,8 @@ def as_model(source: PathLike | Gaussians) -> Gaussians:
 
 
 def as_3dgs_model(source: PathLike | Gaussians, what: str) -> Gaussians:
-    """`as_model`, and UsageError where a network makes its pictures."""
-    found = as_model(source)
-    if isinstance(found, DecodedGaussians):
-        raise UsageError(f"a network makes the pictures of {what}'s model: expected a 3DGS model")
-    return found
+    """As `as_model`. Raises UsageError if the model is rendered by a network."""
+    model = as_model(source)
+    if isinstance(model, DecodedGaussians):
+        raise UsageError(f"expected a 3DGS model, but {what}'s model is rendered by a network")
+    return model
