@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cheap_keys
 from channels.low_bits.trained_like import trained_like
+from files.scene_files import write_blender, write_nerfstudio
 from keyss.files import write_model
 
 WITHOUT = f"""
@@ -29,10 +30,17 @@ WORKING = (
     "evaluate run",
     "view run/publish/stego.ply -o page.html",
 )
-REFUSED = ("audit run", "audit run --report-only")
+REFUSED = (
+    "audit run",
+    "audit run --report-only",
+    "compare --cover a --secret b -o out",
+    "reproduce masks a b -o out",
+)
 
 
 def test_only_audits_need_the_extra(tmp_path: Path) -> None:
+    write_blender(tmp_path / "a", count=3, channels=3)
+    write_nerfstudio(tmp_path / "b", count=4)
     write_model(tmp_path / "cover.ply", trained_like(1500))
     write_model(tmp_path / "secret.ply", trained_like(500, 1))
     command = [sys.executable, "-c", WITHOUT, *WORKING, *REFUSED]
@@ -40,7 +48,8 @@ def test_only_audits_need_the_extra(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     statuses = json.loads(done.stdout.splitlines()[-1])
+    assert not (tmp_path / "out").exists()
     assert statuses == dict.fromkeys(WORKING, 0) | dict.fromkeys(REFUSED, 6), done.stderr
-    for line in done.stderr.splitlines()[-2:]:
+    for line in done.stderr.splitlines()[-len(REFUSED) :]:
         assert line.startswith("keyss: error: to ")
         assert "pip install 'keyss[audit]'" in line

@@ -76,7 +76,7 @@ class TestHelp:
             *("cover", "secret", "secret-file", "key-file", "publish", "out", "method", "preset"),
             *("dry-run", "resume", "overwrite", "device"),
         ]
-        assert len(groups) == 7
+        assert len(groups) == 5
 
     def test_offers_the_presets_there_are(self, keyss: Callable[..., Said]) -> None:
         assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out

@@ -51,6 +51,16 @@ def _carry(folder: Path, *more: object) -> list[object]:
     return ["hide", "--method", "carry", *files, "--width", 48, "-o", folder / "run", *more]
 
 
+@pytest.mark.parametrize("dry_run", [(), ("--dry-run",)])
+def test_options_of_training_that_had_no_effect_are_named(
+    keyss: Callable[..., Said], models: Path, dry_run: tuple[str, ...]
+) -> None:
+    said = keyss(*_carry(models, "--preset", "quick", "--iterations", 7, "--seed", 1, *dry_run))
+    assert said.status == 0
+    assert "warning: --preset and --iterations had no effect" in said.err
+    assert "had no effect" not in keyss(*_carry(models, "--seed", 1, "--overwrite", *dry_run)).err
+
+
 def test_decibels_are_printed_for_models_without_photos(keyss: Callable[..., Said], models: Path) -> None:
     said = keyss(*_carry(models))
     assert said.status == 0, said.err

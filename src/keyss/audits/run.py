@@ -38,7 +38,7 @@ from keyss.runs.opening import HidingRun, open_run
 from keyss.runs.sources import PathLike
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
-_EXTRA = ("jinja2", "matplotlib", "ot", "sklearn")
+EXTRA = ("jinja2", "matplotlib", "ot", "sklearn")
 KEPT = ("hide", "demo", "controls")  # stages of a run whose files an audit keeps
 
 
@@ -74,7 +74,7 @@ def audit(
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
     if unknown := sorted(set(only) - set(PARTS)):
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
-    for module in _EXTRA:
+    for module in EXTRA:
         import_extra(module, "audit", "audit a run")
     started, reporter = time.monotonic(), reporter or SilentReporter()
     opened = open_run(run, keys)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,53 +35,41 @@ _HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this fil
 
 
 @dataclass(frozen=True, kw_only=True)
-class Publication:
-    """How secrets survive conversion, with --publish any."""
+class Details:
+    """Plain models, the check of the result, and the channel of --publish any."""
 
+    cover_model: Annotated[
+        Path | None, optional("FILE", "Plain 3DGS model of a cover of photos.", "fitted")
+    ] = None
+    secret_model: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Plain 3DGS model of a secret of photos, one for each secret.", "fitted"),
+    ] = ()
+    min_psnr: Annotated[
+        float, arg(metavar="DB", help="Fail if cover or secret is further from its plain model than this.")
+    ] = 20.0
+    bound: Annotated[
+        bool,
+        switch("Also fit plain 3DGS of as many Gaussians and steps to compare with; takes twice as long."),
+    ] = False
     channel: Annotated[
         Literal["appended", "colours"] | None,
         optional(
             "{appended,colours}",
-            "appended Gaussians have room for everything, but are visible in the file; colours have little "
-            "room and show less.",
+            "With --publish any: appended Gaussians hold everything, but are visible in the file; colours "
+            "hold less and show less.",
             "appended for scenes, colours for files",
         ),
     ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Models:
-    """Plain 3DGS models of scenes of photos, which are fitted if they are not given."""
-
-    cover_model: Annotated[Path | None, optional("FILE", "Model of the cover.")] = None
-    secret_model: Annotated[
-        UseAppendAction[tuple[Path, ...]], optional("FILE", "Model of a secret, one for each secret.")
-    ] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Quality:
-    """How the result is judged."""
-
-    min_psnr: Annotated[
-        float, arg(metavar="DB", help="Fail if cover or secret is further from its plain model than this.")
-    ] = 20.0
-    bound: Annotated[
-        bool,
-        arg(
-            help="Compare with plain 3DGS of as many Gaussians and training steps, fitted for that; takes "
-            "twice as long."
-        ),
-    ] = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Batch:
-    """Many hidings at once."""
+    """Many hidings."""
 
     batch: Annotated[
         Path | None,
-        optional("CSV", "Table with the columns cover, secret or secret_file, out (below -o), key_file."),
+        optional("CSV", "Table of hidings: columns cover, secret or secret_file, out (below -o), key_file."),
     ] = None
     master_key_file: Annotated[
         Path | None, optional("FILE", "Key file to derive each asset's key from (`keyss keygen --asset`).")
@@ -94,22 +83,23 @@ class HideArguments:
     """The options of `keyss hide`; `keyss.cli.hiding_options` adds those of the method."""
 
     cover: Annotated[
-        Path | None, optional("SCENE", "Public scene: folder of posed photos, or model (.ply, .spz, ...).")
+        Path | None,
+        optional("SCENE", "What everybody will see: folder of posed photos, or model (.ply, .spz, ...)."),
     ] = None
     secret: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("SCENE", "Scene or model to hide in it; repeat for more."),
+        optional("SCENE", "Folder of photos or model to hide in it; repeat for more."),
     ] = ()
     secret_file: Annotated[
         UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Any file to hide, in a cover that is a model; repeat for more."),
+        optional("FILE", "Any other file to hide, if the cover is a model; repeat for more."),
     ] = ()
     key_file: KeyFiles = ()
     publish: Annotated[
         Literal["ply", "spz", "sog", "compressed-ply", "any"],
         arg(
-            help="Published file: any is a .ply that may be converted later; the others must stay unchanged, "
-            "and all but ply have room for small secrets only."
+            help="File to publish: any is a .ply that may be converted later; the others must stay as they "
+            "are, and all but ply have room for small secrets only."
         ),
     ] = "ply"
     out: OutFolder
@@ -119,11 +109,9 @@ class HideArguments:
     resume: Resume = False
     overwrite: Overwrite = False
     device: Device = "auto"
-    publication: OmitArgPrefixes[Publication] = Publication()
     photos: OmitArgPrefixes[Photos] = PHOTOS
-    models: OmitArgPrefixes[Models] = Models()
     training: OmitArgPrefixes[Training] = TRAINING
-    quality: OmitArgPrefixes[Quality] = Quality()
+    details: OmitArgPrefixes[Details] = Details()
     batch: OmitArgPrefixes[Batch] = Batch()
     own: Any  # options of the method alone
 
@@ -163,29 +151,36 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
     from keyss.cli.ranks import answers
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.runs.files import HANDED, STEGOS
 
     method = registry.get(asked.method)
     options, secrets = _method_options(asked, method), _secrets(asked, method)
-    _check_trains(asked, cover, options)
+    idle = _idle_without_training(asked, cover)
+    if idle and not options.may_train:
+        raise UsageError(
+            f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
+            "without refits only hides them: leave out such options"
+        )
     described: dict[str, Any] = vars(asked.photos) | {
         "method": options,
-        "cover_model": asked.models.cover_model,
-        "bound": asked.quality.bound,
+        "cover_model": asked.details.cover_model,
+        "bound": asked.details.bound,
         "device": asked.device,
         "out": asked.out,
     }
     if asked.dry_run:
-        planned = keyss.hide(cover, secrets, dry_run=True, **described).plan
-        assert planned is not None
-        print_plan(planned)
+        plan = keyss.hide(cover, secrets, dry_run=True, **described).plan
+        assert plan is not None
+        print_plan(plan)
+        _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
         return
     with reporting(asked.out, cover, asked.training) as reporter:
         result = keyss.hide(
             cover,
             secrets,
-            min_psnr=asked.quality.min_psnr,
+            min_psnr=asked.details.min_psnr,
             overwrite=asked.overwrite,
             resume=asked.resume,
             reporter=reporter,
@@ -195,6 +190,7 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
         return
     assert result.metrics is not None
     print_hiding(result.metrics)
+    _warn_of_idle(idle, result.metrics.iterations)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
     how = _HOW_TO_PUBLISH[options.place.survives]
     print_files(
@@ -220,7 +216,7 @@ def _secrets(asked: HideArguments, method: Method) -> list[Any]:
     import keyss
     from keyss.core.errors import UsageError
 
-    count, models = len(asked.secret), asked.models.secret_model
+    count, models = len(asked.secret), asked.details.secret_model
     if models and len(models) != count:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
@@ -238,20 +234,24 @@ def _keys(asked: HideArguments, count: int) -> list[str]:
     return found
 
 
-def _check_trains(asked: HideArguments, cover: Path, options: MethodOptions) -> None:
-    """Raise UsageError for options of training where nothing is trained."""
-    from keyss.core.errors import UsageError
+def _idle_without_training(asked: HideArguments, cover: Path) -> str:
+    """The given options that only matter in a training, if models of all scenes are given; else nothing."""
     from keyss.rendering.orbit import is_model
 
-    sources = [asked.models.cover_model or cover, *(asked.models.secret_model or asked.secret)]
-    if options.may_train or not all(map(is_model, sources)):
-        return
-    idle = ["--preset"] if asked.preset != "default" else []
-    idle += [flag for flag in given(asked.training) if flag in ("--iterations", "--max-gaussians", "--live")]
-    if idle:
-        raise UsageError(
-            f"{' and '.join(idle)}: nothing is trained when --method {options.method} gets models of all "
-            f"scenes; leave {'it' if len(idle) == 1 else 'them'} out"
+    sources = [asked.details.cover_model or cover, *(asked.details.secret_model or asked.secret)]
+    if not all(map(is_model, sources)):
+        return ""
+    preset = ["--preset"] if asked.preset != "default" else []
+    flags = (flag for flag in given(asked.training) if flag in ("--iterations", "--max-gaussians", "--live"))
+    return " and ".join([*preset, *flags])
+
+
+def _warn_of_idle(idle: str, steps: int) -> None:
+    """Warn of options that had no effect, if no step was trained."""
+    if idle and not steps:
+        print(
+            f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
+            file=sys.stderr,
         )
 
 
@@ -266,7 +266,7 @@ def _method_options(asked: HideArguments, method: Method) -> MethodOptions:
         if value is not None and value is not False
     }
     changes |= {"publish": asked.publish}
-    changes |= {"channel": asked.publication.channel} if asked.publication.channel else {}
+    changes |= {"channel": asked.details.channel} if asked.details.channel else {}
     options = replace(method.options.preset(asked.preset), **changes)
     return options.with_fit(**asked.training.schedule())
 
@@ -288,7 +288,7 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
             "photos"
         )
     files, keys = asked.secret_file, _keys(asked, len(asked.secret_file))
-    channel = asked.publication.channel or "colours"
+    channel = asked.details.channel or "colours"
     result = keyss.hide(
         cover,
         [keyss.Secret(file=file, key=key) for file, key in zip(files, keys, strict=True)],
@@ -325,7 +325,7 @@ def _hide_batch(asked: HideArguments, table: Path) -> None:
         method=_method_options(asked, method),
         master_key_file=batch.master_key_file,
         **vars(asked.photos),
-        min_psnr=asked.quality.min_psnr,
+        min_psnr=asked.details.min_psnr,
         device=asked.device,
         jobs=batch.jobs,
         ray=batch.ray,

@@ -7,7 +7,7 @@ from typing import Any
 
 from keyss.core.errors import BackendError
 
-_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn"}  # by module, where the names differ
+_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # by module, where the names differ
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import BackendError
+from keyss.core.extras import import_extra
 from keyss.many import processes
 from keyss.many.processes import Resources
 
@@ -80,9 +81,5 @@ def _attempt(folder: str, threads: int, command: tuple[str, ...]) -> int:
 
 def _ray() -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-        import ray.exceptions
-    except ImportError as error:
-        raise BackendError(f"`ray` needs the package ray (pip install 'keyss[sweep]'): {error}") from error
-    return ray
+    import_extra("ray.exceptions", "sweep", "run on a cluster")
+    return import_extra("ray", "sweep", "run on a cluster")

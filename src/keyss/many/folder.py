@@ -12,6 +12,7 @@ import msgspec
 from keyss.core.errors import KeyssError
 from keyss.fitting.config import FitConfig
 from keyss.many.cell import Cell, model_of, result_of
+from keyss.many.measures import check_extras
 from keyss.many.performing import plan_of
 from keyss.many.running import CELLS, MASTER_KEY, Outcome, claimed, run_cells, settle_master_key
 from keyss.methods import registry
@@ -69,7 +70,11 @@ class CellFolder:
         measures: tuple[str, ...] = (),
         controls: Sequence[str] = (),
     ) -> Path:
-        """Add a hiding; its folder. `sources`: the cover, then the secrets. Raises InputError."""
+        """Add a hiding; its folder. `sources`: the cover, then the secrets.
+
+        Raises InputError, and BackendError for measures that need packages which are not installed.
+        """
+        check_extras(measures)
         cell = Cell(
             name=name,
             cover=sources[0],

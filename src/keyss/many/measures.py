@@ -5,7 +5,7 @@ Each is a function from a run to numbers by name; a text in place of a number sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -15,9 +15,12 @@ from statistics import fmean
 import numpy as np
 from numpy.typing import NDArray
 
+from keyss.audits import PARTS
+from keyss.audits.run import EXTRA
 from keyss.channels import is_appended
 from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, UsageError
+from keyss.core.extras import import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model
@@ -196,9 +199,18 @@ def sinkhorn(subject: Subject) -> Numbers:
     return found | {"sinkhorn": distances.sum, "score": score}
 
 
+# Modules of optional packages that measures import.
+_MODULES = {"secrecy": ("sklearn",), "sinkhorn": ("ot",), **dict.fromkeys(PARTS, EXTRA)}
 MEASURES: Mapping[str, Callable[[Subject], Numbers]] = {
     each.__name__: each for each in (files, pictures, secrecy, survival, rendering, pruning, sinkhorn)
 }
+
+
+def check_extras(measures: Iterable[str]) -> None:
+    """Raise BackendError for a package that one of the measures needs and that is not installed."""
+    for name in measures:
+        for module in _MODULES.get(name, ()):
+            import_extra(module, "audit", f"measure {name}")
 
 
 @dataclass(frozen=True)

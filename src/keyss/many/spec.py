@@ -11,24 +11,27 @@
         grid: {sh_degree: [1, 3], fit.iterations: [500, 1000]}
     seeds: [0, 1, 2]
 
-Everything is checked before anything runs: names of fields, types, options of methods, and that files are
-there. Paths are relative to the folder of the file.
+Everything is checked before anything runs: names of fields, types, options of methods, and that files exist.
+Paths are relative to the folder of the file.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import Meta
 
 from keyss.audits import PARTS
-from keyss.core.errors import BackendError, InputError, KeyssError
+from keyss.core.errors import InputError, KeyssError
+from keyss.core.extras import import_extra
 from keyss.core.nearest import did_you_mean
 from keyss.core.scene import ViewOptions
 from keyss.files.reading import read_text
@@ -37,41 +40,48 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 
 MAX_BYTES = 1 << 20  # of the file
-MAX_DEEP = 20  # nested brackets
 MAX_CELLS = 100_000
-_FIT = "fit"  # the options of training lie below it
+_FIT = "fit"  # prefix of the options of training
+_AT_LEAST_ONE = Meta(min_length=1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pair:
-    """A cover and what is hidden in it: scenes or models."""
+class Pair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A cover and its secrets: scenes or models."""
 
     cover: str
-    secrets: tuple[str, ...]
+    secrets: Annotated[tuple[str, ...], _AT_LEAST_ONE]
     name: str | None = None
-    cover_model: str | None = None  # plain models of scenes, if there are any
+    cover_model: str | None = None  # plain models of scenes; None: fitted
     secret_models: tuple[str, ...] = ()
 
+    @property
+    def label(self) -> str:
+        """The name of the pair in tables."""
+        return self.name or "-".join(Path(source).stem for source in (self.cover, *self.secrets))
 
-@dataclass(frozen=True, kw_only=True)
-class MethodSpec:
+
+class MethodSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A method, and those of its options that differ from the preset's."""
 
-    method: str
+    method: Literal[tuple(registry.METHODS)]  # type: ignore[valid-type]
     name: str | None = None
-    preset: str | None = None  # "default"
-    options: dict[str, Any] = field(default_factory=dict)
-    grid: dict[str, list[Any]] = field(default_factory=dict)  # values of options, each with each
+    preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
+    options: dict[str, Any] = {}
+    grid: dict[str, Annotated[list[Any], _AT_LEAST_ONE]] = {}  # values of options, each with each
+
+    @property
+    def label(self) -> str:
+        """The name of the method in tables."""
+        return self.name or self.method
 
 
-@dataclass(frozen=True, kw_only=True)
-class SweepSpec:
-    """A sweep as its file has it."""
+class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of a sweep's file."""
 
-    pairs: tuple[Pair, ...]
-    methods: tuple[MethodSpec, ...]
-    seeds: tuple[int, ...] = (0,)
-    evaluate: tuple[str, ...] = ()  # parts of an audit, beyond what `keyss hide` measures
+    pairs: Annotated[tuple[Pair, ...], _AT_LEAST_ONE]
+    methods: Annotated[tuple[MethodSpec, ...], _AT_LEAST_ONE]
+    seeds: Annotated[tuple[Annotated[int, Meta(ge=0, le=MAX_SEED)], ...], _AT_LEAST_ONE] = (0,)
+    evaluate: tuple[Literal[tuple(PARTS)], ...] = ()  # type: ignore[valid-type]  # beyond `keyss hide`'s own
     width: int | None = None
     background: tuple[float, float, float] | None = None
     skip_missing: bool = False
@@ -81,18 +91,16 @@ class SweepSpec:
 
     @property
     def common(self) -> dict[str, Any]:
-        """What all cells have."""
+        """The fields of all cells."""
         views = ViewOptions(self.width, self.background, self.skip_missing)
-        own = {"min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
-        return {"views": views, **own}
+        return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
 
 
 @dataclass(frozen=True)
 class Variant:
     """A method with one choice of options."""
 
-    name: str  # of the method, as the file has it
-    method: str
+    name: str  # of the method in tables
     options: MethodOptions
     choices: Mapping[str, Any]  # from the grid
 
@@ -100,152 +108,109 @@ class Variant:
 def read_spec(path: Path) -> SweepSpec:
     """The sweep in a file, with absolute paths. Raises InputError, and BackendError without PyYAML."""
     try:
-        import yaml
-    except ImportError as error:
-        raise BackendError(f"sweeps need the package pyyaml (pip install 'keyss[sweep]'): {error}") from error
-    text = read_text(path, MAX_BYTES)
-    try:
-        opening = (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken)
-        closing = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken)
-        depth = 0
-        for token in yaml.scan(text, yaml.SafeLoader):
-            # A few aliases of aliases can expand to more than memory holds.
-            if isinstance(token, yaml.AliasToken):
-                raise InputError(f"{path}: aliases (*name) are not read: write it out")
-            depth += isinstance(token, opening) - isinstance(token, closing)
-            if depth > MAX_DEEP:  # the time grows with its square
-                raise InputError(f"{path}: brackets are nested more than {MAX_DEEP} deep")
-        data = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error
-    _check_names(path, data)
-    try:
-        spec = msgspec.convert(data, SweepSpec)
+        spec = msgspec.convert(_yaml(path), SweepSpec)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}{_suggestion(str(error))}") from error
     _check_values(path, spec)
     base = path.absolute().parent
-    pairs = tuple(_found(path, base, index, pair) for index, pair in enumerate(spec.pairs))
-    spec = replace(spec, pairs=pairs)
-    for _ in variants(path, spec):  # refuses
+    pairs = tuple(_with_absolute_paths(path, base, index, pair) for index, pair in enumerate(spec.pairs))
+    for _ in variants(path, spec):  # raises InputError
         pass
-    return spec
+    return msgspec.structs.replace(spec, pairs=pairs)
 
 
 def variants(path: Path, spec: SweepSpec) -> Iterator[Variant]:
-    """Every method with every choice of its grid. Raises InputError for options that it does not have."""
+    """Every method with every choice of its grid. Raises InputError for invalid options."""
     for index, entry in enumerate(spec.methods):
-        where = f"{path}: methods[{index}]"
-        preset = registry.get(entry.method).options.preset(entry.preset or "default")
+        preset = registry.get(entry.method).options.preset(entry.preset)
         for values in product(*entry.grid.values()):
             choices = dict(zip(entry.grid, values, strict=True))
-            options = _options(where, preset, entry.options, choices)
-            yield Variant(entry.name or entry.method, entry.method, options, choices)
+            options = _options(f"{path}: methods[{index}]: options", preset, {**entry.options, **choices})
+            yield Variant(entry.label, options, choices)
 
 
-def label(pair: Pair) -> str:
-    """The name of a pair in tables."""
-    return pair.name or "-".join(Path(each).stem for each in (pair.cover, *pair.secrets))
+def _yaml(path: Path) -> Any:
+    """Raises InputError for anything but plain YAML, BackendError without PyYAML."""
+    yaml = import_extra("yaml", "sweep", "read sweeps")
 
+    class Loader(yaml.SafeLoader):  # type: ignore[name-defined, misc]
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):  # a few, nested, can expand to more than memory holds
+                raise InputError(f"{path}: aliases (*name) are not supported: repeat what they stand for")
+            return super().compose_node(parent, index)
 
-def _options(
-    where: str, preset: MethodOptions, given: Mapping[str, Any], choices: Mapping[str, Any]
-) -> MethodOptions:
-    inner = given.get(_FIT, {})
-    if not isinstance(inner, dict):
-        raise InputError(f"{where}: options.fit: expected a mapping, got {inner!r}")
-    flat = {name: value for name, value in given.items() if name != _FIT}
-    flat |= {f"{_FIT}.{name}": value for name, value in inner.items()} | dict(choices)
-    training = {f"{_FIT}.{name}" for name in _names(FitConfig) - {"seed"}}
-    _check_known(f"{where}: options", flat, (_names(type(preset)) - {_FIT}) | training)
-    changes = {name: value for name, value in flat.items() if name not in training}
-    fit = {name.removeprefix(f"{_FIT}."): value for name, value in flat.items() if name in training}
+    text = read_text(path, MAX_BYTES)
     try:
-        typed = _typed(type(preset), preset, changes)
-        fitted = _typed(FitConfig, preset.fit, fit)
-        options = replace(preset, **{name: getattr(typed, name) for name in changes})
+        return yaml.load(text, Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error
+
+
+def _suggestion(message: str) -> str:
+    """For the message of a ValidationError about an unknown name: the nearest known one."""
+    if field := re.search(r"unknown field `(.+?)`", message):
+        kinds = (SweepSpec, Pair, MethodSpec)
+        return f"; {did_you_mean(field[1], [name for kind in kinds for name in kind.__struct_fields__])}"
+    if value := re.search(r"enum value '(.+?)' ", message):
+        return f"; {did_you_mean(value[1], [*registry.METHODS, *PRESETS, *PARTS])}"
+    return ""
+
+
+def _options(where: str, preset: MethodOptions, given: Mapping[str, Any]) -> MethodOptions:
+    """The preset with changed options; those of training are in a mapping `fit` or named `fit.NAME`."""
+    nested = given.get(_FIT, {})
+    if not isinstance(nested, dict):
+        raise InputError(f"{where}.fit: expected a mapping, got {nested!r}")
+    flat = {f"{_FIT}.{name}": value for name, value in nested.items()}
+    flat |= {name: value for name, value in given.items() if name != _FIT}
+    training = {f"{_FIT}.{each.name}" for each in fields(FitConfig) if each.name != "seed"}
+    known = training | {each.name for each in fields(preset) if each.name != _FIT}
+    for name in flat:
+        if name not in known:
+            raise InputError(f"{where}: {str(name)[:60]!r} is unknown; {did_you_mean(str(name), known)}")
+    fit = {name.removeprefix(f"{_FIT}."): value for name, value in flat.items() if name in training}
+    own = {name: value for name, value in flat.items() if name not in training}
+    try:
+        fitted = msgspec.convert({**msgspec.to_builtins(preset.fit), **fit}, FitConfig)
+        options = msgspec.convert({**msgspec.to_builtins(preset), **own}, type(preset))
         return options.with_fit(**{name: getattr(fitted, name) for name in fit})
     except (KeyssError, msgspec.ValidationError) as error:
-        raise InputError(f"{where}: options: {error}") from error
-
-
-def _typed(kind: Any, base: Any, changes: Mapping[str, Any]) -> Any:
-    """`base` with changes of the types that `kind` states. Raises ValidationError, and what `kind` does."""
-    return msgspec.convert({**msgspec.to_builtins(base), **changes}, kind)
-
-
-def _check_names(path: Path, data: Any) -> None:
-    """Raise InputError for fields that do not exist: a misspelt one must not be ignored."""
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a mapping with pairs and methods, got {type(data).__name__}")
-    _check_known(str(path), data, _names(SweepSpec))
-    for name, kind in (("pairs", Pair), ("methods", MethodSpec)):
-        listed = data.get(name)
-        for index, each in enumerate(listed if isinstance(listed, list) else ()):
-            if isinstance(each, dict):
-                _check_known(f"{path}: {name}[{index}]", each, _names(kind))
-
-
-def _check_known(where: str, given: Collection[Any], known: Collection[str]) -> None:
-    for each in given:
-        if each not in known:
-            name = str(each)
-            raise InputError(f"{where}: {name[:60]!r} is not known; {did_you_mean(name, known)}")
-
-
-def _names(kind: Any) -> set[str]:
-    return {each.name for each in fields(kind)}
+        raise InputError(f"{where}: {error}") from error
 
 
 def _check_values(path: Path, spec: SweepSpec) -> None:
-    for name in ("pairs", "methods", "seeds"):
-        if not getattr(spec, name):
-            raise InputError(f"{path}: {name}: expected at least one")
-    _check_known(f"{path}: evaluate", spec.evaluate, PARTS)
-    for seed in spec.seeds:
-        if not 0 <= seed <= MAX_SEED:
-            raise InputError(f"{path}: seeds: expected 0 to {MAX_SEED}, got {seed}")
+    """Raise InputError for what types cannot state."""
     if len(set(spec.seeds)) < len(spec.seeds):
-        raise InputError(f"{path}: seeds: the same one is there twice")
-    _check_different(f"{path}: pairs", [label(pair) for pair in spec.pairs])
-    _check_different(f"{path}: methods", [entry.name or entry.method for entry in spec.methods])
-    grids = 0
+        raise InputError(f"{path}: seeds: expected different ones, got one twice")
+    _check_labels(f"{path}: pairs", [pair.label for pair in spec.pairs])
+    _check_labels(f"{path}: methods", [entry.label for entry in spec.methods])
     for index, entry in enumerate(spec.methods):
-        where = f"{path}: methods[{index}]"
-        _check_known(f"{where}.method", [entry.method], registry.METHODS)
-        if entry.preset is not None:
-            _check_known(f"{where}.preset", [entry.preset], PRESETS)
-        for name, values in entry.grid.items():
-            if not values:
-                raise InputError(f"{where}: grid.{name}: expected at least one value")
-            if name in entry.options:
-                raise InputError(f"{where}: {name} is among the options and in the grid")
-        grids += prod(len(values) for values in entry.grid.values())
-    count = len(spec.pairs) * len(spec.seeds) * grids
+        for name in entry.grid.keys() & entry.options.keys():
+            raise InputError(f"{path}: methods[{index}]: {name} is both in the options and in the grid")
+    choices = sum(prod(map(len, entry.grid.values())) for entry in spec.methods)
+    count = len(spec.pairs) * len(spec.seeds) * choices
     if count > MAX_CELLS:
         raise InputError(f"{path}: expected at most {MAX_CELLS:,} cells, got {count:,}")
-    most = min(registry.get(each.method).most_secrets for each in spec.methods)
+    most = min(registry.get(entry.method).most_secrets for entry in spec.methods)
     for index, pair in enumerate(spec.pairs):
-        where, secrets = f"{path}: pairs[{index}]", len(pair.secrets)
-        if not 1 <= secrets <= most:
-            raise InputError(f"{where}.secrets: expected 1 to {most}, got {secrets}")
-        if len(pair.secret_models) not in (0, secrets):
-            raise InputError(
-                f"{where}.secret_models: expected none or one for each secret, got {len(pair.secret_models)}"
-            )
+        where, secrets, models = f"{path}: pairs[{index}]", len(pair.secrets), len(pair.secret_models)
+        if secrets > most:
+            raise InputError(f"{where}.secrets: expected at most {most}, got {secrets}")
+        if models not in (0, secrets):
+            raise InputError(f"{where}.secret_models: expected none or one for each secret, got {models}")
 
 
-def _check_different(where: str, labels: Sequence[str]) -> None:
+def _check_labels(where: str, labels: Sequence[str]) -> None:
     """Raise InputError for equal names: the tables would take them for seeds of one."""
-    for index, each in enumerate(labels):
-        if (first := labels.index(each)) < index:
-            raise InputError(f"{where}[{index}]: called {each!r} as [{first}] is: give one a `name`")
+    for index, label in enumerate(labels):
+        if (first := labels.index(label)) < index:
+            raise InputError(f"{where}[{index}]: has the name {label!r} of [{first}]: give it another `name`")
 
 
-def _found(path: Path, base: Path, index: int, pair: Pair) -> Pair:
-    """The pair with absolute paths. Raises InputError for a missing one."""
+def _with_absolute_paths(path: Path, base: Path, index: int, pair: Pair) -> Pair:
+    """Raises InputError for a missing path."""
 
-    def found(name: str, value: str) -> str:
+    def absolute(name: str, value: str) -> str:
         if "\0" in value:
             raise InputError(f"{path}: pairs[{index}].{name}: expected a path, got {value!r}")
         whole = os.path.realpath(os.path.join(base, os.path.expanduser(value)))
@@ -253,10 +218,10 @@ def _found(path: Path, base: Path, index: int, pair: Pair) -> Pair:
             raise InputError(f"{path}: pairs[{index}].{name}: there is no {value}")
         return whole
 
-    return Pair(
-        cover=found("cover", pair.cover),
-        secrets=tuple(found("secrets", each) for each in pair.secrets),
-        name=pair.name,
-        cover_model=pair.cover_model and found("cover_model", pair.cover_model),
-        secret_models=tuple(found("secret_models", each) for each in pair.secret_models),
+    return msgspec.structs.replace(
+        pair,
+        cover=absolute("cover", pair.cover),
+        secrets=tuple(absolute("secrets", each) for each in pair.secrets),
+        cover_model=pair.cover_model and absolute("cover_model", pair.cover_model),
+        secret_models=tuple(absolute("secret_models", each) for each in pair.secret_models),
     )

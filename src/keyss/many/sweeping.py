@@ -9,7 +9,7 @@ from pathlib import Path
 from keyss.keys.key_file import read_key_file
 from keyss.many.folder import CellFolder, Forecast
 from keyss.many.running import RETRIES, ManyResult, Outcome
-from keyss.many.spec import SweepSpec, label, read_spec, variants
+from keyss.many.spec import SweepSpec, read_spec, variants
 from keyss.many.tables import CellNumbers, write_tables
 from keyss.rendering.orbit import is_model
 from keyss.runs.sources import PathLike
@@ -66,9 +66,9 @@ def _rows(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, CellNum
             for source, model, config in zip(sources, given, options.fits(len(sources)), strict=True)
         ]
         chosen = "".join(f" {name}={value}" for name, value in variant.choices.items())
-        name = f"{label(pair)} {variant.name}{chosen} seed {seed}"
+        name = f"{pair.label} {variant.name}{chosen} seed {seed}"
         place = folder.hiding(name, sources, options, models, measures=spec.evaluate)
-        found.setdefault(place, CellNumbers(label(pair), variant.name, variant.choices, seed, place.name, {}))
+        found.setdefault(place, CellNumbers(pair.label, variant.name, variant.choices, seed, place.name, {}))
     return found
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from scipy.stats import t as student
 
 from keyss.core.errors import BackendError
+from keyss.core.extras import import_extra
 from keyss.files.atomic import write_bytes
 
 CONFIDENCE = 0.95
@@ -109,13 +110,8 @@ def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
 
 
 def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise BackendError(
-            f"Parquet needs the package pyarrow (pip install 'keyss[sweep]'): {error}"
-        ) from error
+    parquet = import_extra("pyarrow.parquet", "sweep", "write Parquet")
+    pyarrow = import_extra("pyarrow", "sweep", "write Parquet")
     buffer = io.BytesIO()
     parquet.write_table(pyarrow.Table.from_pylist([dict(row) for row in rows]), buffer)
     return buffer.getvalue()

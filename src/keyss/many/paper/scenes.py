@@ -7,7 +7,8 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from keyss.core.errors import BackendError, InputError, OutputError, UsageError
+from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.extras import import_extra
 from keyss.core.nearest import did_you_mean
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 
@@ -44,12 +45,7 @@ def download(names: Iterable[str], data: Path) -> None:
     Archives stay in `data/archives`. Raises InputError for what cannot be fetched or unpacked, BackendError
     without pooch.
     """
-    try:
-        import pooch
-    except ImportError as error:
-        raise BackendError(
-            f"downloading needs the package pooch (pip install 'keyss[reproduce]'): {error}"
-        ) from error
+    pooch = import_extra("pooch", "reproduce", "download scenes")
     missing = {name for name in names if not (data / name).exists()}
     archives = data / "archives"
     for url, folders in SOURCES.items():
