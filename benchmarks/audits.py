@@ -16,7 +16,7 @@ from statistics import fmean
 from typing import Any
 
 from keyss.audits import Audit, read_audit
-from keyss.files.atomic import write_bytes
+from keyss.files import write_bytes
 from keyss.measure import ImageComparison, composite_score, mean_over_draws
 
 BEGIN, END = "<!-- audits: begin -->", "<!-- audits: end -->"

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
-from keyss.files.atomic import write_bytes
+from keyss.files import write_bytes
 
 import msgspec
 

@@ -26,7 +26,7 @@ from types import ModuleType
 from keyss.channels import SUFFIXES, CodesChannel, CodesReader, Payload
 from keyss.channels.codes.fields import format_of
 from keyss.core import Gaussians, Scene
-from keyss.files.atomic import write_bytes
+from keyss.files import write_bytes
 from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model

@@ -17,8 +17,8 @@ import time
 import zipfile
 
 from keyss.core import Gaussians, InputError
+from keyss.files import model_bytes, model_of_bytes
 from keyss.files.formats import spz
-from keyss.files.models import MemoryInput, model_bytes, read_source
 
 import numpy as np
 import torch
@@ -39,23 +39,7 @@ def examples(count: int = 60) -> dict[str, list[bytes]]:
     names = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat")
     found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in names}
     found["a.spz"].append(spz.serialise(spz.quantise(model(1), version=4)))
-    found["a.ksplat"] = [_ksplat(count, level) for level in range(3)]
     return found
-
-
-def _ksplat(count: int, level: int) -> bytes:
-    """A file of one section and one full bucket."""
-    size = (48, 24, 24)[level] - (4 if level == 0 else 0)
-    header = np.zeros(4096, np.uint8)
-    header[1] = 1
-    header.view("<u4")[[1, 2, 3, 4]] = 1, 1, count, count
-    header.view("<u2")[10] = level
-    section = np.zeros(1024, np.uint8)
-    section.view("<u4")[[0, 1, 2, 3, 6, 8]] = count, count, count, 1, 32767, 1
-    section.view("<f4")[4] = 5
-    section.view("<u2")[10] = 12
-    body = np.random.default_rng(0).integers(0, 60, 12 + count * size).astype(np.uint8)
-    return header.tobytes() + section.tobytes() + body.tobytes()
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
@@ -107,7 +91,7 @@ def attempt(name: str, data: bytes) -> str | None:
     """What is wrong with how a file is read, if anything."""
     start = time.perf_counter()
     try:
-        model = read_source(MemoryInput(name, data))
+        model = model_of_bytes(name, data)
         finite = all(bool(value.isfinite().all()) for value in vars(model).values())
         problem = None if finite and len(model) else "a model that is empty or not finite"
     except InputError as error:

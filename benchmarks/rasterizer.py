@@ -22,8 +22,7 @@ from pathlib import Path
 from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
 from benchmark_record import make_record, numbers_of_table, processor_name, write_record
 from keyss.core import Camera, Gaussians
-from keyss.files import read_model
-from keyss.files.atomic import write_bytes
+from keyss.files import read_model, write_bytes
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters

@@ -12,7 +12,7 @@ import torch
 
 from keyss.channels import LOW_BITS, Records
 from keyss.core import Gaussians, WrongKeyError
-from keyss.files.ply import read_ply
+from keyss.files import read_model
 
 pytestmark = pytest.mark.argon2
 
@@ -31,11 +31,11 @@ def _quantised(stego: Gaussians) -> Gaussians:
 @pytest.mark.parametrize("change", [_moved, _quantised, lambda stego: stego.with_sh_degree(2)])
 def test_stego_models_that_must_fail(change: Callable[[Gaussians], Gaussians]) -> None:
     with pytest.raises(WrongKeyError, match="opens nothing"):
-        LOW_BITS.reader(change(read_ply(FOLDER / "carried.ply"))).open(CARRIED["key"])
+        LOW_BITS.reader(change(read_model(FOLDER / "carried.ply"))).open(CARRIED["key"])
 
 
 def test_what_is_left_of_a_stego_model_comes_out() -> None:
-    stego = read_ply(FOLDER / "carried.ply")
+    stego = read_model(FOLDER / "carried.ply")
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(0))
     content = LOW_BITS.reader(stego[order[:360]]).open(CARRIED["key"])
     assert isinstance(content, Records)

@@ -109,7 +109,6 @@ def test_a_key_that_opens_nothing(keyss: Run, files: Path, tmp_path: Path) -> No
 def test_what_is_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
     plain = files / "plain.ply"
     assert_refused(keyss("convert", plain, tmp_path / "a.lcc"), 2, "expected a name that ends in")
-    assert_refused(keyss("convert", plain, tmp_path / "a.ksplat"), 2, "expected a name that ends in")
     assert_refused(keyss("convert", files / "key", tmp_path / "a.ply"), 4, "expected a 3DGS model")
     (tmp_path / "there.spz").touch()
     assert_refused(keyss("convert", plain, tmp_path / "there.spz"), 5, "exists")

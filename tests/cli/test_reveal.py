@@ -153,7 +153,7 @@ class TestOutputs:
         assert_refused(said, 2, "is the input")
         assert listing(tmp_path) == before
 
-    @pytest.mark.parametrize("name", ["x.ksplat", "meta.json"])
+    @pytest.mark.parametrize("name", ["x.lcc", "meta.json"])
     def test_formats_that_are_only_read_are_refused_before_any_work(
         self, keyss: Run, files: Path, tmp_path: Path, name: str
     ) -> None:

@@ -13,8 +13,9 @@ from PIL import Image
 
 from files.scene_files import photo
 from keyss.core import InputError
-from keyss.files import load_scene, read_model
-from keyss.files.foreign import CONVERT, what_it_is
+from keyss.files import load_scene, read_model, what_it_is
+
+CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 
 
 def zipped() -> bytes:
@@ -35,9 +36,9 @@ FILES = {  # name and content, and what they are
     "A.SPZ": (b"NGSP" + bytes(12), "an SPZ model"),
     "a.sog": (zipped(), "an SOG model; give it where a model is asked for"),
     "a.splat": (bytes(64), "a .splat model; give it where a model is asked for"),
-    "a.ksplat": (bytes(64), "a .ksplat model"),
+    "a.ksplat": (bytes(64), f"a .ksplat model, which keyss does not read; {CONVERT}"),
     "a.glb": (b"glTF", "a glTF file"),
-    "a.lcc": (b"{}", f"an LCC model, which keyss does not read yet; {CONVERT}"),
+    "a.lcc": (b"{}", f"an LCC model, which keyss does not read; {CONVERT}"),
     "a.csv": (b"x,y,z\n1,2,3\n", "a table; export a .ply"),
     "a.zip": (zipped(), "a ZIP archive; unpack it"),
     "a": (gzip.compress(b"1"), "gzip data; unpack it"),
@@ -53,7 +54,7 @@ FILES = {  # name and content, and what they are
 }
 
 
-READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.ksplat", "a.glb", "a.zip", "a", "b", "c", "f"}
+READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.glb", "a.zip", "a", "b", "c", "f"}
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -12,13 +12,11 @@ from pathlib import Path
 import pytest
 
 from keyss.core import OutputError
-from keyss.files.atomic import atomic_write, write_bytes
-from keyss.files.lock import held_by, lock
-from keyss.files.output import check_output_file
+from keyss.files import atomic_write, check_output_file, held_by, lock, write_bytes
 
 WRITE_AND_WAIT = """
 import sys, time
-from keyss.files.atomic import atomic_write
+from keyss.files import atomic_write
 with atomic_write(sys.argv[1]) as file:
     file.write(b"a part")
     file.flush()
@@ -28,7 +26,7 @@ with atomic_write(sys.argv[1]) as file:
 LOCK_AND_WAIT = """
 import sys, time
 from pathlib import Path
-from keyss.files.lock import lock
+from keyss.files import lock
 with lock(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60)

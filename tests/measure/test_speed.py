@@ -15,7 +15,6 @@ from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
 from keyss.files import write_model
-from keyss.files.ply import write_ply
 from keyss.measure import (
     FileSize,
     ReaderResult,
@@ -85,7 +84,7 @@ def test_a_model_takes_longer_than_a_hundredth_of_it(monkeypatch: pytest.MonkeyP
 
 
 def test_revealing_is_timed_from_file_to_file(clock: Clock, tmp_path: Path) -> None:
-    write_ply(tmp_path / "in.ply", random_gaussians(10))
+    write_model(tmp_path / "in.ply", random_gaussians(10))
     waits = iter([5.0, 1.0, 2.0])
 
     def reopen(model: Gaussians) -> Reopened:
@@ -101,7 +100,7 @@ def test_revealing_is_timed_from_file_to_file(clock: Clock, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_other_peoples_readers_find_our_values(degree: int, tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", random_gaussians(40, sh_degree=degree))
+    write_model(tmp_path / "a.ply", random_gaussians(40, sh_degree=degree))
     found = {each.reader: each for each in readers(tmp_path / "a.ply")}
     for name in ("plyfile", "gsply"):
         assert found[name] == ReaderResult(name, "a.ply", True, 40)
@@ -119,7 +118,7 @@ def test_splat_transform_finds_our_values(
     tmp_path: Path, splat_transform: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", splat_transform)
-    write_ply(tmp_path / "a.ply", random_gaussians(40))
+    write_model(tmp_path / "a.ply", random_gaussians(40))
     assert readers(tmp_path / "a.ply")[2] == ReaderResult("splat-transform", "a.ply", True, 40)
 
 
@@ -127,7 +126,7 @@ def test_other_values_fewer_values_and_failures_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = random_gaussians(40)
-    write_ply(tmp_path / "a.ply", model)
+    write_model(tmp_path / "a.ply", model)
 
     def reading(change: Callable[[Gaussians], Gaussians]) -> Callable[[Path], dict[str, Any]]:
         return lambda path: module._columns_of(change(model))
@@ -151,7 +150,7 @@ def test_readers_that_are_absent_say_so(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("keyss.measure.robustness.conversions.import_module", missing)
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
-    write_ply(tmp_path / "a.ply", random_gaussians(4))
+    write_model(tmp_path / "a.ply", random_gaussians(4))
     found = readers(tmp_path / "a.ply")
     assert [each.loads for each in found] == [None] * 3
     assert all("not installed (" in (each.note or "") for each in found)
@@ -164,7 +163,7 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
     scenes: list[Scene] = [tiny_scene(0, views=8), tiny_scene(1, views=8)]
     cover, secret = trained_like(1000), trained_like(300, seed=1)
-    write_ply(tmp_path / "stego.ply", embed(cover, [(KEY, secret)]))
+    write_model(tmp_path / "stego.ply", embed(cover, [(KEY, secret)]))
     steps: list[tuple[int, int, str]] = []
 
     def slowly(model: Gaussians, key: str) -> Opened:
@@ -179,7 +178,7 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         rounds=2,
         progress=lambda *step: steps.append(step),
     )
-    write_ply(tmp_path / "secret.ply", secret)  # the same size as the revealed file
+    write_model(tmp_path / "secret.ply", secret)  # the same size as the revealed file
     assert found.files == (
         FileSize("stego", (tmp_path / "stego.ply").stat().st_size),
         FileSize("secret 1", (tmp_path / "secret.ply").stat().st_size),

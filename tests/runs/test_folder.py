@@ -12,8 +12,7 @@ import msgspec
 import pytest
 
 from keyss.core import OutputError, UsageError
-from keyss.files.atomic import write_bytes
-from keyss.files.lock import lock
+from keyss.files import lock, write_bytes
 from keyss.runs import MANIFEST, Manifest, RunFolder, read_manifest
 from keyss.runs.folder import clear, write_again
 

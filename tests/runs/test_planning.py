@@ -16,7 +16,7 @@ import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, KeyssOptions, Secret
 from keyss.core import OutputError
-from keyss.files.ply import write_ply
+from keyss.files import write_model
 from keyss.methods import Decoder, DesignName, registry
 from keyss.methods.peers.networks import Convolutions, weights_of
 from tiny_scenes import tiny_scene
@@ -99,7 +99,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_done(
         return Usage(10**9, 10**9, 4 << 20)
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
-    write_ply(tmp_path / "cover.ply", trained_like(2500))
+    write_model(tmp_path / "cover.ply", trained_like(2500))
     secrets = [Secret(trained_like(900, 1), KEY)]
     for verb in (keyss.hide, partial(keyss.hide, dry_run=True)):
         with pytest.raises(OutputError, match=r"free space.*found 4 MB"):

@@ -53,7 +53,6 @@ from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
 from keyss.files.formats import compressed_ply, sog, splat, spz  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
-from keyss.files.ply import write_ply  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
 from keyss.methods import (  # noqa: E402  # noqa: E402
     ATTRIBUTES,
@@ -151,11 +150,11 @@ def main() -> None:
     secret = trained_like(8, 1, 1)
     secret.means[0, 0] = 1e6  # an outlier
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
-    write_ply(FOLDER / "carried.ply", stego)
+    write_model(FOLDER / "carried.ply", stego)
     cover = trained_like(1600)
     joint = some_secret(cover).payload()
     stego = LOW_BITS.prepare(cover).embed([(key, joint)], entropy=bytes(32))
-    write_ply(FOLDER / "keyss.ply", stego)
+    write_model(FOLDER / "keyss.ply", stego)
     write_revealed(key)
     write_published()
     write_extremes()
@@ -315,7 +314,7 @@ def digests(model: Gaussians) -> dict[str, str]:
 
 
 def write_revealed(key: str) -> None:
-    write_ply(FOLDER / "pruned.ply", pruned())
+    write_model(FOLDER / "pruned.ply", pruned())
     opened = [revealed(name, key) for name in ("carried.ply", "keyss.ply")]
     opened += [revealed("pruned.ply", each) for each in TWO_KEYS]
     for suffix in codes_examples.FORMATS:

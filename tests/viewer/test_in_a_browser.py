@@ -13,8 +13,7 @@ import pytest
 
 from cli.said import PROGRAM as KEYSS
 from keyss.core.gaussians import Gaussians
-from keyss.files.models import read_model, write_model
-from keyss.files.ply import write_ply
+from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
 from viewer.browser import POSE, PROGRAM, WEB, Visit, camera_of, drawn, made, psnr
@@ -32,7 +31,7 @@ def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model of 4,000 Gaussians with two secrets."""
     path = tmp_path_factory.mktemp("published") / "stego.ply"
     secrets = [(key, made(200, seed)) for seed, key in enumerate(KEYS, start=1)]
-    write_ply(path, embed(made(4000, 0), secrets, entropy=bytes(32)))
+    write_model(path, embed(made(4000, 0), secrets, entropy=bytes(32)))
     return path
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from keyss.core.errors import OutputError
-from keyss.files.ply import write_ply
+from keyss.files import write_model
 from keyss.viewer import ModelServer, export_html
 from keyss.viewer.page import asset
 from tiny_scenes import random_gaussians
@@ -25,7 +25,7 @@ from viewer.browser import ROOT, WEB
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
     path = tmp_path / "a model & <more>.ply"
-    write_ply(path, random_gaussians(5))
+    write_model(path, random_gaussians(5))
     return path
 
 

@@ -17,7 +17,7 @@ from keyss.files.models import (
     model_bytes,
     model_of_bytes,
 )
-from keyss.files.streams import StandardOutput, is_standard
+from keyss.files.streams import is_standard, write_standard_output
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
 from keyss.runs.folder import check_not_published
@@ -93,7 +93,7 @@ def convert(
     if dry_run:
         return result
     if is_standard(path):
-        StandardOutput().write(memoryview(data))
+        write_standard_output(data)
     else:
         write_bytes(path, data)
     return result

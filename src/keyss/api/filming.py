@@ -15,7 +15,7 @@ from torch import Tensor
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, ViewOptions, checked_background
-from keyss.files.output import check_not_an_input, check_output_file
+from keyss.files.atomic import check_not_an_input, check_output_file
 from keyss.files.video import check_video, write_video
 from keyss.fitting.reporting import Reporter, SilentReporter
 from keyss.rendering import Backend, render, resolve_device

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from keyss.channels import open_content
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.files.atomic import write_bytes
+from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
 from keyss.files.models import check_model_output, is_model_path, write_model
-from keyss.files.output import check_not_an_input, check_output_file
 from keyss.files.streams import is_standard
 from keyss.methods.hidden_file import HiddenFile, OpensAFileError
 from keyss.methods.opened import Frame

@@ -21,7 +21,7 @@ from keyss.core import InputError, import_extra
 from keyss.measure.images import ImageComparison
 from keyss.measure.robustness.survival import mean_over_draws
 from keyss.viewer.page import embedding_rules, page_with
-from keyss.viewer.showing import is_shown
+from keyss.viewer.showing import is_readable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -74,7 +74,7 @@ def published_model(path: Path, up: str) -> Published:
             data = file.read(MAX_EMBEDDED + 1) if inside else b""
     except OSError:
         data = b""
-    if not is_shown(path.name, data):
+    if not is_readable(path.name, data):
         return Published(None, "It was not in RUN/publish when this page was written.")
     if len(data) > MAX_EMBEDDED:
         size = f"It is larger than {MAX_EMBEDDED >> 20} MiB, too large for this page."

@@ -113,8 +113,7 @@ def steganalyze(
     import sys
 
     from keyss.cli.tables import print_steganalysis
-    from keyss.files.atomic import write_bytes
-    from keyss.files.output import check_output_file
+    from keyss.files.atomic import check_output_file, write_bytes
     from keyss.measure.stegexpose import csv_bytes, steganalyze as analyze
     from keyss.progress import reporter
 

@@ -1,2 +1,19 @@
-from .models import read_model as read_model, write_model as write_model
+from .atomic import (
+    atomic_write as atomic_write,
+    check_output_file as check_output_file,
+    held_by as held_by,
+    lock as lock,
+    write_bytes as write_bytes,
+)
+from .foreign import what_it_is as what_it_is
+from .models import (
+    DECODED_SUFFIX as DECODED_SUFFIX,
+    check_model_output as check_model_output,
+    is_model_path as is_model_path,
+    keeps_low_bits as keeps_low_bits,
+    model_bytes as model_bytes,
+    model_of_bytes as model_of_bytes,
+    read_model as read_model,
+    write_model as write_model,
+)
 from .scenes import load_scene as load_scene

@@ -1,12 +1,11 @@
-"""Files that are no 3DGS model that keyss reads: what they are, and what a person can do with them."""
+"""Names files that keyss does not read as models, and says what to do with them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from keyss.core.errors import InputError
-from keyss.files.streams import StandardInput
+from keyss.files.reading import open_input
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
@@ -20,16 +19,16 @@ class _Kind:
     name: str  # with its article
     advice: str
     suffixes: tuple[str, ...] = ()
-    magic: tuple[bytes, ...] = ()  # of which one begins the file
+    magic: tuple[bytes, ...] = ()  # possible first bytes
 
 
-# The first whose suffix fits, else the first whose magic does: some are gzip data or ZIP archives inside.
+# The first kind whose suffix fits, else the first whose magic does, since some formats are ZIP archives.
 _KINDS = (
     _Kind("an SPZ model", _MODEL, (".spz",), (b"NGSP",)),
     _Kind("an SOG model", _MODEL, (".sog",)),
     _Kind("a .splat model", _MODEL, (".splat",)),
-    _Kind("a .ksplat model", _MODEL, (".ksplat",)),
     _Kind("a glTF file", _MODEL, (".glb",), (b"glTF",)),
+    _Kind("a .ksplat model", CONVERT, (".ksplat",)),
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
     _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),
     _Kind("a table", _EXPORT, (".csv", ".tsv")),
@@ -49,25 +48,26 @@ _KINDS = (
 )
 
 
-def what_it_is(path: Path | StandardInput) -> str:
-    """What a file is that keyss does not read, by its name or its first bytes, and what to do.
+def what_it_is(path: Path) -> str:
+    """The kind of a file that keyss does not read, and what to do with it; to follow "expected ..., found".
 
-    To follow "expected ..., found". Raises InputError when it cannot be read.
+    Raises InputError if it cannot be read.
     """
-    try:
-        if not path.is_file():  # reading a pipe could wait for ever
-            return "neither a file nor a folder"
-        with path.open("rb") as file:
-            start = file.read(16)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not path.is_file():  # reading a pipe could block for ever
+        return "neither a file nor a folder"
+    with open_input(path) as file:
+        return kind_of(path.name, file.read(16))
+
+
+def kind_of(name: str, start: bytes) -> str:
+    """`what_it_is` for a file with this name and these first 16 bytes."""
     if not start:
         return "an empty file"
-    by_suffix = (kind for kind in _KINDS if path.name.lower().endswith(kind.suffixes))
+    by_suffix = (kind for kind in _KINDS if name.lower().endswith(kind.suffixes))
     by_magic = (kind for kind in _KINDS if start.startswith(kind.magic))
     kind = next(by_suffix, None) or next(by_magic, None)
     if kind is None:
-        return "a file of no kind that keyss knows"  # none of its bytes: it may be a key
+        return "a file of no kind that keyss knows"  # does not quote it: it may be a key
     if kind.advice == CONVERT:
-        return f"{kind.name}, which keyss does not read yet; {CONVERT}"
+        return f"{kind.name}, which keyss does not read; {CONVERT}"
     return f"{kind.name}; {kind.advice}"

@@ -1,4 +1,4 @@
-"""3DGS models on disk, whatever their format: the one door through which the rest of the program goes.
+"""Reading and writing 3DGS models in all formats.
 
 A new format is a module with a reader and a writer, and one entry in `FORMATS`.
 """
@@ -6,24 +6,32 @@ A new format is a module with a reader and a writer, and one entry in `FORMATS`.
 from __future__ import annotations
 
 import importlib
+import io
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.files.atomic import atomic_write
-from keyss.files.foreign import what_it_is
-from keyss.files.output import check_not_an_input, check_output_file
+from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
+from keyss.files.foreign import kind_of
 from keyss.files.ply import read_ply, write_ply
-from keyss.files.ply_rows import is_compressed
-from keyss.files.streams import MemoryInput, MemoryOutput, StandardInput, StandardOutput, is_standard
+from keyss.files.ply_rows import has_packed_header
+from keyss.files.reading import open_input
+from keyss.files.streams import (
+    MAX_BYTES,
+    check_standard_output,
+    is_standard,
+    read_standard_input,
+    write_standard_output,
+)
 
-DECODED_SUFFIX = ".3dgs.safetensors"  # of models whose pictures a network makes
+DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
 
 
 @dataclass(frozen=True)
@@ -31,151 +39,142 @@ class ModelFormat:
     """One file format of 3DGS models."""
 
     name: str
-    suffixes: tuple[str, ...]  # in lower case and with the dot; the first is the usual one
-    magic: tuple[bytes, ...]  # of which one begins every file; none: only the name tells
-    read: Callable[[Path | StandardInput], Gaussians]  # on the CPU; raises InputError
-    write: Callable[[Path | StandardOutput, Gaussians], None] | None  # atomically; raises OutputError
-    exact: bool = False  # whether all numbers come back to the last bit
+    suffixes: tuple[str, ...]  # lower case, with the dot; the first is the usual one
+    magic: tuple[bytes, ...]  # possible first bytes; empty: recognised by name only
+    read: Callable[[BinaryIO], Gaussians]  # onto the CPU; raises InputError
+    write: Callable[[Gaussians, BinaryIO], None] | None  # raises OutputError
+    is_exact: bool = False  # True if all numbers are kept to the last bit
 
 
 def _format(module: str) -> Any:
-    """A module of `keyss.files.formats`, imported when it is needed: some take their time."""
+    """A module of `keyss.files.formats`, imported on first use since some import slow libraries."""
     return importlib.import_module(f"keyss.files.formats.{module}")
 
 
-def _reader(module: str) -> Callable[[Path | StandardInput], Gaussians]:
-    """What reads files by `read_MODULE`, which takes bytes."""
+def _reader(module: str) -> Callable[[BinaryIO], Gaussians]:
+    """A reader that calls the module's `read_MODULE(data)`."""
 
-    def read(source: Path | StandardInput) -> Gaussians:
-        try:
-            data = _format("common").read_whole(source)
-            with np.errstate(all="ignore"):  # what is not finite is reported in the end
-                model: Gaussians = getattr(_format(module), f"read_{module}")(data)
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from error
-        except OSError as error:
-            raise InputError(f"cannot read {source}: {error.strerror or error}") from error
+    def read(file: BinaryIO) -> Gaussians:
+        data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise InputError(f"expected at most {MAX_BYTES:,} bytes, found more")
+        with np.errstate(all="ignore"):  # values that are not finite are reported in the end
+            model: Gaussians = getattr(_format(module), f"read_{module}")(data)
         return model
 
     return read
 
 
-def _writer(module: str) -> Callable[[Path | StandardOutput, Gaussians], None]:
-    """What writes files by `write_MODULE`, which gives bytes."""
+def _writer(module: str) -> Callable[[Gaussians, BinaryIO], None]:
+    """A writer that calls the module's `write_MODULE(model)`."""
 
-    def write(target: Path | StandardOutput, model: Gaussians) -> None:
-        try:
-            data = getattr(_format(module), f"write_{module}")(_format("common").writable(model))
-        except OutputError as error:
-            raise OutputError(f"cannot write {target}: {error}") from error
-        with atomic_write(target) as file:
-            file.write(data)
+    def write(model: Gaussians, file: BinaryIO) -> None:
+        file.write(getattr(_format(module), f"write_{module}")(_format("common").writable(model)))
 
     return write
 
 
-def _write_decoded(target: Path | StandardOutput, model: Gaussians) -> None:
-    """Only what a network decodes: others have formats of their own."""
-    if not isinstance(model, DecodedGaussians):
-        raise UsageError(
-            f"cannot write a 3DGS model as {target}: files that end in {DECODED_SUFFIX} are for models that "
-            "a network decodes; take a name that ends in .ply"
-        )
-    try:
-        data = _format("decoded").write_decoded(model)
-    except OutputError as error:
-        raise OutputError(f"cannot write {target}: {error}") from error
-    with atomic_write(target) as file:
-        file.write(data)
+def _write_decoded(model: Gaussians, file: BinaryIO) -> None:
+    file.write(_format("decoded").write_decoded(model))
 
 
-def _read_any_ply(source: Path | StandardInput) -> Gaussians:
-    """Compressed files end in .ply, too."""
-    return _reader("compressed_ply")(source) if is_compressed(source) else read_ply(source)
+def _read_any_ply(file: BinaryIO) -> Gaussians:
+    return _reader("compressed_ply")(file) if has_packed_header(file) else read_ply(file)
 
 
-def _read_sog_folder(source: Path | StandardInput) -> Gaussians:
-    model: Gaussians = _format("sog").read_sog_folder(source)
+def _read_sog_folder(file: BinaryIO) -> Gaussians:
+    model: Gaussians = _format("sog").read_sog_folder(file)
     return model
 
 
-# The first whose suffix fits a name is its format.
+# A file name belongs to the first format with a fitting suffix.
 FORMATS = [
     ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer("compressed_ply")),
-    ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, exact=True),
+    ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, is_exact=True),
     ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz"), _writer("spz")),
     ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog"), _writer("sog")),
     ModelFormat("SOG", ("meta.json",), (), _read_sog_folder, None),
     ModelFormat("glTF", (".glb",), (b"glTF",), _reader("glb"), _writer("glb")),
     ModelFormat(".splat", (".splat",), (), _reader("splat"), _writer("splat")),
-    ModelFormat(".ksplat", (".ksplat",), (), _reader("ksplat"), None),
 ]
-# No format of 3DGS models: it is read where it is named.
-_DECODED = ModelFormat("decoded", (DECODED_SUFFIX,), (), _reader("decoded"), _write_decoded, exact=True)
+# Not a format of 3DGS models, hence not among those that messages list.
+_DECODED = ModelFormat("decoded", (DECODED_SUFFIX,), (), _reader("decoded"), _write_decoded, is_exact=True)
 _PLY = FORMATS[1]
 
 
 def is_model_path(path: Path | str) -> bool:
-    """Whether a name ends as those of model files do; the file itself is not looked at."""
+    """True if a path has the suffix of a model format."""
     return _by_suffix(path) is not None
 
 
 def read_model(path: Path | str) -> Gaussians:
-    """The model at `path`, on the CPU. The format is told by the first bytes; "-" is standard input.
+    """The model at `path`, on the CPU; "-" is standard input. The first bytes tell the format.
 
-    Raises InputError for a file that is missing, of no known format, named as one of another format, or not
-    a whole and finite model.
+    Raises InputError for a file that is missing, of unknown format, named like another format, or not a
+    complete and finite model.
     """
-    return read_source(StandardInput() if is_standard(path) else Path(path))
-
-
-def read_source(source: Path | StandardInput) -> Gaussians:
-    """`read_model` for what is open already."""
-    return _by_content(source).read(source)
-
-
-def write_model(path: Path | str, model: Gaussians) -> None:
-    """Atomically write `model` in the format that the suffix of `path` names; as PLY to "-", standard output.
-
-    PLY keeps every number, the others round, and most of them sort; docs/formats.md has by how much. Raises
-    UsageError for an unknown suffix, OutputError for a model that is empty, not finite or beyond what the
-    format holds, and when the system refuses.
-    """
-    _, write = _for_writing(path, model)
-    write(StandardOutput() if is_standard(path) else Path(path), model)
-
-
-def model_bytes(path: Path | str, model: Gaussians) -> bytes:
-    """What `write_model` would write to `path`. Raises as it does."""
-    memory = MemoryOutput(str(path))
-    _for_writing(path, model)[1](memory, model)
-    return memory.data
+    if is_standard(path):
+        return model_of_bytes("standard input", read_standard_input())
+    path = Path(path)
+    if os.path.isdir(path):
+        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found a folder")
+    if not os.path.isfile(path):
+        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
+    with open_input(path) as file:
+        return _read(file, path.name)
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
-    """What `read_model` would read from `path`, were `data` there; `write_model` has to know its suffix."""
-    return _for_writing(path)[0].read(MemoryInput(str(path), data))
+    """The model that `read_model` would read if the file at `path` contained `data`."""
+    try:
+        return _read(io.BytesIO(data), Path(path).name)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write_model(path: Path | str, model: Gaussians) -> None:
+    """Atomically write `model` in the format of the suffix; "-" is standard output, in PLY.
+
+    PLY keeps every number; the others round, and most of them sort: see docs/formats.md. Raises UsageError
+    for an unknown suffix, OutputError for a model that is empty, not finite or beyond the format's range, and
+    when the system refuses.
+    """
+    if is_standard(path):
+        write_standard_output(model_bytes(path, model))
+        return
+    write = _writer_for(path, model)
+    with atomic_write(path) as file:
+        _write(write, model, file, path)
+
+
+def model_bytes(path: Path | str, model: Gaussians) -> bytes:
+    """The bytes that `write_model` would write to `path`. Raises as it does."""
+    file = io.BytesIO()
+    _write(_writer_for(path, model), model, file, path)
+    return file.getvalue()
 
 
 def keeps_low_bits(path: Path | str) -> bool:
-    """Whether `write_model` keeps all numbers to the last bit in the format that `path` names.
-
-    Raises UsageError for an unknown suffix.
-    """
-    return _for_writing(path)[0].exact
+    """True if the format of the suffix keeps all numbers to the last bit. Raises UsageError if unknown."""
+    return _for_writing(path).is_exact
 
 
 def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path] = ()) -> Path:
-    """`path`, if `write_model` may write there: UsageError for its suffix, and see `check_output_file`.
+    """`path`, if `write_model` may write there without overwriting one of the `inputs`.
 
-    None of the `inputs` may be overwritten, whatever name leads to it.
+    Raises UsageError for an unknown suffix, and what `check_output_file` and `check_not_an_input` raise.
     """
     _for_writing(path)
     if is_standard(path):
-        StandardOutput().check()
+        check_standard_output()
         return Path(path)
     check_not_an_input(path, inputs)
     return check_output_file(path, overwrite)
+
+
+def known_suffixes() -> str:
+    """The suffixes of all formats that can be read, for messages."""
+    return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)
 
 
 def _by_suffix(path: Path | str) -> ModelFormat | None:
@@ -183,49 +182,55 @@ def _by_suffix(path: Path | str) -> ModelFormat | None:
     return next((each for each in (*FORMATS, _DECODED) if name.endswith(each.suffixes)), None)
 
 
-def _for_writing(
-    path: Path | str, model: Gaussians | None = None
-) -> tuple[ModelFormat, Callable[[Path | StandardOutput, Gaussians], None]]:
-    """The format that a name means, and what writes it. Raises UsageError, also where it cannot hold it."""
+def _for_writing(path: Path | str) -> ModelFormat:
+    """The format of the suffix. Raises UsageError if it is unknown or cannot be written."""
     found = _PLY if is_standard(path) else _by_suffix(path)
     if found is None or found.write is None:
         known = ", ".join(suffix for each in FORMATS if each.write for suffix in each.suffixes)
         raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known}")
-    if isinstance(model, DecodedGaussians) and found.write is not _write_decoded:
-        raise UsageError(
-            f"cannot write {path}: a network makes the pictures of this model, which 3DGS files do not hold; "
-            f"take a name that ends in {DECODED_SUFFIX}, and `keyss render` draws it"
-        )
-    return found, found.write
-
-
-def _by_content(path: Path | StandardInput) -> ModelFormat:
-    try:
-        if path.is_dir():
-            raise InputError(
-                f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found a folder"
-            )
-        if not path.is_file():
-            raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
-        with path.open("rb") as file:
-            start = file.read(max(len(magic) for each in FORMATS for magic in each.magic))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
-    named = _by_suffix(str(path))
-    if named in fitting or (named and start and not named.magic and not fitting):
-        return named
-    if not fitting:
-        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), found {what_it_is(path)}")
-    found = fitting[-1]
-    if named is not None:
-        raise InputError(
-            f"{path}: the name says {named.name}, but the content is {found.name}; "
-            f"rename it to end in {found.suffixes[0]}"
-        )
     return found
 
 
-def known_suffixes() -> str:
-    """Ends of names of the formats that are read, as they stand in messages."""
-    return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)
+def _writer_for(path: Path | str, model: Gaussians) -> Callable[[Gaussians, BinaryIO], None]:
+    """The writer of the format of the suffix. Raises UsageError, also if it cannot hold the model."""
+    found = _for_writing(path)
+    if isinstance(model, DecodedGaussians) and found is not _DECODED:
+        raise UsageError(
+            f"cannot write {path}: a network decodes what this model renders, which 3DGS files cannot hold; "
+            f"use a name that ends in {DECODED_SUFFIX}, which `keyss render` reads"
+        )
+    if found is _DECODED and not isinstance(model, DecodedGaussians):
+        raise UsageError(
+            f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
+            "use a name that ends in .ply"
+        )
+    assert found.write is not None
+    return found.write
+
+
+def _write(
+    write: Callable[[Gaussians, BinaryIO], None], model: Gaussians, file: BinaryIO, path: Path | str
+) -> None:
+    try:
+        write(model, file)
+    except OutputError as error:
+        raise OutputError(f"cannot write {path}: {error}") from error
+
+
+def _read(file: BinaryIO, name: str) -> Gaussians:
+    """The model in an open file, in the format of its first bytes, which `name` must not contradict."""
+    start = file.read(16)
+    file.seek(0)
+    fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
+    named = _by_suffix(name)
+    if named in fitting or (named and start and not named.magic and not fitting):
+        return named.read(file)
+    if not fitting:
+        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {kind_of(name, start)}")
+    found = fitting[-1]
+    if named is not None:
+        raise InputError(
+            f"the name says {named.name}, but the content is {found.name}; "
+            f"rename it to end in {found.suffixes[0]}"
+        )
+    return found.read(file)

@@ -1,109 +1,92 @@
-"""A 3DGS model in PLY as a table: what its properties are called, and what is wrong with their values.
+"""A 3DGS model in PLY as a table: the names of its properties, and checks of their values.
 
-Without torch, which takes a second to load, for those who only want to know what a file holds.
+Does not import torch, which takes a second, so that `keyss info` is fast.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Set
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from keyss.core.errors import InputError
-from keyss.files.ply_table import MAX_HEADER_BYTES, Rows, WholeTable, read_vertex_blocks
-from keyss.files.streams import StandardInput
+from keyss.core.errors import InputError, KeyssError
+from keyss.files.ply_table import MAX_HEADER_BYTES, Rows, Vertices, read_vertices
+from keyss.files.reading import open_input
 
-# Stands in for an infinite opacity logit. Converters write infinities for opacities of 0 and 1; a larger
-# bound would not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
+# Replaces an infinite opacity logit, which converters write for opacities of 0 and 1. A larger bound would
+# not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
 OPACITY_LOGIT_BOUND = 16.0
 
 
-def is_compressed(source: Path | StandardInput) -> bool:
-    """Whether the header is that of a compressed model, which is read otherwise."""
-    with source.open("rb") as file:
-        return b" packed_position" in file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
+def is_compressed(path: Path) -> bool:
+    """True if a .ply is a compressed model. Raises OSError."""
+    with path.open("rb") as file:
+        return has_packed_header(file)
 
 
-def read_rows(path: Path | str | StandardInput) -> tuple[list[str], Rows]:
+def has_packed_header(file: BinaryIO) -> bool:
+    """True if a .ply that is open at its start is a compressed model; the position stays."""
+    header = file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
+    file.seek(0)
+    return b" packed_position" in header
+
+
+def read_rows(path: Path) -> tuple[list[str], Rows]:
     """Names and values [N, len(names)] of a model's properties in the order of `model_names`.
 
-    Raises InputError for anything that is not a whole, finite 3DGS model in binary or ascii PLY.
+    Raises InputError if it is not a complete, finite 3DGS model in binary or ascii PLY.
     """
-    whole = WholeTable()
-    return read_row_blocks(path, whole.begin), whole.rows
+    with open_input(path) as file:
+        vertices = read_model_rows(file)
+        return vertices.names, vertices.rows()
 
 
-def read_row_blocks(
-    path: Path | str | StandardInput, begin: Callable[[list[str], int], Callable[[int, Rows], None]]
-) -> list[str]:
-    """`read_rows` for some Gaussians at a time; `begin`: see `ply_table.read_vertex_blocks`."""
-    settled = Settled()
-
-    def begin_settled(names: list[str], count: int) -> Callable[[int, Rows], None]:
-        place = begin(names, count)
-
-        def settle_and_place(start: int, rows: Rows) -> None:
-            settled.settle(rows, names)
-            place(start, rows)
-
-        return settle_and_place
-
-    names = read_vertex_blocks(path, lambda found: _model_properties(found.keys(), path), begin_settled)
-    if problem := settled.problem(names):
-        raise InputError(f"{path}: {problem}")
-    return names
+def read_model_rows(file: BinaryIO) -> Vertices:
+    """The properties of a model in the order of `model_names`, as `finite_rows`. Raises InputError."""
+    vertices = read_vertices(file, _model_properties)
+    return replace(vertices, blocks=finite_rows(vertices.blocks, vertices.names, InputError))
 
 
-def _model_properties(found: Set[str], path: Path | str | StandardInput) -> list[str]:
+def finite_rows(blocks: Iterable[Rows], names: list[str], error: type[KeyssError]) -> Iterator[Rows]:
+    """The blocks with infinite opacity logits clamped in place to +-OPACITY_LOGIT_BOUND.
+
+    At the end raises `error` if there were no rows or if other values were not finite.
+    """
+    count, bad = 0, np.zeros(len(names), np.int64)
+    opacity = names.index("opacity")
+    for rows in blocks:
+        count += len(rows)
+        if not np.isfinite(rows).all():
+            logits = rows[:, opacity]
+            logits[np.isposinf(logits)] = OPACITY_LOGIT_BOUND
+            logits[np.isneginf(logits)] = -OPACITY_LOGIT_BOUND
+            bad += np.count_nonzero(~np.isfinite(rows), axis=0)
+        yield rows
+    if not count:
+        raise error("it holds no Gaussians")
+    if bad.any():
+        wrong = [f"{name} in {number:,}" for name, number in zip(names, bad, strict=True) if number]
+        more = f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else ""
+        raise error(f"NaN or infinite values among {count:,} Gaussians: {', '.join(wrong[:5])}{more}")
+
+
+def _model_properties(found: Mapping[str, str]) -> list[str]:
     """Names of the properties that make a model. Raises InputError if any is missing."""
     rest = {name for name in found if re.fullmatch(r"f_rest_[0-9]+", name)}
     names = model_names(len(rest) // 3 + 1)
     if len(rest) not in (0, 9, 24, 45) or not rest <= set(names):
         raise InputError(
-            f"{path}: expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ... (SH degree 0 to 3), "
-            f"got {len(rest)}"
+            f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ... (SH degree 0 to 3), got {len(rest)}"
         )
     missing = [name for name in names if name not in found]
-    if not missing:
-        return names
-    if "packed_position" in found:
-        why = "this is a compressed .ply, which `read_model` reads"
-    elif missing == names[3:]:
-        why = "this is a point cloud, not a 3DGS model"
-    else:
-        why = "this is not a 3DGS model"
-    raise InputError(f"{path}: {why}: properties missing: {', '.join(missing)}")
-
-
-class Settled:
-    """What is wrong with the values of a model, which come some rows at a time."""
-
-    def __init__(self) -> None:
-        self._count, self._bad = 0, np.zeros(0, np.int64)
-
-    def settle(self, rows: Rows, names: list[str]) -> None:
-        """Clamp infinite opacity logits in place, and take notice of what is still not finite."""
-        self._count += len(rows)
-        if np.isfinite(rows).all():
-            return
-        opacity = rows[:, names.index("opacity")]
-        opacity[np.isposinf(opacity)] = OPACITY_LOGIT_BOUND
-        opacity[np.isneginf(opacity)] = -OPACITY_LOGIT_BOUND
-        if not len(self._bad):
-            self._bad = np.zeros(len(names), np.int64)
-        self._bad += np.count_nonzero(~np.isfinite(rows), axis=0)
-
-    def problem(self, names: list[str]) -> str | None:
-        """What is wrong with the values, if anything."""
-        if not self._count:
-            return "it holds no Gaussians"
-        wrong = [f"{name} in {count:,}" for name, count in zip(names, self._bad, strict=False) if count]
-        if not wrong:
-            return None
-        more = f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else ""
-        return f"NaN or infinite values among {self._count:,} Gaussians: {', '.join(wrong[:5])}{more}"
+    if missing:
+        kind = "a point cloud, not a 3DGS model" if missing == names[3:] else "not a 3DGS model"
+        raise InputError(f"this is {kind}: properties missing: {', '.join(missing)}")
+    return names
 
 
 def model_names(k: int) -> list[str]:

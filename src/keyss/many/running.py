@@ -16,8 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from keyss import progress
 from keyss._processes import how_it_ended
 from keyss.core.errors import OutputError
-from keyss.files.atomic import write_bytes
-from keyss.files.lock import lock
+from keyss.files.atomic import lock, write_bytes
 from keyss.fitting.reporting import Reporter
 from keyss.keys.generation import generate_key
 from keyss.keys.key_file import read_key_file

@@ -18,7 +18,6 @@ from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import DECODED_SUFFIX, read_model, write_model
-from keyss.files.ply import read_ply
 from keyss.files.ply_rows import is_compressed
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_package, transform
@@ -150,7 +149,7 @@ def readers(path: Path) -> list[ReaderResult]:
     if path.suffix != ".ply" or is_compressed(path):
         note = "only a .ply of floats stores every number exactly"
         return [ReaderResult(name, path.name, None, note=note) for name, _ in programs]
-    expected = _columns_of(read_ply(path))
+    expected = _columns_of(read_model(path))
     found: list[ReaderResult] = []
     for name, read in programs:
         try:
@@ -201,4 +200,4 @@ def _gsply(path: Path) -> Columns:
 
 def _splat_transform(path: Path) -> Columns:
     with tempfile.TemporaryDirectory() as folder:
-        return _columns_of(read_ply(transform(path, Path(folder) / "copy.ply")))
+        return _columns_of(read_model(transform(path, Path(folder) / "copy.ply")))

@@ -20,8 +20,7 @@ import msgspec
 
 from keyss._version import __version__
 from keyss.core.errors import InputError, OutputError, UsageError
-from keyss.files.lock import held_by, lock
-from keyss.files.output import check_not_an_input
+from keyss.files.atomic import check_not_an_input, held_by, lock
 from keyss.runs.records import read_record, write_record
 
 PUBLISH, PRIVATE = "publish", "private"

@@ -1,6 +1,5 @@
-"""The page in which a published model is looked at and a key can be typed; `web/` has its sources."""
+"""The page that shows a published model and takes a key; its sources are in `web/`."""
 
-from keyss.viewer.page import export_html
-from keyss.viewer.serving import ModelServer
+import lazy_loader
 
-__all__ = ["ModelServer", "export_html"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

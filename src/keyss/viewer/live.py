@@ -1,8 +1,8 @@
-"""A training as it is now, on a page of this machine.
+"""A page of this machine that shows a training while it runs.
 
-While nobody looks, nothing is done. When the page asks, the model is copied between two steps, at most every
-few seconds and for at most a fiftieth of the time; a thread of its own makes a file of the copy. The address
-has a random part, without which other users of the machine get nothing: a secret may be in training.
+While nobody watches, nothing is copied. While the page polls, the model is copied between two steps, at most
+every few seconds and for at most a fiftieth of the time; the server's thread encodes the copy. The URL has a
+random part, without which other users of the machine get nothing: the model may be a secret.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import json
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from io import BytesIO
 from types import TracebackType
-from typing import BinaryIO, Literal, Self
+from typing import Any, BinaryIO, Literal, Self
 
 from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
@@ -25,15 +25,15 @@ from keyss.viewer.page import page_live
 from keyss.viewer.serving import PageServer
 
 Side = Literal["published", "secret"]
-EVERY = 3.0  # seconds between two copies, at least
-_COST = 50  # times as long as one takes passes until the next
-_WATCHED = 15.0  # seconds after the last question for which somebody is taken to look
+EVERY = 3.0  # minimum seconds between two copies
+_COST = 50  # a copy is followed by a pause of this many times its duration
+_WATCHED = 15.0  # seconds for which a request counts as somebody watching
 _STATE = "live"
 
 
 @dataclass
 class _Copy:
-    """A model of some time, and the file that is made of it when it is asked for."""
+    """A copy of a model, and its file once it was requested."""
 
     version: int
     model: Gaussians
@@ -41,17 +41,8 @@ class _Copy:
     ply: bytes | None = None
 
 
-@dataclass(frozen=True)
-class _Progress:
-    title: str = ""
-    iteration: int = 0
-    iterations: int = 0
-    gaussians: int = 0
-    numbers: Mapping[str, float] = field(default_factory=dict)
-
-
 class LiveTraining:
-    """The page of a training; a context in which it is served, by a thread of its own."""
+    """A context that serves the page of a training on a thread of its own."""
 
     def __init__(self, up: str = "-y", timer: Callable[[], float] = time.monotonic) -> None:
         """Raises OutputError."""
@@ -62,15 +53,16 @@ class LiveTraining:
         self._server = PageServer(page_live(_STATE, up), contents, folder=folder)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._timer = timer
-        self._progress = _Progress()
+        self._progress: dict[str, Any] = {}
         self._copies: dict[str, _Copy] = {}
-        self._asked = self._taken = -float("inf")
+        self._requested = self._copied = -float("inf")
         self._pause = EVERY
         self._version = 0
+        self.progress()
 
     @property
     def address(self) -> str:
-        """Where the page is; nobody finds it without being told."""
+        """The URL of the page, which cannot be guessed."""
         return self._server.address
 
     def __enter__(self) -> Self:
@@ -83,30 +75,45 @@ class LiveTraining:
         self._server.close()
         self._thread.join()
 
-    def reporter(self, told: Reporter) -> LiveReporter:
-        """What a training reports to, so that the page follows it; all of it is passed on to `told`."""
-        return LiveReporter(self, told, "published")
+    def reporter(self, reporter: Reporter) -> LiveReporter:
+        """A reporter that updates the page and passes everything on to `reporter`."""
+        return LiveReporter(self, reporter, "published")
 
-    def progress(self, progress: _Progress) -> None:
-        self._progress = progress
+    def progress(
+        self,
+        title: str = "",
+        iteration: int = 0,
+        iterations: int = 0,
+        gaussians: int = 0,
+        numbers: dict[str, float] | None = None,
+    ) -> None:
+        """Set what the page shows beside the model."""
+        self._progress = {
+            "title": title,
+            "iteration": iteration,
+            "iterations": iterations,
+            "gaussians": gaussians,
+            "numbers": numbers or {},
+        }
 
     def look(self, side: Side, model: Callable[[], Gaussians]) -> None:
-        """Copy the model if somebody looks and it is time; always after a training's last step."""
-        now, last = self._timer(), self._progress.iteration >= self._progress.iterations
-        looked_at = now - self._asked < _WATCHED and now - self._taken >= self._pause
-        if not (looked_at or last):
+        """Copy the model if somebody watches and a copy is due, and always after the last step."""
+        now, is_last = self._timer(), self._progress["iteration"] >= self._progress["iterations"]
+        is_due = now - self._requested < _WATCHED and now - self._copied >= self._pause
+        if not (is_due or is_last):
             return
-        taken = model().detach().to("cpu")
-        copied = Gaussians(*(getattr(taken, each.name).clone() for each in fields(Gaussians)))
+        current = model().detach().to("cpu")
+        copied = Gaussians(*(getattr(current, each.name).clone() for each in fields(Gaussians)))
         self._version += 1
         self._copies[side] = _Copy(self._version, copied)
-        self._taken = self._timer()
-        self._pause = max(EVERY, _COST * (self._taken - now))
+        self._copied = self._timer()
+        self._pause = max(EVERY, _COST * (self._copied - now))
 
     def _state(self) -> BinaryIO:
-        self._asked = self._timer()
-        versions = {side: self._copies[side].version if side in self._copies else 0 for side in _SIDES}
-        return BytesIO(json.dumps({**vars(self._progress), "versions": versions}).encode())
+        self._requested = self._timer()
+        copies = {side: self._copies.get(side) for side in ("published", "secret")}
+        versions = {side: copy.version if copy else 0 for side, copy in copies.items()}
+        return BytesIO(json.dumps({**self._progress, "versions": versions}).encode())
 
     def _opens(self, side: str) -> Callable[[], BinaryIO]:
         def opened() -> BinaryIO:
@@ -117,45 +124,42 @@ class LiveTraining:
                 if copy.ply is None:
                     try:
                         copy.ply = model_bytes("model.ply", copy.model)
-                    except KeyssError as error:  # a training that went wrong
+                    except KeyssError as error:  # a diverged training
                         raise OSError(str(error)) from error
             return BytesIO(copy.ply)
 
         return opened
 
 
-_SIDES: tuple[Side, Side] = ("published", "secret")
-
-
 class LiveReporter:
-    """Passes all on to `told`, and shows the page how far the training is and what it came to."""
+    """Passes everything on to `reporter`, and shows progress and model on the page."""
 
-    def __init__(self, training: LiveTraining, told: Reporter, side: Side) -> None:
-        self.training, self.told, self.side = training, told, side
-        self.title, self.iterations = "", 0
+    def __init__(self, training: LiveTraining, reporter: Reporter, side: Side) -> None:
+        self._training, self._reporter, self._side = training, reporter, side
+        self._title, self._iterations = "", 0
 
     @property
     def loss_every(self) -> int:
-        return self.told.loss_every
+        return self._reporter.loss_every
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
-        self.told.start(title, iterations, iteration)
-        self.title, self.iterations = title, iterations
-        self.training.progress(_Progress(title, iteration, iterations))
+        self._reporter.start(title, iterations, iteration)
+        self._title, self._iterations = title, iterations
+        self._training.progress(title, iteration, iterations)
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
-        self.told.update(iteration, gaussians, numbers)
+        self._reporter.update(iteration, gaussians, numbers)
         decibels = {name: value for name, value in numbers.items() if name != "loss"}
-        self.training.progress(_Progress(self.title, iteration, self.iterations, gaussians, decibels))
+        self._training.progress(self._title, iteration, self._iterations, gaussians, decibels)
 
     def look(self, model: Callable[[], Gaussians]) -> None:
-        self.training.look(self.side, model)
+        self._training.look(self._side, model)
 
     def of_secret(self) -> Reporter:
-        return LiveReporter(self.training, self.told, "secret")
+        return LiveReporter(self._training, self._reporter, "secret")
 
     def note(self, line: str) -> None:
-        self.told.note(line)
+        self._reporter.note(line)
 
     def finish(self) -> None:
-        self.told.finish()
+        self._reporter.finish()

@@ -1,7 +1,7 @@
-"""The viewer as files: one page that has everything in it, or a folder for a static host.
+"""The viewer as files: one self-contained page, or a folder for a static host.
 
-The page asks nobody for anything: its content security policy allows no other host, and where everything is
-in one file, not even the host that it came from. No secret is in it, only the model that is published anyway.
+The content security policy of the page allows no other host, and that of a self-contained page not even its
+own. The page contains the published model and no secret.
 """
 
 from __future__ import annotations
@@ -14,51 +14,51 @@ from pathlib import Path
 from urllib.parse import quote
 
 from keyss.core.errors import InputError, OutputError, UsageError
-from keyss.files.atomic import write_bytes
-from keyss.files.output import check_not_an_input, check_output_file
-from keyss.viewer.showing import shown
+from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
+from keyss.viewer.showing import readable
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
-MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers take text of 512 MiB, and time for it
+MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers limit text to 512 MiB and parse it slowly
 MAX_BYTES = 2 << 30
-# Argon2id is WebAssembly; workers, and pictures that are saved, come from blobs that the page makes itself.
+# Argon2id is WebAssembly. Workers and saved pictures come from blobs that the page makes itself.
 _WASM, _SELF = "'wasm-unsafe-eval'", "'self'"
 _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
 
 
 def served_policy() -> str:
-    """The content security policy of a page whose parts lie beside it."""
+    """The content security policy of a page whose parts are served beside it."""
     scripts = f"script-src {_SELF} {_WASM}; worker-src {_SELF} blob:"
     return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
 
 
 def page_beside(model: str, up: str = "-y") -> bytes:
-    """The page for `model`, the address of a file beside it; style and script lie beside it too."""
+    """The page for `model`, the URL of a file beside it; style and script are beside it too."""
     return _served("keyss-model", model, up)
 
 
 def page_live(state: str, up: str = "-y") -> bytes:
-    """The page for a training that goes on; `state`: the address of what `keyss.viewer.live` says of it."""
+    """The page for a running training; `state` is the URL of the JSON that `LiveTraining` serves."""
     return _served("keyss-live", state, up)
 
 
 def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
-    """The page with the `model` and everything else in it; `name` is shown, `up` is "-y", "z" or "y"."""
+    """A self-contained page with the `model`; it shows `name`. `up` is "-y", "z" or "y"."""
     style, script = asset(STYLE).decode(), asset(SCRIPT).decode()
     data = f'<script id="model" type="application/octet-stream" data-name="{html.escape(name)}">'
     scripts = f"script-src {_hash(script)} {_WASM}; worker-src blob:"
     rules = f"{scripts}; style-src {_hash(style)}; img-src blob: data:; {_NOTHING}"
+    licences = asset(LICENCES).decode().replace("--", "- -")  # "--" may end a comment
     return _page(
         policy=f"default-src 'none'; {rules}",
         style=f"<style>{style}</style>",
         model=data + b64encode(model).decode() + "</script>",
-        script=f"<!-- {_comment(asset(LICENCES).decode())} -->\n<script>{script}</script>",
+        script=f"<!-- {licences} -->\n<script>{script}</script>",
         up=up,
     )
 
 
 def embedding_rules() -> dict[str, str]:
-    """What the policy of a page that has `page_with` in a frame has to allow: sources by directive."""
+    """Sources by directive that the policy of a page with `page_with` in a frame has to allow."""
     script = f"{_hash(asset(SCRIPT).decode())} {_WASM}"
     return {"script-src": script, "worker-src": "blob:", "img-src": "blob: data:"}
 
@@ -66,35 +66,35 @@ def embedding_rules() -> dict[str, str]:
 def export_html(
     model: Path | str, out: Path | str, *, up: str = "-y", overwrite: bool = False
 ) -> tuple[Path, ...]:
-    """Write the viewer with the published `model`: one file, or a folder where `out` does not end in .html.
+    """Write the viewer with the published `model`: one file if `out` ends in .html, else a folder.
 
-    One file opens from disk; a folder, for larger models, has to be served. `up`: "-y", as captures made with
-    COLMAP have it, "z" or "y". A model of a format that the page does not read is converted, with a
-    KeyssWarning. Returns what was written.
-    Raises UsageError for a model that is too large, InputError for what is none, OutputError.
+    The file opens from disk; a folder, for larger models, needs a web server. `up`: "-y" as in COLMAP's
+    scenes, "z" or "y". A model in a format that the page does not read is converted, with a KeyssWarning.
+    Returns the paths written. Raises UsageError for a model that is too large, InputError if it is not a
+    model, OutputError.
     """
     model, out = Path(model), Path(out)
-    found = shown(model)
-    if found.bytes > MAX_BYTES:
-        raise UsageError(f"{model} has {found.bytes:,} bytes, and a page takes {MAX_BYTES:,}")
+    file = readable(model)
+    if file.size > MAX_BYTES:
+        raise UsageError(f"{model} has {file.size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
     try:
-        with found.open() as file:
-            data = file.read()
+        with file.open() as opened:
+            data = opened.read()
     except OSError as error:
         raise InputError(f"{model}: cannot be read: {error.strerror}") from error
     if out.suffix.lower() in (".html", ".htm"):
         if len(data) > MAX_IN_ONE_FILE:
             raise UsageError(
-                f"{model} has {len(data):,} bytes, and one page takes {MAX_IN_ONE_FILE:,}: name a folder "
-                "for the output, which a web server can serve"
+                f"{model} has {len(data):,} bytes, more than the {MAX_IN_ONE_FILE:,} that fit into one page: "
+                "name an output folder instead, and put it on a web server"
             )
         check_not_an_input(out, [model])
-        write_bytes(check_output_file(out, overwrite), page_with(data, found.name, up))
+        write_bytes(check_output_file(out, overwrite), page_with(data, file.name, up))
         return (out,)
-    contents = {INDEX: page_beside(quote(found.name), up), found.name: data}
+    contents = {INDEX: page_beside(quote(file.name), up), file.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
     if len(contents) < 5:
-        raise UsageError(f"{model} has the name of a file of the viewer: give it another one")
+        raise UsageError(f"{model} has the name of a file of the viewer: rename it")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -122,20 +122,16 @@ def _served(name: str, content: str, up: str) -> bytes:
     )
 
 
-def _page(*, up: str = "-y", **parts: str) -> bytes:
+def _page(*, policy: str, up: str, **parts: str) -> bytes:
+    """`page.html` with its placeholders replaced."""
     page = asset("page.html").decode().replace('data-up="-y"', f'data-up="{html.escape(up)}"')
-    policy = f'<meta http-equiv="Content-Security-Policy" content="{html.escape(parts.pop("policy"))}">'
-    for name, part in {"policy": policy, **parts}.items():
-        before, found, after = page.partition(f"<!--{name}-->")
-        assert found, name
+    parts["policy"] = f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">'
+    for name, part in parts.items():
+        before, placeholder, after = page.partition(f"<!--{name}-->")
+        assert placeholder, name
         page = before + part + after
     return page.encode()
 
 
 def _hash(text: str) -> str:
     return f"'sha256-{b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _comment(text: str) -> str:
-    """Text that ends no comment."""
-    return text.replace("--", "- -")

@@ -1,4 +1,4 @@
-"""The page over HTTP, for this machine unless told otherwise: with one model, or whatever else is given."""
+"""Serves the page over HTTP, on this machine only unless told otherwise."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
 from keyss.viewer.page import SCRIPT, STYLE, asset, page_beside, served_policy
-from keyss.viewer.showing import shown
+from keyss.viewer.showing import readable
 
 LOCALHOST = "127.0.0.1"
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}
-# What is given out at an address: its type, and what opens it or raises OSError.
+# By path: the media type, and a function that opens the content or raises OSError.
 Contents = Mapping[str, tuple[str, Callable[[], BinaryIO]]]
 
 
@@ -27,14 +27,14 @@ class _ServerIPv6(ThreadingHTTPServer):
 
 
 class PageServer:
-    """A server of the page and of `contents`. Nothing else is given out, whatever is asked."""
+    """Serves the page and `contents`, and nothing else."""
 
     def __init__(
         self, page: bytes, contents: Contents, host: str = LOCALHOST, port: int = 0, folder: str = "/"
     ) -> None:
-        """`port` 0: any that is free. `folder`: where all of it lies, between slashes.
+        """`port` 0 takes any free port. `folder` is the prefix of all paths, with both slashes.
 
-        Raises OutputError for a port in use.
+        Raises OutputError if the port is in use.
         """
         application: Contents = {
             "": ("text/html; charset=utf-8", lambda: BytesIO(page)),
@@ -53,33 +53,34 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """The URL of the page."""
         host, port = self._server.server_address[:2]
         name = f"[{host!s}]" if ":" in str(host) else host
         return f"http://{name!s}:{port}{self._folder}"
 
     def run(self) -> None:
-        """Serve until `close` is called by another thread, or a signal ends it."""
+        """Serve until another thread calls `close`, or a signal ends it."""
         try:
             self._server.serve_forever(poll_interval=0.2)
         finally:
             self._server.server_close()
 
     def close(self) -> None:
+        """End `run`."""
         self._server.shutdown()
 
 
 class ModelServer(PageServer):
-    """A server of the page and one model."""
+    """Serves the page and one model."""
 
     def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0, up: str = "-y") -> None:
-        """`port` 0: any that is free. Warns (KeyssWarning) of a model that is converted for the page.
+        """`port` 0 takes any free port. Warns (KeyssWarning) if the model is converted for the page.
 
-        Raises InputError for what is no model, and OutputError for a port in use.
+        Raises InputError if `model` is not a model, OutputError if the port is in use.
         """
-        found = shown(Path(model))
-        page = page_beside(f"model/{quote(found.name)}", up)
-        super().__init__(page, {f"model/{found.name}": ("application/octet-stream", found.open)}, host, port)
+        file = readable(Path(model))
+        page = page_beside(f"model/{quote(file.name)}", up)
+        super().__init__(page, {f"model/{file.name}": ("application/octet-stream", file.open)}, host, port)
 
 
 def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
@@ -94,42 +95,42 @@ def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
             self._answer(with_content=False)
 
         def _answer(self, *, with_content: bool) -> None:
-            # Another site whose name leads here must not read the model through a visitor's browser.
             try:
-                asked = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+                host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
             except ValueError:
                 self.send_error(HTTPStatus.BAD_REQUEST)
                 return
-            found = contents.get(unquote(urlsplit(self.path).path))
-            if local and asked not in _LOCAL_NAMES:
+            # DNS rebinding: another site's name resolves to this server, whose model it must not read.
+            if local and host not in _LOCAL_NAMES:
                 self.send_error(HTTPStatus.FORBIDDEN)
                 return
-            if found is None:
+            content = contents.get(unquote(urlsplit(self.path).path))
+            if content is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
                 return
-            kind, opened = found
+            media_type, opened = content
             try:
                 with opened() as file:
                     size = file.seek(0, 2)
                     file.seek(0)
                     self.send_response(HTTPStatus.OK)
-                    for name, value in _headers(kind, size).items():
+                    for name, value in _headers(media_type, size).items():
                         self.send_header(name, value)
                     self.end_headers()
                     if with_content:
                         shutil.copyfileobj(file, self.wfile)
-            except OSError:  # whoever asked has left, or the model is gone
+            except OSError:  # the client has left, or the model is gone
                 self.close_connection = True
 
         def log_message(self, format: str, *args: object) -> None:
-            """Nobody reads it."""
+            """Log nothing."""
 
     return Handler
 
 
-def _headers(kind: str, size: int) -> dict[str, str]:
+def _headers(media_type: str, size: int) -> dict[str, str]:
     return {
-        "Content-Type": kind,
+        "Content-Type": media_type,
         "Content-Length": str(size),
         "Content-Security-Policy": f"{served_policy()}; frame-ancestors 'none'",
         "X-Content-Type-Options": "nosniff",

@@ -1,4 +1,4 @@
-"""A model as the page can read it: as it lies there, or converted where the page does not read its format."""
+"""Models in a format that the page reads, converted if necessary."""
 
 from __future__ import annotations
 
@@ -11,55 +11,54 @@ from typing import BinaryIO
 
 from keyss.core.errors import KeyssWarning
 
-# What the page reads: by first bytes, or by the ends of names of formats that have no other sign.
-_MAGIC, _NAMES = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04"), (".splat",)
+# The page recognises formats by their first bytes, and .splat, which has no signature, by its name.
+_MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 _MAX_HEADER = 64 << 10  # bytes of a .ply
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A file for the page."""
+class Readable:
+    """A model file for the page."""
 
-    name: str  # of the formats that have no other sign, the page goes by its end
+    name: str
     open: Callable[[], BinaryIO]  # raises OSError
-    bytes: int
+    size: int  # bytes
 
 
-def shown(model: Path) -> Shown:
-    """The file of a model as the page reads it, which is not looked at further if it is that already.
+def readable(model: Path) -> Readable:
+    """The model's file if the page reads its format, else a lossless conversion, with a KeyssWarning.
 
-    What else keyss reads, SOG in a folder and .ply in text, is converted without loss, with a KeyssWarning.
-    Raises InputError for what is no model, or damaged where it is converted.
+    Only a file that is converted is parsed here. Raises InputError if it is not a valid model.
     """
     try:
         with model.open("rb") as file:
             header = file.read(_MAX_HEADER)
             size = file.seek(0, 2)
     except OSError:
-        header, size = b"", 0  # what it is will be said
-    if is_shown(model.name, header):
-        return Shown(model.name, lambda: model.open("rb"), size)
-    return _converted(model)
+        header, size = b"", 0  # read_model raises the InputError
+    if is_readable(model.name, header):
+        return Readable(model.name, lambda: model.open("rb"), size)
 
+    from keyss.files import read_model  # imports torch, which the page itself does not need
+    from keyss.files.models import model_bytes
 
-def is_shown(name: str, start: bytes) -> bool:
-    """Whether a file of this name that begins so is one that the page reads, if it is not damaged."""
-    if start.startswith(b"ply") and b"\nformat ascii" in start[:_MAX_HEADER].partition(b"end_header")[0]:
-        return False
-    return start.startswith(_MAGIC) or bool(start and name.lower().endswith(_NAMES))
-
-
-def _converted(model: Path) -> Shown:
-    from keyss.files.models import model_bytes, read_model  # torch with them, for which a page need not wait
-
-    found = read_model(model)
-    in_folder = model.name.lower() == "meta.json"
-    name = f"{model.absolute().parent.name or 'model'}.sog" if in_folder else f"{model.stem}.ply"
-    data = model_bytes(name, found)
-    what = "a SOG in a folder" if in_folder else f"a {model.suffix}, or a .ply in text,"
+    gaussians = read_model(model)
+    name, kind = f"{model.stem}.ply", f"a {model.suffix}"
+    if header.startswith(b"ply"):
+        kind = "a .ply in text"
+    elif model.name.lower() == "meta.json":
+        name, kind = f"{model.absolute().parent.name or 'model'}.sog", "a SOG folder"
+    data = model_bytes(name, gaussians)
     warnings.warn(
-        f"{model}: the page does not read {what}, and shows it as {name}, which holds the same",
+        f"{model}: the page does not read {kind}; it shows a lossless copy, {name}",
         KeyssWarning,
-        stacklevel=4,
+        stacklevel=3,
     )
-    return Shown(name, lambda: BytesIO(data), len(data))
+    return Readable(name, lambda: BytesIO(data), len(data))
+
+
+def is_readable(name: str, start: bytes) -> bool:
+    """True if the page reads the format of a file with this name and these first bytes."""
+    if start.startswith(b"ply"):
+        return b"\nformat ascii" not in start[:_MAX_HEADER].partition(b"end_header")[0]
+    return start.startswith(_MAGIC) or bool(start and name.lower().endswith(".splat"))

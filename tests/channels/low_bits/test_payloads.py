@@ -22,7 +22,7 @@ from keyss.channels.low_bits import cells, ciphers, reading, spread
 from keyss.channels.low_bits.reading import SALTS_TRIED
 from keyss.channels.low_bits.salts import salt_rows
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
-from keyss.files.ply import read_ply, write_ply
+from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey, generate_key
 from keyss.keys.generation import ALPHABET
 from keyss.rendering import render
@@ -130,7 +130,7 @@ def _without_normals(columns: Columns) -> Columns:
 @pytest.mark.parametrize("name", OTHER_FILES)
 def test_survives_other_files(stego: Gaussians, tmp_path: Path, name: str) -> None:
     (tmp_path / "a.ply").write_bytes(OTHER_FILES[name](columns_of(stego)))
-    again = read_ply(tmp_path / "a.ply")
+    again = read_model(tmp_path / "a.ply")
     assert_same_bits(again, stego)
     assert extract(again, KEY) == PAYLOAD
 
@@ -141,7 +141,7 @@ def _resave_by_plyfile(source: Path, target: Path) -> None:
 
 
 RESAVERS: dict[str, Callable[[Path, Path], object]] = {
-    "keyss": lambda source, target: write_ply(target, read_ply(source)),
+    "keyss": lambda source, target: write_model(target, read_model(source)),
     "gsply": lambda source, target: gsply.plywrite(target, gsply.plyread(source)),
     "plyfile": _resave_by_plyfile,
 }
@@ -149,15 +149,15 @@ RESAVERS: dict[str, Callable[[Path, Path], object]] = {
 
 @pytest.mark.parametrize("name", RESAVERS)
 def test_survives_being_saved_again(stego: Gaussians, tmp_path: Path, name: str) -> None:
-    write_ply(tmp_path / "in.ply", stego)
+    write_model(tmp_path / "in.ply", stego)
     RESAVERS[name](tmp_path / "in.ply", tmp_path / "out.ply")
-    assert extract(read_ply(tmp_path / "out.ply"), KEY) == PAYLOAD
+    assert extract(read_model(tmp_path / "out.ply"), KEY) == PAYLOAD
 
 
 def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
-    write_ply(tmp_path / "in.ply", stego)
+    write_model(tmp_path / "in.ply", stego)
     copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
-    assert extract(read_ply(copy), KEY) == PAYLOAD
+    assert extract(read_model(copy), KEY) == PAYLOAD
 
 
 def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:

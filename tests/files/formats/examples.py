@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import fields, replace
 
 import numpy as np
 import torch
 
 from keyss.core import Gaussians
-from keyss.core.gaussians import SH_C0
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
@@ -97,44 +95,3 @@ def random_compressed(rng: np.random.Generator, count: int, k: int) -> Compresse
         alphas=rng.integers(0, 256, count).astype(np.uint8),
         sh=rng.integers(0, 256, (count, k, 3)).astype(np.uint8),
     )
-
-
-def ksplat_of(model: Gaussians, level: int, *, bucket: int = 64) -> bytes:
-    """A .ksplat of a model: two sections, the first of full buckets and the second of partly filled ones."""
-    n, k = model.sh.shape[:2]
-    position, number, harmonic = [("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1")][level]
-    count = 3 * (k - 1)
-    row = np.dtype(
-        [("m", position, 3), ("s", number, 3), ("q", number, 4), ("c", "u1", 4), ("h", harmonic, count)]
-    )
-    sections, bodies = b"", b""
-    half = n // (2 * bucket) * bucket
-    block, finest = 5.0, 32767
-    for start, end in ((0, half), (half, n)):
-        part = model[start:end]
-        sizes = [bucket] * (half // bucket) if start == 0 else _uneven(end - start)
-        centres = np.stack([chunk.mean(0).numpy() for chunk in part.means.split(sizes)]).astype("<f4")
-        rows = np.zeros(len(part), row)
-        means = part.means.numpy()
-        if level:
-            offset = (means - np.repeat(centres, sizes, axis=0)) / (block / 2) * finest
-            means = np.rint(offset + finest).clip(0, 65535)
-        rows["m"], rows["s"], rows["q"] = means, part.scales.numpy(), part.quats.numpy()
-        rows["c"][:, :3] = ((part.sh[:, 0] * SH_C0 + 0.5) * 255).round().clamp(0, 255).numpy()
-        rows["c"][:, 3] = (part.opacities * 255).round().numpy()
-        bands = [part.sh[:, d * d : (d + 1) ** 2].transpose(1, 2).flatten(1) for d in range(1, int(k**0.5))]
-        if bands:
-            values = torch.cat(bands, dim=1).numpy()
-            rows["h"] = np.rint((values + 1.5) / 3 * 255).clip(0, 255) if level == 2 else values
-        partial = sizes if start else []
-        header = struct.pack("<IIIIfHxx", len(part), len(part), bucket, len(sizes), block, 12)
-        header += struct.pack("<IIIIH", finest, 0, 0 if start else len(sizes), len(partial), int(k**0.5) - 1)
-        sections += header.ljust(1024, b"\0")
-        bodies += np.array(partial, "<u4").tobytes() + centres.tobytes() + rows.tobytes()
-    start = struct.pack("<BBxxIIIIHxxfffff", 0, 1, 2, 2, n, n, level, 0, 0, 0, -1.5, 1.5)
-    return start.ljust(4096, b"\0") + sections + bodies
-
-
-def _uneven(count: int) -> list[int]:
-    sizes = [10, 1, 30]
-    return [*sizes, count - sum(sizes)]

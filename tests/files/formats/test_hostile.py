@@ -21,9 +21,8 @@ from PIL import Image
 
 from files.formats.examples import model_of
 from keyss.core.errors import InputError
-from keyss.files import read_model, write_model
-from keyss.files.formats import glb, sog, spz
-from keyss.files.models import MemoryInput, model_bytes, read_source
+from keyss.files import model_bytes, model_of_bytes, read_model, write_model
+from keyss.files.formats import spz
 from mutations import attempt, damaged, examples
 
 MODEL = model_of(60, 1)
@@ -35,7 +34,7 @@ def refused(name: str, data: bytes, words: str, *, most: int = 8 * MEGABYTE) -> 
     tracemalloc.start()
     start = time.process_time()  # others may keep the machine busy
     with pytest.raises(InputError, match=words):
-        read_source(MemoryInput(name, data))
+        model_of_bytes(name, data)
     assert time.process_time() - start < 5
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -58,7 +57,7 @@ def test_truncated_files(name: str) -> None:
         if name == "a.splat" and end and end % 32 == 0:
             continue  # a smaller model
         with pytest.raises(InputError):
-            read_source(MemoryInput(name, data[:end]))
+            model_of_bytes(name, data[:end])
 
 
 # --- counts that no file can hold ------------------------------------------------------------------------
@@ -78,11 +77,8 @@ def test_counts_beyond_all_measure(count: int) -> None:
     refused("a.ply", ply.encode() + bytes(500), "the header announces")
     refused("a.sog", with_meta(lambda meta: meta.update(count=count)), "it announces")
     refused(
-        "a.glb", with_json(lambda gltf: gltf["accessors"][0].update(count=count)), "leads out of its data"
+        "a.glb", with_json(lambda gltf: gltf["accessors"][0].update(count=count)), "exceeds its buffer view"
     )
-    ksplat = bytearray(examples()["a.ksplat"][0])
-    ksplat[16:20] = struct.pack("<I", count)
-    refused("a.ksplat", bytes(ksplat), "it announces|do not have")
 
 
 def test_no_gaussians_at_all() -> None:
@@ -108,7 +104,7 @@ def test_a_zstd_bomb() -> None:
     start = 32 + 6 * 16
     changed = data[:32] + struct.pack("<Q", len(bomb)) + data[40:start] + bomb + data[start + old :]
     tracemalloc.start()
-    read_source(MemoryInput("a.spz", changed))
+    model_of_bytes("a.spz", changed)
     assert tracemalloc.get_traced_memory()[1] < 4 * MEGABYTE
     tracemalloc.stop()
 
@@ -128,7 +124,7 @@ def contents(data: bytes) -> dict[str, bytes]:
 
 def with_meta(change: Callable[[dict], object], **files: bytes) -> bytes:
     """A .sog whose meta.json was changed, and files in it."""
-    inside = contents(sog.write_sog(MODEL))
+    inside = contents(model_bytes("a.sog", MODEL))
     meta = json.loads(inside["meta.json"])
     change(meta)
     inside["meta.json"] = json.dumps(meta).encode()
@@ -136,12 +132,12 @@ def with_meta(change: Callable[[dict], object], **files: bytes) -> bytes:
 
 
 def test_a_zip_bomb() -> None:
-    inside = contents(sog.write_sog(MODEL))
+    inside = contents(model_bytes("a.sog", MODEL))
     for name in ("meta.json", "means_l.webp"):
         bomb = archive(inside | {name: bytes(200 * MEGABYTE)}, zipfile.ZIP_DEFLATED)
         refused("a.sog", bomb, "unpacks to 209,715,200 bytes")
     lzma = archive(inside, zipfile.ZIP_LZMA)
-    refused("a.sog", lzma, "packed by neither of the ways")
+    refused("a.sog", lzma, "unsupported ZIP compression")
 
 
 def webp(width: int, height: int) -> bytes:
@@ -165,7 +161,7 @@ def test_a_webp_of_huge_size() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda meta: meta["means"].update(mins=[0, 0, 1e999]), "makes no sense"),
+        (lambda meta: meta["means"].update(mins=[0, 0, 1e999]), "cannot parse"),
         (lambda meta: meta["means"].update(maxs=[0, 0, 1e300]), "not finite|infinite"),
         (lambda meta: meta["means"].update(mins=[0, 0]), "no bounds of three coordinates"),
         (lambda meta: meta["scales"].update(codebook=[1e200] * 256), "not finite"),
@@ -185,13 +181,13 @@ def test_a_meta_json_that_lies(change: Callable[[dict], object], words: str) -> 
 
 
 def test_a_folder_of_sog_is_not_left(tmp_path: Path) -> None:
-    for name, content in contents(sog.write_sog(MODEL)).items():
+    for name, content in contents(model_bytes("a.sog", MODEL)).items():
         (tmp_path / name).write_bytes(content)
     assert len(read_model(tmp_path / "meta.json")) == len(MODEL)
     (tmp_path / "inside").mkdir()
     meta = json.loads((tmp_path / "meta.json").read_text())
     meta["quats"]["files"] = ["../quats.webp"]
-    for name in contents(sog.write_sog(MODEL)):
+    for name in contents(model_bytes("a.sog", MODEL)):
         (tmp_path / "inside" / name).write_bytes((tmp_path / name).read_bytes())
     (tmp_path / "inside" / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(InputError, match=r"there is no '\.\./quats\.webp' beside it"):
@@ -217,7 +213,7 @@ def test_numbers_that_are_none(value: float) -> None:
     compressed = model_bytes("a.compressed.ply", MODEL)
     at = compressed.index(b"end_header\n") + 11
     refused("a.ply", compressed[:at] + struct.pack("<f", value) + compressed[at + 4 :], "NaN or infinite")
-    binary = glb.write_glb(MODEL)
+    binary = model_bytes("a.glb", MODEL)
     at = binary.index(b"BIN\0") + 4
     refused("a.glb", binary[:at] + struct.pack("<f", value) + binary[at + 4 :], "NaN or infinite")
 
@@ -225,7 +221,7 @@ def test_numbers_that_are_none(value: float) -> None:
 def test_scales_of_zero_and_below() -> None:
     splat = bytearray(model_bytes("a.splat", MODEL))
     splat[12:16] = struct.pack("<f", 0.0)
-    assert float(read_source(MemoryInput("a.splat", bytes(splat))).log_scales.min()) < -80
+    assert float(model_of_bytes("a.splat", bytes(splat)).log_scales.min()) < -80
     splat[12:16] = struct.pack("<f", -1.0)
     refused("a.splat", bytes(splat), "NaN or infinite values in log_scales")
 
@@ -234,7 +230,7 @@ def test_scales_of_zero_and_below() -> None:
 
 
 def with_json(change: Callable[[dict], object]) -> bytes:
-    data = glb.write_glb(MODEL)
+    data = model_bytes("a.glb", MODEL)
     (size,) = struct.unpack_from("<I", data, 12)
     document = json.loads(data[20 : 20 + size])
     change(document)
@@ -248,19 +244,19 @@ def with_json(change: Callable[[dict], object]) -> bytes:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda gltf: gltf["nodes"][0].update(children=[0]), "its nodes are no tree"),
+        (lambda gltf: gltf["nodes"][0].update(children=[0]), "its nodes are not a tree"),
         (lambda gltf: gltf["nodes"][0].update(children=[7]), "a part that is not there"),
-        (lambda gltf: gltf["nodes"][0].update(scale=[1, 2, 1]), "move, turn and scale them evenly"),
-        (lambda gltf: gltf["nodes"][0].update(scale=[0, 0, 0]), "move, turn and scale them evenly"),
+        (lambda gltf: gltf["nodes"][0].update(scale=[1, 2, 1]), "by more than a similarity"),
+        (lambda gltf: gltf["nodes"][0].update(scale=[0, 0, 0]), "by more than a similarity"),
         (lambda gltf: gltf["nodes"][0].update(rotation=[0, 0, 0, 0]), "no proper transform"),
         (lambda gltf: gltf["nodes"][0].update(mesh=3), "a part that is not there"),
         (lambda gltf: gltf["meshes"][0]["primitives"][0].pop("extensions"), "without Gaussians"),
         (lambda gltf: gltf["accessors"][2].update(bufferView=99), "buffer view that is not there"),
-        (lambda gltf: gltf["accessors"][0].update(byteOffset=-4), "leads out of its data"),
+        (lambda gltf: gltf["accessors"][0].update(byteOffset=-4), "exceeds its buffer view"),
         (lambda gltf: gltf["accessors"][2].update(type="VEC3"), "4 numbers each"),
         (lambda gltf: gltf["accessors"][3].update(count=3), "different lengths"),
-        (lambda gltf: gltf["buffers"][0].update(uri="https://example.org/a.bin"), "these lie elsewhere"),
-        (lambda gltf: gltf["bufferViews"][0].update(byteOffset=10**9), "leads out of its data"),
+        (lambda gltf: gltf["buffers"][0].update(uri="https://example.org/a.bin"), "refers to other files"),
+        (lambda gltf: gltf["bufferViews"][0].update(byteOffset=10**9), "exceeds its buffer view"),
     ],
 )
 def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
@@ -279,7 +275,7 @@ def test_nodes_move_gaussians() -> None:
     def change(gltf: dict) -> None:
         gltf["nodes"] = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}]
 
-    found = read_source(MemoryInput("a.glb", with_json(change)))
+    found = model_of_bytes("a.glb", with_json(change))
     expected = MODEL.means.numpy() * 2 + np.array([1, 2, 3], np.float32)
     expected[:, :2] *= -1  # from y up to y down
     assert np.allclose(found.means.numpy(), expected, atol=1e-5)
@@ -288,9 +284,11 @@ def test_nodes_move_gaussians() -> None:
 
 def test_deep_json_is_no_problem(tmp_path: Path) -> None:
     deep = b"[" * 100_000
-    refused("a.sog", archive({"meta.json": deep}), "makes no sense", most=32 * MEGABYTE)
+    refused("a.sog", archive({"meta.json": deep}), "cannot parse", most=32 * MEGABYTE)
     with pytest.raises(InputError):
-        glb.read_glb(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(deep), len(deep), b"JSON") + deep)
+        model_of_bytes(
+            "a.glb", struct.pack("<4sIII4s", b"glTF", 2, 20 + len(deep), len(deep), b"JSON") + deep
+        )
 
 
 def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:

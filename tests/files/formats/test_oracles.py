@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from files.formats.examples import assert_close, ksplat_of, model_of
+from files.formats.examples import assert_close, model_of
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.files.formats import compressed_ply, glb, spz
-from keyss.files.ply import write_ply
 
 Transform = Callable[..., Path]
 DEGREES = pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -40,7 +39,7 @@ def test_splat_transform_reads_ours(
 def test_we_read_splat_transforms(
     splat_transform: Transform, tmp_path: Path, suffix: str, degree: int
 ) -> None:
-    write_ply(tmp_path / "in.ply", model_of(600, degree))
+    write_model(tmp_path / "in.ply", model_of(600, degree))
     options = ["-i", "1"] if suffix == "sog" else []
     theirs = splat_transform(tmp_path / "in.ply", tmp_path / f"theirs.{suffix}", *options)
     back = read_model(splat_transform(theirs, tmp_path / "back.ply"))
@@ -83,7 +82,7 @@ def test_spz_has_the_codes_of_splat_transforms(
 ) -> None:
     """It uses the format's own library."""
     model = model_of(600, degree)
-    write_ply(tmp_path / "in.ply", model)
+    write_model(tmp_path / "in.ply", model)
     theirs = spz.parse(splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes())
     assert spz.quantise(model, version=4) == theirs
 
@@ -93,7 +92,7 @@ def test_compressed_ply_has_the_codes_of_splat_transforms(
     splat_transform: Transform, tmp_path: Path, degree: int
 ) -> None:
     model = model_of(600, degree)
-    write_ply(tmp_path / "in.ply", model)
+    write_model(tmp_path / "in.ply", model)
     theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
     codes = compressed_ply.parse(theirs)
     order = torch.cdist(compressed_ply.dequantise(codes).means, model.means).argmin(dim=1)
@@ -105,7 +104,7 @@ def test_the_order_in_chunks_is_as_good_as_splat_transforms(
     splat_transform: Transform, tmp_path: Path
 ) -> None:
     model = model_of(5000, 0)
-    write_ply(tmp_path / "in.ply", model)
+    write_model(tmp_path / "in.ply", model)
     theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
 
     def extent(data: bytes) -> float:
@@ -119,13 +118,13 @@ def test_the_order_in_chunks_is_as_good_as_splat_transforms(
 def test_we_read_splat_transforms_glb(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
     """It writes the values of a .ply turned by 180 degrees, and we bring them back."""
     model = model_of(200, degree)
-    write_ply(tmp_path / "in.ply", model)
+    write_model(tmp_path / "in.ply", model)
     found = read_model(splat_transform(tmp_path / "in.ply", tmp_path / "a.glb"))
     assert_close(found, model, 1e-6)
 
 
 def test_a_folder_of_sog(splat_transform: Transform, tmp_path: Path) -> None:
-    write_ply(tmp_path / "in.ply", model_of(300, 1))
+    write_model(tmp_path / "in.ply", model_of(300, 1))
     (tmp_path / "sog").mkdir()
     meta = splat_transform(tmp_path / "in.ply", tmp_path / "sog" / "meta.json", "-i", "1")
     whole = splat_transform(tmp_path / "in.ply", tmp_path / "a.sog", "-i", "1")
@@ -168,7 +167,7 @@ def test_gsply_reads_ours(tmp_path: Path, suffix: str, degree: int) -> None:
 @DEGREES
 @pytest.mark.parametrize("version", [3, 4])
 def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
-    write_ply(tmp_path / "in.ply", model_of(300, degree))
+    write_model(tmp_path / "in.ply", model_of(300, degree))
     gsply.write_spz(tmp_path / "a.spz", gsply.plyread(tmp_path / "in.ply"), version=version)
     theirs = of_gsply(gsply.read_spz(tmp_path / "a.spz"), turned=True)
     assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
@@ -187,7 +186,7 @@ def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
 
 @DEGREES
 def test_we_read_gsplys_compressed_ply(tmp_path: Path, degree: int) -> None:
-    write_ply(tmp_path / "in.ply", model_of(300, degree))
+    write_model(tmp_path / "in.ply", model_of(300, degree))
     path = tmp_path / "a.compressed.ply"
     gsply.plywrite(path, gsply.plyread(tmp_path / "in.ply"), compressed=True)
     assert_close(read_model(path), of_gsply(gsply.plyread(path)), 1e-4)
@@ -200,18 +199,3 @@ def test_glb_comes_back(degree: int) -> None:
     assert_close(found, model, 1e-6)
     assert torch.equal(found.means, model.means)
     assert torch.equal(found.sh, model.sh)
-
-
-# --- .ksplat: no program here writes its two smaller levels ----------------------------------------------
-
-
-@pytest.mark.parametrize("level", [0, 1, 2])
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_ksplat_as_splat_transform_reads_it(
-    splat_transform: Transform, tmp_path: Path, level: int, degree: int
-) -> None:
-    model = model_of(300, degree)
-    (tmp_path / "a.ksplat").write_bytes(ksplat_of(model, level))
-    found = read_model(tmp_path / "a.ksplat")
-    assert_close(found, read_model(splat_transform(tmp_path / "a.ksplat", tmp_path / "back.ply")), 1e-5)
-    assert_close(found, model, 0.02)

@@ -18,7 +18,7 @@ from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, u
 from keyss.channels.low_bits.ciphers import key_cipher
 from keyss.channels.low_bits.salts import salt_rows
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
-from keyss.files.ply import read_ply, write_ply
+from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
 from keyss.methods import RecordRoom, Table, Wanted, encode_all, record_request
 from keyss.methods.records.encoding import check_degrees
@@ -265,26 +265,26 @@ def test_survives_files_without_normals_with_more_properties_and_in_other_orders
     for index, data in enumerate((ply_bytes(bare), ply_bytes(more))):
         path = tmp_path / f"{index}.ply"
         path.write_bytes(data)
-        assert_same_bits(read_ply(path), stego)
+        assert_same_bits(read_model(path), stego)
 
 
 def test_survives_our_writer_and_gsply(stego: Gaussians, tmp_path: Path) -> None:
-    write_ply(tmp_path / "ours.ply", stego)
+    write_model(tmp_path / "ours.ply", stego)
     gsply.plywrite(tmp_path / "theirs.ply", gsply.plyread(tmp_path / "ours.ply"))
-    assert len(extract(read_ply(tmp_path / "theirs.ply"), KEY).gaussians) == 1200
+    assert len(extract(read_model(tmp_path / "theirs.ply"), KEY).gaussians) == 1200
 
 
 def test_survives_plyfile(stego: Gaussians, tmp_path: Path) -> None:
     plyfile = pytest.importorskip("plyfile")
-    write_ply(tmp_path / "ours.ply", stego)
+    write_model(tmp_path / "ours.ply", stego)
     plyfile.PlyData.read(tmp_path / "ours.ply").write(tmp_path / "theirs.ply")
-    assert_same_bits(read_ply(tmp_path / "theirs.ply"), stego)
+    assert_same_bits(read_model(tmp_path / "theirs.ply"), stego)
 
 
 def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
-    write_ply(tmp_path / "in.ply", stego)
+    write_model(tmp_path / "in.ply", stego)
     copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
-    assert len(extract(read_ply(copy), KEY).gaussians) == 1200
+    assert len(extract(read_model(copy), KEY).gaussians) == 1200
 
 
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians, secret: Gaussians) -> None:

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from keyss.core import WrongKeyError
-from keyss.files.ply import read_ply
+from keyss.files import read_model
 from methods.carry.carried import extract
 
 pytestmark = pytest.mark.argon2
 
 FOLDER = Path(__file__).parents[2] / "vectors"
 VECTOR = json.loads((FOLDER / "carried.json").read_text())
-STEGO = read_ply(FOLDER / "carried.ply")
+STEGO = read_model(FOLDER / "carried.ply")
 
 
 def test_a_carried_model_opens() -> None:

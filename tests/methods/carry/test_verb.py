@@ -17,7 +17,7 @@ from keyss.channels import LOW_BITS
 from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.core.pruning_compensation import compensate_pruning
-from keyss.files.ply import read_ply, write_ply
+from keyss.files import read_model, write_model
 from keyss.methods import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -27,9 +27,9 @@ KEY = "a key of many characters: 93hXmQ2"
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
-    write_ply(folder / "cover.ply", trained_like(2500))
-    write_ply(folder / "secret.ply", trained_like(900, 1))
-    write_ply(folder / "large.ply", trained_like(6000, 2))
+    write_model(folder / "cover.ply", trained_like(2500))
+    write_model(folder / "secret.ply", trained_like(900, 1))
+    write_model(folder / "large.ply", trained_like(6000, 2))
     (folder / "key").write_text(KEY)
     (folder / "other").write_text(KEY + "4")
     for name in ("key", "other"):
@@ -74,7 +74,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert metrics["wrong_key"] is None
     stego = tmp_path / "out/publish/stego.ply"
     assert run("reveal", stego, "--key-file", "key", "-o", tmp_path / "secret.ply")[0] == 0
-    assert len(read_ply(tmp_path / "secret.ply")) == 900
+    assert len(read_model(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
     assert run("evaluate", tmp_path / "out", "--key-file", "key")[0] == 0
     assert json.loads((tmp_path / "out/private/metrics.json").read_text()) == metrics
@@ -91,7 +91,7 @@ def test_too_large_secrets_are_refused_or_pruned(
     hide = (*hide, "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out", "--refit", "never")
     assert status == 2
-    cover = LOW_BITS.prepare(read_ply("cover.ply"))
+    cover = LOW_BITS.prepare(read_model("cover.ply"))
     fits = cover.record_capacity([record_request(6000, 3)])
     assert 4000 < fits < 4800
     assert f"{fits:,} would fit; --prune-to-fit" in err
@@ -107,7 +107,7 @@ def test_too_large_secrets_are_refused_or_pruned(
 def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
     run: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
-    write_ply(tmp_path / "tiny.ply", trained_like(100))
+    write_model(tmp_path / "tiny.ply", trained_like(100))
     hide = ("hide", "--method", "carry", "--cover", tmp_path / "tiny.ply", "--key-file", "key")
     for flags in ((), ("--prune-to-fit",), ("--refit=never",)):
         status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", *flags)
@@ -151,7 +151,7 @@ def test_options_of_the_other_method_are_refused(
 def test_dithering_says_what_it_costs(
     run: Callable[..., tuple[int, str, str]], files: Path, tmp_path: Path
 ) -> None:
-    write_ply(tmp_path / "coarse.ply", read_ply(files / "cover.ply").map(lambda v: (v * 64).round() / 64))
+    write_model(tmp_path / "coarse.ply", read_model(files / "cover.ply").map(lambda v: (v * 64).round() / 64))
     hide = (
         "hide",
         "--method",

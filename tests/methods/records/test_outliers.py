@@ -13,7 +13,7 @@ import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, Secret
 from keyss.core.gaussians import DRAWN_OPACITY
-from keyss.files.ply import write_ply
+from keyss.files import write_model
 from keyss.methods import Codec, Table, outliers
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
@@ -129,8 +129,8 @@ def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:
 @pytest.mark.parametrize("value", [1e10, 1e30])
 def test_a_secret_with_an_outlier_is_carried_from_file_to_file(tmp_path: Path, value: float) -> None:
     secret = _with(_bulk(900, 1), torch.tensor([5]), "means", value)
-    write_ply(tmp_path / "secret.ply", secret)
-    write_ply(tmp_path / "cover.ply", trained_like(2000))
+    write_model(tmp_path / "secret.ply", secret)
+    write_model(tmp_path / "cover.ply", trained_like(2000))
     result = keyss.hide(
         tmp_path / "cover.ply",
         [Secret(tmp_path / "secret.ply", KEY)],

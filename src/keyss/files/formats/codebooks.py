@@ -1,8 +1,8 @@
-"""Codebooks: few numbers, or few vectors, that stand for many.
+"""Codebooks of numbers and palettes of vectors.
 
-Lloyd's method in one dimension, where it takes milliseconds. Vectors are grouped by a tree that splits the
-worst group first: k-means with tens of thousands of clusters, which other writers run, takes minutes without
-a GPU (splat-transform: half a minute a round for 20,000 Gaussians) and gains less than 8 bits lose.
+Numbers are quantised by Lloyd's method, which takes milliseconds in one dimension. Vectors are grouped by a
+tree that splits the worst group first: k-means with tens of thousands of clusters, which other writers run,
+takes minutes without a GPU and gains less than rounding to 8 bits loses.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from keyss.files.formats.common import Bytes, Floats, Shorts
 
 SIZE = 256  # numbers of a codebook
 _ROUNDS = 50
-_BINS = 1024  # of as many values each, in which densities are measured
-_MIN_WIDTH = 1e-6  # of such a bin, as a share of the whole: values may be equal
-_AXES = 12  # of the largest spread, by which groups are split
-_SAMPLE = 50_000  # vectors that tell which they are
+_BINS = 1024  # with equally many values each, to estimate the density
+_MIN_WIDTH = 1e-6  # of a bin, relative to the range, since values may be equal
+_AXES = 12  # principal axes by which groups are split
+_SAMPLE = 50_000  # vectors from which the axes are computed
 
 
 def codebook_of(values: Floats) -> Floats:
-    """[256] ascending numbers that stand for `values` of any shape.
+    """[256] ascending numbers that approximate `values` of any shape.
 
-    Squared errors count by the inverse root of the density: rare values are often those of the few Gaussians
-    that cover most. Measured on six models, that gains 0 to 8 dB of pictures against counting them alike.
+    Squared errors are weighted by the inverse square root of the density: rare values often belong to the few
+    Gaussians that cover most of the image. On six models, this gains 0 to 8 dB over equal weights.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     distinct = np.unique(ordered)
@@ -33,7 +33,7 @@ def codebook_of(values: Floats) -> Floats:
     at = np.unique(np.linspace(0, len(ordered) - 1, _BINS + 1).astype(int))
     width = np.maximum(np.diff(ordered[at]), _MIN_WIDTH * (distinct[-1] - distinct[0]))
     density = np.diff(at) / width
-    # The best density of numbers is the third root of the density that counts (Panter and Dite 1951).
+    # The optimal density of the numbers is the cube root of the weighted density (Panter and Dite 1951).
     share = np.concatenate([[0.0], np.cumsum(width * density ** (1 / 6))])
     numbers = np.interp((np.arange(SIZE) + 0.5) / SIZE * share[-1], share, ordered[at])
     weight = np.repeat(density**-0.5, np.diff(np.append(at[:-1], len(ordered))))
@@ -52,14 +52,14 @@ def codebook_of(values: Floats) -> Floats:
 
 
 def nearest(codebook: Floats, values: Floats) -> Bytes:
-    """Indices of the numbers of an ascending codebook nearest to `values`, in their shape."""
+    """Indices of the nearest numbers of an ascending codebook, in the shape of `values`."""
     middles = (codebook[1:].astype(np.float64) + codebook[:-1]) / 2
     found: Bytes = np.searchsorted(middles, values).astype(np.uint8)
     return found
 
 
 def palette_of(vectors: Floats, size: int) -> tuple[Floats, Shorts]:
-    """At most `size` (65,536 or fewer) vectors [P, D] for `vectors` [N, D], and which stands for each [N]."""
+    """A palette [P, D] of at most `size` (up to 65,536) vectors for `vectors` [N, D], and labels [N]."""
     from keyss.files.formats.grouping import groups  # numba takes a second to import
 
     with np.errstate(over="ignore"):

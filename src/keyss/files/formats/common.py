@@ -1,9 +1,8 @@
-"""What several formats share: bytes for opacities, quaternions without their largest part, spatial order."""
+"""Code shared by several formats: checks, quantisation of attributes, spatial order."""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,21 +12,20 @@ import torch
 from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
-from keyss.files.streams import MAX_BYTES, StandardInput
 
 Bytes = npt.NDArray[np.uint8]
 Shorts = npt.NDArray[np.uint16]
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 
-# Files that unpack to more than this are believed only if they are large themselves: published models take
-# 7 bytes per Gaussian at the very least, and positions, which differ, do not pack to less than one.
+# A packed file may announce more Gaussians than this only if it has a byte for each: published models take at
+# least 7 bytes per Gaussian.
 SMALL_COUNT = 1 << 18
 _MORTON_BITS = 21  # per axis
 
 
 class Codes:
-    """Base of the codes of a format: dataclasses of numbers and arrays, equal when all of these are."""
+    """Base of a format's codes: dataclasses of numbers and arrays, which compare by value."""
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
@@ -39,19 +37,18 @@ class Codes:
 
 
 class CodedGaussians(Gaussians):
-    """The model of a file, and the codes that it has there.
+    """The model of a file with the file's codes.
 
-    Whatever makes another model of it, its own methods but `to` included, gives `Gaussians` without codes:
-    they are those of a file that nobody has changed.
+    Only `to` keeps the codes: every other method, and every derived model, gives `Gaussians` without them.
     """
 
-    __slots__ = ("codes",)  # and not in vars(), which are the tensors
+    __slots__ = ("codes",)  # not in vars(), which holds the tensors
 
     codes: Codes
 
     @staticmethod
     def of(model: Gaussians, codes: Codes) -> CodedGaussians:
-        """`model`, which the codes stand for."""
+        """`model`, decoded from `codes`."""
         found = CodedGaussians(*(getattr(model, each.name) for each in fields(model)))
         object.__setattr__(found, "codes", codes)
         return found
@@ -68,21 +65,12 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def reason(error: Exception) -> str:
-    """What an error of a library says, as far as one line holds it: it may quote the file at any length."""
+    """The start of a library's message, which may quote the file at any length."""
     return str(error)[:200]
 
 
-def read_whole(source: Path | StandardInput) -> bytes:
-    """All bytes of a model's file. Raises InputError for more than 4 GiB, and OSError."""
-    with source.open("rb") as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{source}: expected at most {MAX_BYTES:,} bytes, found more")
-    return data
-
-
 def check_count(count: int, size: int) -> None:
-    """Raise InputError where a packed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
+    """Raise InputError if a packed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
     if count < 1:
         raise InputError("it holds no Gaussians")
     if count > max(SMALL_COUNT, size):
@@ -90,7 +78,7 @@ def check_count(count: int, size: int) -> None:
 
 
 def check_sh_degree(degree: int) -> int:
-    """Number of SH coefficients per channel beyond the constant one. Raises InputError above degree 3."""
+    """SH coefficients per channel without the constant one. Raises InputError above degree 3."""
     if not 0 <= degree <= 3:
         raise InputError(f"expected spherical harmonics of degree 0 to 3, found {degree}")
     return (degree + 1) ** 2 - 1
@@ -104,7 +92,7 @@ def gaussians_of(
     colors: npt.NDArray[Any],
     rest: npt.NDArray[Any],
 ) -> Gaussians:
-    """A model of arrays: `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the other harmonics.
+    """A model from arrays: `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the other harmonics.
 
     Raises InputError for values that are not finite in single precision.
     """
@@ -118,11 +106,8 @@ def gaussians_of(
 
 
 def writable(model: Gaussians) -> Gaussians:
-    """`model` on the CPU with finite opacity logits. Raises OutputError if it is empty or not finite.
-
-    That of a file, which is both, stays as it is there.
-    """
-    if isinstance(model, CodedGaussians):
+    """`model` on the CPU with finite opacity logits. Raises OutputError if it is empty or not finite."""
+    if isinstance(model, CodedGaussians):  # read from a file, hence valid
         return model
     flat = model.detach().to("cpu")
     if len(flat) == 0:
@@ -139,7 +124,7 @@ def writable(model: Gaussians) -> Gaussians:
 
 
 def arrays_of(model: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """The arrays that `gaussians_of` takes, of a model anywhere."""
+    """The arguments of `gaussians_of`, from a model on any device."""
     flat = model.detach().to("cpu")
     sh = flat.sh.numpy()
     parts = (flat.means, flat.quats, flat.log_scales, flat.opacity_logits)
@@ -148,7 +133,7 @@ def arrays_of(model: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats,
 
 
 def logits(opacities: npt.NDArray[Any]) -> Doubles:
-    """Opacity logits of opacities from 0 to 1, which themselves become -+OPACITY_LOGIT_BOUND."""
+    """Opacity logits of opacities in [0, 1], clipped to +-OPACITY_LOGIT_BOUND."""
     values = np.asarray(opacities, dtype=np.float64)
     with np.errstate(divide="ignore"):
         found: Doubles = np.log(values) - np.log1p(-values)
@@ -157,37 +142,38 @@ def logits(opacities: npt.NDArray[Any]) -> Doubles:
 
 
 def opacities(opacity_logits: Floats) -> Doubles:
-    """[N] opacities, 0 to 1."""
+    """[N] opacities in [0, 1]."""
     with np.errstate(over="ignore"):
         found: Doubles = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
     return found
 
 
 def rounded(values: npt.NDArray[Any]) -> Doubles:
-    """`values` to the nearest integers, halves away from 0, as C's `round` does."""
+    """`values` rounded to integers, halves away from 0, like C's `round`."""
     found: Doubles = np.copysign(np.floor(np.abs(values) + 0.5), values)
     return found
 
 
-def to_bytes(values: npt.NDArray[Any], most: int = 255) -> npt.NDArray[Any]:
-    """`values` rounded and cut to 0 to `most`, as uint8 or, above 255, uint16."""
-    found: npt.NDArray[Any] = rounded(values).clip(0, most).astype(np.uint8 if most < 256 else np.uint16)
-    return found
+def to_bytes(values: npt.NDArray[Any], maximum: int = 255) -> npt.NDArray[Any]:
+    """`values` rounded and clipped to 0 to `maximum`, as uint8 or, above 255, uint16."""
+    kind = np.uint8 if maximum < 256 else np.uint16
+    codes: npt.NDArray[Any] = rounded(values).clip(0, maximum).astype(kind)
+    return codes
 
 
 def colour_bytes(f_dc: Floats) -> Bytes:
-    """[..., 3] 8-bit colours seen where there are no other harmonics; cut to what bytes hold."""
+    """[..., 3] 8-bit colours of the constant harmonic, clipped."""
     return to_bytes((0.5 + SH_C0 * f_dc.astype(np.float64)) * 255)
 
 
 def f_dc_of(colors: npt.NDArray[Any]) -> Doubles:
-    """f_dc of colours, 0 to 1 where they can be seen."""
+    """f_dc of colours in [0, 1]."""
     found: Doubles = (np.asarray(colors, dtype=np.float64) - 0.5) / SH_C0
     return found
 
 
 def log_scales_of(scales: npt.NDArray[Any]) -> Doubles:
-    """Logarithms of scales, those of 0 that of the smallest normal number; NaN of negative ones."""
+    """Logarithms of scales: 0 counts as the smallest normal number; NaN for negative scales."""
     with np.errstate(invalid="ignore"):
         values = np.asarray(scales, dtype=np.float64)
         found: Doubles = np.log(np.where(values == 0, np.finfo(np.float32).tiny, values))
@@ -195,13 +181,13 @@ def log_scales_of(scales: npt.NDArray[Any]) -> Doubles:
 
 
 def scales_of(log_scales: Floats) -> Floats:
-    """Scales, none beyond single precision."""
+    """Scales, clipped to the range of float32."""
     found: Floats = np.exp(log_scales.astype(np.float64)).clip(0, np.finfo(np.float32).max).astype(np.float32)
     return found
 
 
 def unit(quats: npt.NDArray[Any]) -> Doubles:
-    """[N, 4] quaternions of length 1; those of length 0 become (1, 0, 0, 0), as renderers take them."""
+    """[N, 4] normalised quaternions; zero becomes (1, 0, 0, 0), as in renderers."""
     values = quats.astype(np.float64)
     length = np.linalg.norm(values, axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -210,9 +196,9 @@ def unit(quats: npt.NDArray[Any]) -> Doubles:
 
 
 def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:
-    """Of unit quaternions [N, 4]: which part is the largest [N], and the others [N, 3], in order.
+    """The index of the largest component [N] of unit quaternions [N, 4], and the others [N, 3] in order.
 
-    Signs are such that the largest is positive; the others then lie within +-sqrt(1/2).
+    The signs make the largest component positive; the others are within +-sqrt(1/2).
     """
     largest = np.abs(quats).argmax(axis=1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -220,7 +206,7 @@ def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:
 
 
 def from_smallest_three(largest: Bytes, others: Doubles) -> Doubles:
-    """[N, 4] unit quaternions: the inverse of `smallest_three`; too long `others` leave 0 for the largest."""
+    """[N, 4] unit quaternions, the inverse of `smallest_three`; the largest is 0 if `others` are too long."""
     quats = np.empty((len(largest), 4))
     np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
     rest = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
@@ -238,7 +224,7 @@ def in_morton_order(model: Gaussians) -> Gaussians:
 
 
 def morton_order(means: Floats) -> npt.NDArray[np.intp]:
-    """[N] indices that sort positions along a Z-order curve: neighbours in space follow each other."""
+    """[N] indices that sort positions along a Z-order curve."""
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     extent = np.where(high > low, high - low, 1.0)
     cells = ((means - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
@@ -249,7 +235,7 @@ def morton_order(means: Floats) -> npt.NDArray[np.intp]:
 
 
 def _spread(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """The lowest 21 bits of `values`, with two zeros between any two of them."""
+    """The lowest 21 bits of `values` with two zero bits between neighbours."""
     values = values & np.uint64(0x1FFFFF)
     for shift, mask in (
         (32, 0x1F00000000FFFF),

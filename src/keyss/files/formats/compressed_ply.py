@@ -1,8 +1,8 @@
-"""Compressed .ply, PlayCanvas's format: chunks of 256 Gaussians, and 16 bytes and harmonics for each.
+"""Compressed .ply, PlayCanvas's format: 16 bytes and 8-bit harmonics per Gaussian, in chunks of 256.
 
-https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply/#compressed-ply. Within a chunk,
-positions, log scales and colours lie between a smallest and a largest value of each coordinate, so that they
-are the finer the nearer a chunk's Gaussians are to each other: `write_compressed_ply` sorts them.
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply/#compressed-ply. Positions, log
+scales and colours are quantised between the bounds of their chunk, hence the finer the closer the Gaussians
+of a chunk are: `write_compressed_ply` sorts them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,8 +39,8 @@ from keyss.files.ply_table import ply_header, read_tables
 
 CHUNK = 256  # Gaussians
 _VECTOR = (11, 10, 11)  # bits of x, y, z
-_SCALE_LIMIT = 20.0  # log scales are cut to +- this
-_SMALLEST_RANGE = 1e-5  # below it, all of a chunk's values are its smallest
+_SCALE_LIMIT = 20.0  # log scales are clipped to +- this
+_MIN_RANGE = 1e-5  # of a chunk; below it, all of its values become the lower bound
 
 _BOUNDS = [
     f"{end}_{name}"
@@ -54,12 +53,12 @@ _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 @dataclass(frozen=True, eq=False)
 class CompressedPlyCodes(Codes):
-    """All numbers of a file; Gaussian i lies in chunk i // 256. See `dequantise` for their meaning."""
+    """All numbers of a file; Gaussian i is in chunk i // 256. `dequantise` decodes them."""
 
     bounds: Floats  # [C, 18] smallest, then largest x y z; log scales; r g b (0 to 1: of f_dc * SH_C0 + 0.5)
     positions: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
-    largest: Bytes  # [N] which of w, x, y, z (0 to 3) is not stored
-    rotations: Shorts  # [N, 3] 10 bits each, the others from -sqrt(1/2) to sqrt(1/2)
+    largest: Bytes  # [N] index of the component of wxyz that is not stored
+    rotations: Shorts  # [N, 3] 10 bits each, the other components from -sqrt(1/2) to sqrt(1/2)
     scales: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
     colors: Bytes  # [N, 3] between the bounds
     alphas: Bytes  # [N] opacities in 255ths
@@ -70,11 +69,11 @@ class CompressedPlyCodes(Codes):
 
 
 def parse(data: bytes) -> CompressedPlyCodes:
-    """The codes of a file; colours without bounds, as old ones have, get 0 and 1.
+    """The codes of a file; old files have no bounds of colours, which are then 0 and 1.
 
-    Raises InputError for anything that is not a whole compressed .ply.
+    Raises InputError if it is not a complete compressed .ply.
     """
-    tables = read_tables(io.BytesIO(data), Path("compressed .ply"))
+    tables = read_tables(io.BytesIO(data))
     vertex, chunk = tables["vertex"], tables.get("chunk")
     n = len(vertex)
     if chunk is None or not _has(vertex, _PACKED, "u4") or not _has(chunk, _BOUNDS[:12], "f4"):
@@ -118,15 +117,15 @@ def serialise(codes: CompressedPlyCodes) -> bytes:
 
 
 def dequantise(codes: CompressedPlyCodes) -> Gaussians:
-    """The model that codes stand for. Raises InputError for bounds that are not finite."""
+    """Decode codes to a model. Raises InputError for bounds that are not finite."""
     bounds = codes.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(codes)].reshape(-1, 3, 2, 3)
-    most = 2.0 ** np.array(_VECTOR) - 1
+    steps = 2.0 ** np.array(_VECTOR) - 1
     rotations = (codes.rotations / 1023 - 0.5) * np.sqrt(2)
     harmonics = np.where(codes.sh == 0, 0.0, np.where(codes.sh == 255, 256.0, codes.sh + 0.5))
     return gaussians_of(
-        _between(bounds[:, 0], codes.positions / most),
+        _between(bounds[:, 0], codes.positions / steps),
         from_smallest_three(codes.largest, rotations),
-        _between(bounds[:, 1], codes.scales / most),
+        _between(bounds[:, 1], codes.scales / steps),
         logits(codes.alphas / 255),
         f_dc_of(_between(bounds[:, 2], codes.colors / 255)),
         harmonics / 32 - 4,
@@ -134,7 +133,7 @@ def dequantise(codes: CompressedPlyCodes) -> Gaussians:
 
 
 def quantise(model: Gaussians) -> CompressedPlyCodes:
-    """The codes of a model in its order, each 256 of its Gaussians a chunk."""
+    """The codes of a model, in its order."""
     means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
     colors = f_dc.astype(np.float64) * SH_C0 + 0.5
     parts = [means.astype(np.float64), log_scales.astype(np.float64), colors]
@@ -144,13 +143,13 @@ def quantise(model: Gaussians) -> CompressedPlyCodes:
     ends = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
     position, scale, color = (_share(ends[:, i], values) for i, values in enumerate(parts))
     largest, others = smallest_three(unit(quats))
-    most = 2.0 ** np.array(_VECTOR) - 1
+    steps = 2.0 ** np.array(_VECTOR) - 1
     return CompressedPlyCodes(
         bounds=bounds,
-        positions=np.floor(position * most + 0.5).astype(np.uint16),
+        positions=np.floor(position * steps + 0.5).astype(np.uint16),
         largest=largest,
         rotations=to_bytes(np.floor((others * np.sqrt(0.5) + 0.5) * 1023 + 0.5), 1023),
-        scales=np.floor(scale * most + 0.5).astype(np.uint16),
+        scales=np.floor(scale * steps + 0.5).astype(np.uint16),
         colors=to_bytes(np.floor(color * 255 + 0.5)),
         alphas=to_bytes(np.floor(opacities(opacity_logits) * 255 + 0.5)),
         sh=to_bytes(np.trunc((rest.astype(np.float64) / 8 + 0.5) * 256)),
@@ -164,7 +163,7 @@ def read_compressed_ply(data: bytes) -> CodedGaussians:
 
 
 def write_compressed_ply(model: Gaussians) -> bytes:
-    """A model as a file, sorted so that the Gaussians of a chunk are near each other."""
+    """A model as a file, sorted so that the Gaussians of a chunk are close together."""
     if isinstance(model, CodedGaussians) and isinstance(model.codes, CompressedPlyCodes):
         return serialise(model.codes)
     return serialise(quantise(in_morton_order(model)))
@@ -176,20 +175,20 @@ def _has(table: npt.NDArray[np.void], names: list[str], code: str) -> bool:
 
 
 def _harmonics(table: npt.NDArray[np.void] | None, n: int) -> Bytes:
-    """[N, K - 1, 3] codes of the element `sh`, which has all red ones first; none where it is missing."""
+    """[N, K - 1, 3] codes of the element `sh`, which has all red ones first; K = 1 without it."""
     if table is None:
         return np.empty((n, 0, 3), np.uint8)
     names = list(table.dtype.names or ())
     if names != [f"f_rest_{i}" for i in range(len(names))] or len(names) not in (9, 24, 45):
         raise InputError(f"expected 9, 24 or 45 properties f_rest_0, f_rest_1, ..., found {len(names)}")
     if len(table) != n or not _has(table, names, "u1"):
-        raise InputError(f"expected harmonics of {n:,} Gaussians as bytes, found others")
+        raise InputError(f"expected one byte for each harmonic of {n:,} Gaussians, found something else")
     found: Bytes = np.ascontiguousarray(table).view(np.uint8).reshape(n, 3, -1).transpose(0, 2, 1).copy()
     return found
 
 
 def _fields(packed: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray[np.uint32]:
-    """[N, 3] the lowest bits of `packed` [N], the last of the three lowest."""
+    """[N, 3] three bit fields of `packed` [N]; the last field has the lowest bits."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
     masks = np.array([2**each - 1 for each in bits], dtype=np.uint32)
     found: npt.NDArray[np.uint32] = packed[:, None] >> shifts & masks
@@ -197,28 +196,28 @@ def _fields(packed: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray
 
 
 def _joined(values: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray[np.uint32]:
-    """[N] the inverse of `_fields`."""
+    """[N] integers from their bit fields, the inverse of `_fields`."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
     found: npt.NDArray[np.uint32] = np.bitwise_or.reduce(values.astype(np.uint32) << shifts, axis=1)
     return found
 
 
 def _between(ends: Doubles, share: Doubles) -> Doubles:
-    """Values at `share` [N, 3] of the way between `ends` [N, 2, 3]."""
+    """[N, 3] linear interpolation at `share` [N, 3] between `ends` [N, 2, 3]."""
     return ends[:, 0] * (1 - share) + ends[:, 1] * share
 
 
 def _bounds(values: Doubles) -> Doubles:
-    """[C, 6] smallest and largest of each coordinate in each chunk of `values` [N, 3]."""
+    """[C, 6] minimum and maximum of each coordinate in each chunk of `values` [N, 3]."""
     starts = np.arange(0, len(values), CHUNK)
     both = [ufunc.reduceat(values, starts, axis=0) for ufunc in (np.minimum, np.maximum)]
     return np.concatenate(both, axis=1)
 
 
 def _share(ends: Doubles, values: Doubles) -> Doubles:
-    """[N, 3] where values lie between `ends` [N, 2, 3]: 0 to 1."""
+    """[N, 3] position of values between `ends` [N, 2, 3], in [0, 1]: the inverse of `_between`."""
     extent = ends[:, 1] - ends[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(extent < _SMALLEST_RANGE, 0.0, (values - ends[:, 0]) / extent)
+        share = np.where(extent < _MIN_RANGE, 0.0, (values - ends[:, 0]) / extent)
     found: Doubles = share.clip(0, 1)
     return found

@@ -1,8 +1,8 @@
-"""Models that a network decodes, as safetensors: no format of anybody else's, and nothing executable in it.
+"""Models that a network decodes, as safetensors: our own format, without executable content.
 
 Tensors of single precision: `means` [N, 3], `quats` [N, 4], `log_scales` [N, 3], `opacity_logits` [N],
-`sh` [N, K, 3]; `features` [N, C] where they stand in for the harmonics; `background` [C]; and of each layer,
-from 0 on, `layer.I.weight` [out, in, 3, 3] and `layer.I.bias` [out].
+`sh` [N, K, 3]; `features` [N, C] if they replace the harmonics; `background` [C]; and of each layer I from 0:
+`layer.I.weight` [out, in, 3, 3] and `layer.I.bias` [out].
 """
 
 from __future__ import annotations

@@ -1,16 +1,20 @@
 """glTF's binary form, .glb, with the extension KHR_gaussian_splatting.
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting. Attributes are
-activated: scales and opacities, not their logarithms and logits. glTF has y up; as other converters do, the
-frame of a .ply is taken for one turned by 180 degrees about z. What we write says so in its node, and keeps
-the values.
+activated: scales and opacities, not their logarithms and logits. glTF has y up; like other converters, we
+take the frame of a .ply as rotated by 180 degrees about z. Files we write have this rotation in their node,
+and unchanged positions.
+
+Of glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) this reads what Gaussians need. Python
+libraries for glTF leave buffers to their users and check no bounds.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -33,27 +37,83 @@ from keyss.files.formats.common import (
     to_bytes,
     unit,
 )
-from keyss.files.formats.gltf import EXTENSION, Accessor, BufferView, Document, Mesh, Node, Primitive, values
 
+EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-_FLOAT, _BYTE, _ARRAY = 5126, 5121, 34962
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
-_COUNTS = (1, 3, 5, 7)  # coefficients of each degree
-_MAX_DEPTH = 64  # of nodes in nodes
-_MAX_PARTS = 64  # that show Gaussians
-_MIN_BYTES = 16  # that a Gaussian takes
+_MAX_DEPTH = 64  # of nested nodes
+_MAX_PARTS = 64  # primitives with Gaussians
+_MIN_BYTES = 16  # per Gaussian
+
+
+class _Accessor(msgspec.Struct, omit_defaults=True):
+    """Typed values in a buffer view."""
+
+    count: int
+    type: str
+    componentType: int
+    bufferView: int | None = None
+    byteOffset: int = 0
+    normalized: bool = False
+    min: list[float] = []
+    max: list[float] = []
+    sparse: dict[str, Any] | None = None
+
+
+class _BufferView(msgspec.Struct, omit_defaults=True):
+    buffer: int
+    byteOffset: int = 0
+    byteLength: int = 0
+    byteStride: int | None = None
+    target: int | None = None
+
+
+class _Node(msgspec.Struct, omit_defaults=True):
+    mesh: int | None = None
+    children: list[int] = []
+    matrix: list[float] | None = None
+    translation: list[float] | None = None
+    rotation: list[float] | None = None
+    scale: list[float] | None = None
+
+
+class _Primitive(msgspec.Struct, omit_defaults=True):
+    attributes: dict[str, int] = {}  # indices of accessors
+    mode: int = 4
+    extensions: dict[str, dict[str, Any]] = {}
+
+
+class _Mesh(msgspec.Struct):
+    primitives: list[_Primitive]
+
+
+class _Document(msgspec.Struct, omit_defaults=True):
+    """The parts of a glTF document that are used here."""
+
+    asset: dict[str, Any] = {}
+    extensionsUsed: list[str] = []
+    scene: int | None = None
+    scenes: list[dict[str, Any]] = []
+    nodes: list[_Node] = []
+    buffers: list[dict[str, Any]] = []
+    bufferViews: list[_BufferView] = []
+    accessors: list[_Accessor] = []
+    meshes: list[_Mesh] = []
 
 
 def read_glb(data: bytes) -> Gaussians:
     """All Gaussians of a file's scene, as one model in the frame of a .ply.
 
-    Raises InputError for a file without any, and for those that another extension compresses.
+    Raises InputError for a file without Gaussians or with compressed ones.
     """
     document, binary = _chunks(data)
     parts: list[Gaussians] = []
-    room = len(data) // _MIN_BYTES  # Gaussians; one that is shown twice counts twice
-    for placed, mesh in _placed(document):
+    room = len(data) // _MIN_BYTES  # Gaussians, counted once for each node that shows them
+    for to_scene, mesh in _placed(document):
         for primitive in mesh.primitives:
             if EXTENSION not in primitive.extensions:
                 continue
@@ -61,7 +121,7 @@ def read_glb(data: bytes) -> Gaussians:
             room -= len(model)
             if room < 0 or len(parts) == _MAX_PARTS:
                 raise InputError("damaged glTF: the same Gaussians over and over")
-            parts.append(_moved(model, placed))
+            parts.append(_moved(model, to_scene))
     if not parts:
         raise InputError(f"a glTF file without Gaussians: nothing in its scene has {EXTENSION}")
     degree = max(part.sh_degree for part in parts)
@@ -69,13 +129,13 @@ def read_glb(data: bytes) -> Gaussians:
 
 
 def write_glb(model: Gaussians) -> bytes:
-    """A model as a file, with colours for programs that know points only."""
+    """A model as a file, with colours for programs that only know points."""
     means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
     alphas = opacities(opacity_logits)
-    rgba = np.concatenate([colour_bytes(f_dc), to_bytes(alphas * 255)[:, None]], axis=1)
+    colors = np.concatenate([colour_bytes(f_dc), to_bytes(alphas * 255)[:, None]], axis=1)
     attributes = {
         "POSITION": means,
-        "COLOR_0": rgba,
+        "COLOR_0": colors,
         f"{EXTENSION}:ROTATION": np.roll(unit(quats), -1, axis=1),
         f"{EXTENSION}:SCALE": scales_of(log_scales),
         f"{EXTENSION}:OPACITY": alphas,
@@ -83,32 +143,38 @@ def write_glb(model: Gaussians) -> bytes:
     }
     names = _coefficients(model.sh_degree)
     attributes |= {name: rest[:, index] for index, name in enumerate(names[1:])}
-    document = Document(
+    views: list[_BufferView] = []
+    accessors: list[_Accessor] = []
+    binary = bytearray()
+    for name, array in attributes.items():
+        is_color = name == "COLOR_0"
+        content = array if is_color else array.astype("<f4")
+        views.append(_BufferView(0, len(binary), content.nbytes, target=_ARRAY_BUFFER))
+        kind = "SCALAR" if content.ndim == 1 else f"VEC{content.shape[1]}"
+        accessor = _Accessor(len(content), kind, _BYTE if is_color else _FLOAT, len(accessors))
+        accessor.normalized = is_color
+        if name == "POSITION":
+            accessor.min, accessor.max = means.min(axis=0).tolist(), means.max(axis=0).tolist()
+        accessors.append(accessor)
+        binary += content.tobytes()
+    settings = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance",
+        "projection": "perspective",
+    }
+    indices = {name: index for index, name in enumerate(attributes)}
+    document = _Document(
         asset={"version": "2.0", "generator": "keyss"},
         extensionsUsed=[EXTENSION],
         scene=0,
         scenes=[{"nodes": [0]}],
-        nodes=[Node(mesh=0, rotation=list(_TURN))],
+        nodes=[_Node(mesh=0, rotation=list(_TURN))],
+        buffers=[{"byteLength": len(binary)}],
+        bufferViews=views,
+        accessors=accessors,
+        meshes=[_Mesh([_Primitive(indices, _POINTS, {EXTENSION: settings})])],
     )
-    binary = bytearray()
-    for array in attributes.values():
-        content = array if array.dtype == np.uint8 else array.astype("<f4")
-        kind = {1: "SCALAR"}.get(content.ndim, f"VEC{content.shape[-1]}")
-        document.bufferViews.append(BufferView(0, len(binary), content.nbytes, target=_ARRAY))
-        accessor = Accessor(
-            len(content), kind, _FLOAT if array is not rgba else _BYTE, len(document.accessors)
-        )
-        accessor.normalized = array is rgba
-        if array is means:
-            accessor.min, accessor.max = means.min(axis=0).tolist(), means.max(axis=0).tolist()
-        document.accessors.append(accessor)
-        binary += content.tobytes()
-    settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    settings |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-    document.meshes = [
-        Mesh([Primitive({name: i for i, name in enumerate(attributes)}, 0, {EXTENSION: settings})])
-    ]
-    document.buffers = [{"byteLength": len(binary)}]
     text = msgspec.json.encode(document)
     text += b" " * (-len(text) % 4)
     size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)
@@ -116,65 +182,78 @@ def write_glb(model: Gaussians) -> bytes:
     return start + _CHUNK.pack(len(binary), _BIN) + bytes(binary)
 
 
-def _chunks(data: bytes) -> tuple[Document, bytes]:
-    """The JSON and the binary part of a file."""
+def _chunks(data: bytes) -> tuple[_Document, bytes]:
+    """The JSON and the binary chunk of a file."""
     if len(data) < _HEADER.size or not data.startswith(_MAGIC):
         raise InputError("not a .glb: it does not begin with glTF")
     _, version, size = _HEADER.unpack_from(data)
     if version != 2 or size > len(data):
         raise InputError("not a whole .glb of glTF 2.0")
-    found: list[bytes] = []
+    chunks: list[bytes] = []
     at = _HEADER.size
     for kind in (_JSON, _BIN):
         if at + _CHUNK.size > len(data):
-            raise InputError("not a whole .glb: a part is missing")
+            raise InputError("not a whole .glb: a chunk is missing")
         length, name = _CHUNK.unpack_from(data, at)
         at += _CHUNK.size
         if name != kind or at + length > len(data):
-            raise InputError("not a whole .glb: a part is missing, cut short, or out of place")
-        found.append(data[at : at + length])
+            raise InputError("not a whole .glb: a chunk is missing, cut short, or out of place")
+        chunks.append(data[at : at + length])
         at += length
     try:
-        return msgspec.json.decode(found[0], type=Document), found[1]
+        return msgspec.json.decode(chunks[0], type=_Document), chunks[1]
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"the JSON of the .glb makes no sense: {reason(error)}") from error
+        raise InputError(f"cannot parse the JSON of the .glb: {reason(error)}") from error
 
 
-def _placed(document: Document) -> Iterable[tuple[Doubles, Mesh]]:
+def _placed(document: _Document) -> Iterator[tuple[Doubles, _Mesh]]:
     """The meshes of the scene, each with the transform [4, 4] from its coordinates to the scene's."""
     try:
-        roots = (
-            document.scenes[document.scene or 0].get("nodes", [])
-            if document.scenes
-            else range(len(document.nodes))
-        )
-        left = [(index, np.eye(4), 0) for index in roots if isinstance(index, int)]
-        seen: set[int] = set()
-        while left:
-            index, above, depth = left.pop()
-            if index in seen or depth > _MAX_DEPTH or index < 0:
-                raise InputError("damaged glTF: its nodes are no tree")
-            seen.add(index)
+        roots = range(len(document.nodes))
+        if document.scenes:
+            roots = document.scenes[document.scene or 0].get("nodes", [])
+        stack = [(index, np.eye(4), 0) for index in roots if isinstance(index, int)]
+        visited: set[int] = set()
+        while stack:
+            index, above, depth = stack.pop()
+            if index in visited or depth > _MAX_DEPTH or index < 0:
+                raise InputError("damaged glTF: its nodes are not a tree")
+            visited.add(index)
             node = document.nodes[index]
-            here = above @ node.transform()
-            left += [(child, here, depth + 1) for child in node.children]
+            here = above @ _transform(node)
+            stack += [(child, here, depth + 1) for child in node.children]
             if node.mesh is not None:
                 yield here, document.meshes[node.mesh]
     except (IndexError, TypeError) as error:
         raise InputError("damaged glTF: it names a part that is not there") from error
 
 
-def _gaussians(document: Document, primitive: Primitive, binary: bytes) -> Gaussians:
+def _transform(node: _Node) -> Doubles:
+    """[4, 4] from a node's coordinates to its parent's."""
+    transform = np.eye(4)
+    try:
+        if node.matrix is not None:
+            transform = np.array(node.matrix, np.float64).reshape(4, 4).T
+        else:
+            rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1]).as_matrix()
+            transform[:3, :3] = rotation * np.array(node.scale or [1, 1, 1], np.float64).reshape(3)
+            transform[:3, 3] = node.translation or [0, 0, 0]
+    except ValueError as error:
+        raise InputError("damaged glTF: a node has no proper transform") from error
+    if not np.isfinite(transform).all():
+        raise InputError("damaged glTF: a node's transform is not finite")
+    return transform
+
+
+def _gaussians(document: _Document, primitive: _Primitive, binary: bytes) -> Gaussians:
     """The Gaussians of a primitive, in its own coordinates."""
     if "extensions" in primitive.extensions[EXTENSION]:
-        raise InputError(
-            "its Gaussians are compressed by another extension of glTF, which keyss does not read"
-        )
+        raise InputError("its Gaussians are compressed by another glTF extension, which keyss does not read")
 
     def attribute(name: str, width: int) -> Doubles:
         if name not in primitive.attributes:
             raise InputError(f"damaged glTF: its Gaussians have no {name}")
-        return values(document, primitive.attributes[name], width, binary)
+        return _values(document, primitive.attributes[name], width, binary)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in primitive.attributes)
     sh = [attribute(name, 3) for name in _coefficients(degree)]
@@ -191,11 +270,41 @@ def _gaussians(document: Document, primitive: Primitive, binary: bytes) -> Gauss
     return gaussians_of(means, wxyz, log_scales_of(scales), logits(alphas), sh[0], rest)
 
 
-def _moved(model: Gaussians, placed: Doubles) -> Gaussians:
-    """`model` from coordinates that `placed` takes to a scene with y up, to those of a .ply."""
+def _values(document: _Document, index: int, width: int, binary: bytes) -> Doubles:
+    """[N, width] the values of an accessor into the binary chunk."""
+    if not 0 <= index < len(document.accessors):
+        raise InputError("damaged glTF: it names an accessor that is not there")
+    accessor = document.accessors[index]
+    code = _COMPONENTS.get(accessor.componentType)
+    if accessor.sparse is not None or code is None or _WIDTHS.get(accessor.type) != width:
+        raise InputError(f"damaged glTF: expected an accessor of {width} numbers each")
+    if accessor.bufferView is None or not 0 <= accessor.bufferView < len(document.bufferViews):
+        raise InputError("damaged glTF: it names a buffer view that is not there")
+    view = document.bufferViews[accessor.bufferView]
+    if view.buffer != 0 or any("uri" in each for each in document.buffers[:1]):
+        raise InputError("expected a .glb that contains its data, found one that refers to other files")
+    dtype = np.dtype(code)
+    row = width * dtype.itemsize
+    stride = view.byteStride or row
+    start, end = view.byteOffset + accessor.byteOffset, view.byteOffset + view.byteLength
+    needed = (accessor.count - 1) * stride + row
+    is_sound = min(accessor.count, view.byteOffset, accessor.byteOffset) >= 0 and stride >= row
+    if not is_sound or (accessor.count and start + needed > min(end, len(binary))):
+        raise InputError("damaged glTF: an accessor exceeds its buffer view")
+    if accessor.count == 0:
+        return np.empty((0, width))
+    values = np.ndarray((accessor.count, width), dtype, binary, start, (stride, dtype.itemsize))
+    numbers = values.astype(np.float64)
+    if accessor.normalized and dtype.kind != "f":
+        numbers = np.maximum(numbers / np.iinfo(dtype).max, -1.0)
+    return numbers
+
+
+def _moved(model: Gaussians, to_scene: Doubles) -> Gaussians:
+    """`model` moved by `to_scene` into a scene with y up, then into the frame of a .ply."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_quat(_TURN).as_matrix().round()
-    whole = turn @ placed
+    whole = turn @ to_scene
     if np.array_equal(whole, np.eye(4)):
         return model
     with np.errstate(all="ignore"):
@@ -206,9 +315,7 @@ def _moved(model: Gaussians, placed: Doubles) -> Gaussians:
         rotation, translation = torch.from_numpy(whole[:3, :3] / scale), torch.from_numpy(whole[:3, 3].copy())
         moved = Similarity(scale, rotation, translation).apply_gaussians(model)
     except ValueError as error:
-        raise InputError(
-            "a glTF node does more to Gaussians than move, turn and scale them evenly"
-        ) from error
+        raise InputError("a glTF node transforms Gaussians by more than a similarity") from error
     parts = (moved.means, moved.quats, moved.log_scales, moved.sh)
     if not all(bool(each.isfinite().all()) for each in parts):
         raise InputError("NaN or infinite values in Gaussians of a glTF node")
@@ -217,4 +324,4 @@ def _moved(model: Gaussians, placed: Doubles) -> Gaussians:
 
 def _coefficients(degree: int) -> list[str]:
     """Names of the attributes of harmonics, in order."""
-    return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(degree + 1) for i in range(_COUNTS[d])]
+    return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(degree + 1) for i in range(2 * d + 1)]

@@ -1,4 +1,4 @@
-"""Points in groups: a tree that splits the worst group first, at the mean of its widest axis."""
+"""Groups points by a tree that splits the worst group first, at the mean of its widest axis."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Integers = npt.NDArray[np.int64]
 
 
 def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:
-    """At most `size` groups of `points` [N, D]: their indices in order of groups, and where each begins."""
+    """At most `size` groups of `points` [N, D]: indices [N] sorted by group, and where each group starts."""
     order = np.arange(len(points))
     heap = [(0.0, 0, len(points), *_widest(points, order, 0, len(points)))]
     heap[0] = (-heap[0][5], *heap[0][1:])
@@ -33,7 +33,7 @@ def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:
 
 
 def _compiled(function: Any) -> Any:
-    """Compiled at its first call, and kept where there is a folder to keep it in."""
+    """Compile at the first call, and cache the code if a cache folder is writable."""
     jit: Any = numba.njit  # typed in some versions only
     try:
         return jit(function, cache=True, nogil=True)
@@ -43,7 +43,7 @@ def _compiled(function: Any) -> Any:
 
 @_compiled
 def _widest(points: Any, order: Any, start: int, end: int) -> Any:
-    """(axis of the largest spread of a group, its mean there, squared error of the whole group)."""
+    """(axis of the largest spread of a group, mean along it, squared error of the group)."""
     dimensions = points.shape[1]
     sums, squares = np.zeros(dimensions), np.zeros(dimensions)
     for i in range(start, end):
@@ -59,7 +59,7 @@ def _widest(points: Any, order: Any, start: int, end: int) -> Any:
 
 @_compiled
 def _split(points: Any, order: Any, start: int, end: int, axis: int, mean: float) -> int:
-    """Sort a group into those at most `mean` and the others; where the others begin."""
+    """Partition a group at `mean` along `axis`; returns where the upper part starts."""
     low, high = start, end - 1
     while low <= high:
         if points[order[low], axis] <= mean:

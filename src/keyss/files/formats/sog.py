@@ -1,7 +1,7 @@
-"""SOG, PlayCanvas's format of images: version 2 is read and written.
+"""SOG, PlayCanvas's format that stores attributes as images: reads and writes version 2.
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/. `parse` and `serialise` turn
-files into codes and back; the archive and its images lie in `sog_bundle`.
+files into codes and back; `sog_bundle` handles the archive and its images.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
@@ -39,50 +39,49 @@ from keyss.files.formats.common import (
     to_bytes,
     unit,
 )
-from keyss.files.streams import StandardInput
 
-_FINEST = 65535  # a position's largest code
-_LARGEST = 252  # of the fourth byte of a quaternion: w, x, y or z is not stored
-_ROW = 64  # vectors of the palette in a row of pixels
+_MAX_POSITION = 65535  # the largest code of a position
+_LARGEST = 252  # plus the index (wxyz) of the component that is not stored: a quaternion's fourth byte
+_ROW = 64  # palette vectors in a row of pixels
 _MAX_LABELS = 65536
 
 
 @dataclass(frozen=True, eq=False)
 class SogCodes(Codes):
-    """All numbers of a file; see `dequantise` for their meaning."""
+    """All numbers of a file; `dequantise` decodes them."""
 
     mins: Doubles  # [3] smallest positions, as sign(x) ln(|x| + 1)
     maxs: Doubles  # [3] largest positions, likewise
     positions: Shorts  # [N, 3] in 65535ths between them
-    largest: Bytes  # [N] which of w, x, y, z (0 to 3) is not stored
-    rotations: Bytes  # [N, 3] the others, from -sqrt(1/2) to sqrt(1/2)
+    largest: Bytes  # [N] index of the component of wxyz that is not stored
+    rotations: Bytes  # [N, 3] the other components, from -sqrt(1/2) to sqrt(1/2)
     scale_codebook: Floats  # [256] log scales
     scales: Bytes  # [N, 3] indices into it
     color_codebook: Floats  # [256] f_dc
     colors: Bytes  # [N, 3] indices into it
     alphas: Bytes  # [N] opacities in 255ths
-    sh_codebook: Floats  # [256] harmonics; of a model without any [0]
+    sh_codebook: Floats  # [256] harmonics; [0] for degree 0
     palette: Bytes  # [P, K - 1, 3] indices into it
-    labels: Shorts  # [N] indices into the palette; of a model without harmonics 0
+    labels: Shorts  # [N] indices into the palette; 0 for degree 0
 
     def __len__(self) -> int:
         return len(self.positions)
 
 
 def parse(data: bytes) -> SogCodes:
-    """The codes of a .sog. Raises InputError for anything that is not a whole one of version 2."""
+    """The codes of a .sog. Raises InputError if it is not a complete SOG of version 2."""
     with bundle.opened(data) as archive:
         return parse_files(bundle.member(archive), len(data))
 
 
 def parse_files(file: Callable[[str], bytes], size: int) -> SogCodes:
-    """The codes of a meta.json and the images that it names; `file` gives their bytes, `size` in all."""
+    """The codes of a meta.json and its images. `file` reads one of them by name; `size` is their total."""
     meta = bundle.read_meta(file("meta.json"))
     n = meta.count
     check_count(n, size)
 
     def image(names: list[str], index: int = 0) -> Bytes:
-        """[N, 4] RGBA of the first pixels."""
+        """[N, 4] the first N pixels, RGBA."""
         return bundle.pixels(file(names[index]), n)
 
     low, high = image(meta.means.files), image(meta.means.files, 1)
@@ -157,7 +156,7 @@ def serialise(codes: SogCodes) -> bytes:
 
 
 def dequantise(codes: SogCodes) -> Gaussians:
-    """The model that codes stand for. Raises InputError where it is not finite."""
+    """Decode codes to a model. Raises InputError if it is not finite."""
     means = positions_of(codes, codes.positions)
     rotations = (codes.rotations / 255 * 2 - 1) * np.sqrt(0.5)
     palette = codes.sh_codebook[codes.palette] if codes.palette.size else np.empty((1, 0, 3), np.float32)
@@ -172,20 +171,21 @@ def dequantise(codes: SogCodes) -> Gaussians:
 
 
 def positions_of(codes: SogCodes, levels: npt.NDArray[Any]) -> Doubles:
-    """[N, 3] world positions that `levels`, 0 to 65535, stand for in a file; they need not be integers."""
+    """[N, 3] world positions for the codes `levels`, 0 to 65535, which may be fractional."""
     extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
-    logs = codes.mins + extent * (levels / _FINEST)
+    logs = codes.mins + extent * (levels / _MAX_POSITION)
     with np.errstate(over="ignore"):
         found: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
     return found
 
 
 def quantise(model: Gaussians) -> SogCodes:
-    """The codes of a model in its order, with half as many palette vectors or more, up to 65,536."""
+    """The codes of a model, in its order; the palette has N / 2 to N vectors, at most 65,536."""
     means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
     n, k = rest.shape[:2]
     logs = np.copysign(np.log1p(np.abs(means.astype(np.float64))), means)
     mins, maxs = logs.min(axis=0), logs.max(axis=0)
+    positions = (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _MAX_POSITION
     largest, others = smallest_three(unit(quats))
     scale_codebook, color_codebook = codebook_of(log_scales), codebook_of(f_dc)
     sh_codebook, palette, labels = (
@@ -201,7 +201,7 @@ def quantise(model: Gaussians) -> SogCodes:
     return SogCodes(
         mins=mins,
         maxs=maxs,
-        positions=to_bytes((logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _FINEST, _FINEST),
+        positions=to_bytes(positions, _MAX_POSITION),
         largest=largest,
         rotations=to_bytes((others * np.sqrt(2) + 1) / 2 * 255),
         scale_codebook=scale_codebook,
@@ -221,28 +221,24 @@ def read_sog(data: bytes) -> CodedGaussians:
     return CodedGaussians.of(dequantise(codes), codes)
 
 
-def read_sog_folder(meta: Path | StandardInput) -> Gaussians:
-    """The model of a meta.json and the images beside it. Raises InputError."""
-    try:
-        if not isinstance(meta, Path):
-            raise InputError("expected a meta.json with its images beside it")
-        size = sum(each.stat().st_size for each in meta.parent.glob("*.webp"))
-        return dequantise(parse_files(bundle.beside(meta), size))
-    except InputError as error:
-        raise InputError(f"{meta}: {error}") from error
-    except OSError as error:
-        raise InputError(f"cannot read {meta}: {error.strerror or error}") from error
+def read_sog_folder(file: BinaryIO) -> Gaussians:
+    """The model of an open meta.json and the images beside it. Raises InputError."""
+    meta = Path(getattr(file, "name", ""))
+    if not meta.is_file():
+        raise InputError("expected a meta.json with its images beside it")
+    size = sum(image.stat().st_size for image in meta.parent.glob("*.webp"))
+    return dequantise(parse_files(bundle.beside(meta), size))
 
 
 def write_sog(model: Gaussians) -> bytes:
-    """A model as a .sog, sorted so that its images pack well."""
+    """A model as a .sog, sorted so that its images compress well."""
     if isinstance(model, CodedGaussians) and isinstance(model.codes, SogCodes):
         return serialise(model.codes)
     return serialise(quantise(in_morton_order(model)))
 
 
 def _codebook(values: list[float]) -> Floats:
-    """[256] numbers. Raises InputError for more, and for what is not finite; fewer are followed by 0."""
+    """[256] numbers, padded with 0. Raises InputError for more than 256, and if they are not finite."""
     if len(values) > SIZE:
         raise InputError(f"damaged SOG: expected codebooks of at most {SIZE} numbers, found {len(values):,}")
     with np.errstate(over="ignore"):
@@ -253,13 +249,13 @@ def _codebook(values: list[float]) -> Floats:
 
 
 def _joined(low: Bytes, high: Bytes) -> Shorts:
-    """16-bit integers of their bytes."""
+    """16-bit integers from their low and high bytes."""
     found: Shorts = low.astype(np.uint16) | (high.astype(np.uint16) << np.uint16(8))
     return found
 
 
 def _rgba(colors: npt.NDArray[Any], alpha: Bytes | None = None) -> Bytes:
-    """[M, 4] pixels of colours [M, 3], 0 to 255, and an alpha [M], by default 255."""
+    """[M, 4] pixels from colours [M, 3], 0 to 255, and an alpha [M], by default 255."""
     found = np.full((len(colors), 4), 255, np.uint8)
     found[:, :3] = colors
     if alpha is not None:

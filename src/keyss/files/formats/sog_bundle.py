@@ -1,4 +1,4 @@
-"""The archive of a SOG: meta.json and lossless WebP images in a ZIP archive, all of it from strangers."""
+"""The archive of a SOG: a ZIP of meta.json and lossless WebP images. Its content is untrusted."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from keyss.files.streams import MAX_BYTES
 
 _MAX_META_BYTES = 1 << 20
 _MAX_MEMBERS = 64
-_SMALL_IMAGE = 1 << 16  # pixels; larger ones may have four times the pixels that are needed
-_DATE = (1980, 1, 1, 0, 0, 0)  # so that equal models make equal files
+_SMALL_IMAGE = 1 << 16  # pixels; larger images may have at most four times the pixels needed
+_DATE = (1980, 1, 1, 0, 0, 0)  # equal models make equal files
 
-
-# What zipfile raises for archives that are damaged, or packed in ways that it does not know.
+# Raised by zipfile for archives that are damaged or use unknown compression.
 _BROKEN = (
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError),
     *(ValueError, NotImplementedError, RuntimeError, OverflowError),
@@ -33,20 +32,20 @@ _BROKEN = (
 
 
 class Images(msgspec.Struct):
-    """Names of images."""
+    """Names of image files."""
 
     files: list[str]
 
 
 class Book(msgspec.Struct):
-    """Images of indices into numbers."""
+    """Images of indices into a codebook."""
 
     codebook: list[float]
     files: list[str]
 
 
 class Means(msgspec.Struct):
-    """Positions: bounds [3], and images of their low and their high bytes."""
+    """Positions: bounds [3], and images of the low and high bytes."""
 
     mins: list[float]
     maxs: list[float]
@@ -54,7 +53,7 @@ class Means(msgspec.Struct):
 
 
 class Harmonics(msgspec.Struct):
-    """A palette of `count` vectors, and which one each Gaussian has."""
+    """A palette of `count` vectors, and each Gaussian's index into it."""
 
     count: int
     bands: int
@@ -75,24 +74,24 @@ class Meta(msgspec.Struct, omit_defaults=True):
 
 
 class _Version(msgspec.Struct):
-    version: int = 1  # which had no such field
+    version: int = 1  # without the field
 
 
 def read_meta(data: bytes) -> Meta:
-    """A meta.json with as many names and bounds as are needed. Raises InputError."""
+    """A meta.json with all file names and bounds. Raises InputError."""
     try:
         version = msgspec.json.decode(data, type=_Version).version
         if version != 2:
             raise InputError(f"expected SOG of version 2, found {version}")
         meta = msgspec.json.decode(data, type=Meta)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"the meta.json of a SOG makes no sense: {reason(error)}") from error
+        raise InputError(f"cannot parse the meta.json of a SOG: {reason(error)}") from error
     needed = [(meta.means.files, 2), (meta.scales.files, 1), (meta.quats.files, 1), (meta.sh0.files, 1)]
     needed += [(meta.shN.files, 2)] if meta.shN else []
     if any(len(files) < count for files, count in needed):
         raise InputError("the meta.json of a SOG names fewer images than it needs")
     if not len(meta.means.mins) == len(meta.means.maxs) == 3:
-        raise InputError("the meta.json of a SOG gives no bounds of three coordinates")
+        raise InputError("the meta.json of a SOG has no bounds of three coordinates")
     return meta
 
 
@@ -108,21 +107,19 @@ def opened(data: bytes) -> zipfile.ZipFile:
 
 
 def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
-    """What gives a file of an archive by its name; images, which are packed already, no larger than it is."""
+    """A function that reads a file of the archive by name, unpacked to at most twice the archive's size."""
     size = sum(info.compress_size for info in archive.infolist())
 
     def read(name: str) -> bytes:
         try:
             info = archive.getinfo(name)
-            most = max(_MAX_META_BYTES, 2 * size)
-            if info.file_size > most:
+            limit = max(_MAX_META_BYTES, 2 * size)
+            if info.file_size > limit:
                 raise InputError(f"damaged SOG: {name[:80]!r} unpacks to {info.file_size:,} bytes")
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise InputError(
-                    f"damaged SOG: {name[:80]!r} is packed by neither of the ways that readers know"
-                )
+                raise InputError(f"damaged SOG: {name[:80]!r} has an unsupported ZIP compression")
             with archive.open(info) as file:
-                return file.read(most)
+                return file.read(limit)
         except KeyError as error:
             raise InputError(
                 f"not a SOG: there is no {name[:80]!r} in the archive; unpack it if it is another"
@@ -134,7 +131,7 @@ def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
 
 
 def beside(meta: Path) -> Callable[[str], bytes]:
-    """What gives the files beside a meta.json; names do not lead out of its folder."""
+    """A function that reads a file of the meta.json's folder by name."""
 
     def read(name: str) -> bytes:
         path = meta if name == "meta.json" else meta.parent / name
@@ -146,7 +143,7 @@ def beside(meta: Path) -> Callable[[str], bytes]:
 
 
 def packed(files: Mapping[str, bytes]) -> bytes:
-    """An archive of files, not compressed once more."""
+    """An archive of files, which are compressed already."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():
@@ -155,21 +152,22 @@ def packed(files: Mapping[str, bytes]) -> bytes:
 
 
 def pixels(data: bytes, count: int, width: int | None = None) -> Bytes:
-    """[count, 4] RGBA of the first pixels of a lossless WebP; `width`: what it has to have.
+    """[count, 4] RGBA of the first pixels of a lossless WebP, which must have this `width` if given.
 
-    Its size is looked at before anything is decoded. Raises InputError.
+    Checks the size before decoding. Raises InputError.
     """
-    found = _size(data)
-    if found[0] * found[1] < count or (width is not None and found[0] != width):
-        raise InputError(f"damaged SOG: expected an image of {count:,} pixels, found {found[0]} x {found[1]}")
-    if found[0] * found[1] > max(_SMALL_IMAGE, 4 * count):
-        raise InputError(f"damaged SOG: an image of {found[0]} x {found[1]} for {count:,} pixels")
+    size = _size(data)
+    area = size[0] * size[1]
+    if area < count or (width is not None and size[0] != width):
+        raise InputError(f"damaged SOG: expected an image of {count:,} pixels, found {size[0]} x {size[1]}")
+    if area > max(_SMALL_IMAGE, 4 * count):
+        raise InputError(f"damaged SOG: an image of {size[0]} x {size[1]} for {count:,} pixels")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
-                if image.size != found:
-                    raise InputError("damaged SOG: an image of two sizes")
+                if image.size != size:
+                    raise InputError("damaged SOG: an image with two sizes")
                 decoded = np.asarray(image.convert("RGBA")).reshape(-1, 4)
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
         raise InputError(f"damaged SOG: an image cannot be read: {reason(error)}") from error
@@ -177,7 +175,7 @@ def pixels(data: bytes, count: int, width: int | None = None) -> Bytes:
 
 
 def webp(values: Bytes, width: int, height: int) -> bytes:
-    """[M, 4] RGBA as the first pixels of a lossless WebP; colours under an alpha of 0 are kept."""
+    """[M, 4] RGBA as the first pixels of a lossless WebP, which keeps colours where alpha is 0."""
     canvas = np.zeros((height * width, 4), np.uint8)
     canvas[: len(values)] = values
     data = io.BytesIO()
@@ -187,10 +185,10 @@ def webp(values: Bytes, width: int, height: int) -> bytes:
 
 
 def _size(data: bytes) -> tuple[int, int]:
-    """Width and height in pixels, of the header of a lossless WebP.
+    """Width and height in pixels from the header of a lossless WebP.
 
-    https://developers.google.com/speed/webp/docs/riff_container. Pillow allocates a canvas when it opens
-    a file.
+    https://developers.google.com/speed/webp/docs/riff_container. Pillow is not asked, since it allocates a
+    canvas when it opens a file.
     """
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise InputError("damaged SOG: an image is not WebP")

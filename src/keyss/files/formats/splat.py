@@ -1,7 +1,7 @@
 """The .splat of antimatter15: 32 bytes for each Gaussian, no header, no harmonics.
 
 https://github.com/antimatter15/splat. Positions and scales are floats; colours, opacity and rotation are
-bytes. Colours outside of 0 to 1, which f_dc may stand for, are cut.
+bytes. Colours are clipped to 0 to 1.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def read_splat(data: bytes) -> Gaussians:
     """The model in a file, of SH degree 0. Raises InputError."""
     if not data or len(data) % _ROW.itemsize:
         raise InputError(
-            f"not a whole .splat: expected 32 bytes for each Gaussian, found {len(data):,} in all"
+            f"not a whole .splat: expected 32 bytes for each Gaussian, found {len(data):,} in total"
         )
     rows = np.frombuffer(data, _ROW)
     return gaussians_of(
@@ -46,7 +46,7 @@ def read_splat(data: bytes) -> Gaussians:
 
 
 def write_splat(model: Gaussians) -> bytes:
-    """A model as a file, those first that cover most: viewers show what has been loaded."""
+    """A model as a file, the most visible Gaussians first, as viewers show a file while it loads."""
     means, quats, log_scales, opacity_logits, f_dc, _ = arrays_of(model)
     size = np.exp(log_scales.astype(np.float64).sum(axis=1))
     order = np.argsort(-opacities(opacity_logits) * size, kind="stable")

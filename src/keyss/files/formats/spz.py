@@ -1,8 +1,8 @@
-"""SPZ, Niantic's compressed format: versions 2, 3 and 4 are read, 3 and 4 written.
+"""SPZ, Niantic's compressed format: reads versions 2, 3 and 4, writes 3 and 4.
 
-https://github.com/nianticlabs/spz. `parse` and `serialise` turn bytes into codes and back; files lie in
-`spz_container`. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward (RDF): `quantise`
-and `dequantise` turn models by 180 degrees about x, as the format's own library does.
+https://github.com/nianticlabs/spz. `parse` and `serialise` turn bytes into codes and back;
+`spz_container` packs them. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward (RDF):
+`quantise` and `dequantise` rotate models by 180 degrees about x, like Niantic's library.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from keyss.files.formats.common import (
 )
 from keyss.files.formats.spz_container import Header, pack, unpack
 
-VERSION = 3  # with 10-bit rotations, and read by more programs than the newer 4
-_FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as the format's own library writes
-_MAX = 2**23 - 1  # of a position's code
-_COLOR_SCALE = 0.15  # f_dc times this, plus 0.5, is 0 to 1
-_MAGNITUDE = 2**9 - 1  # a part of a rotation has a sign and 9 bits
+VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
+_FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library
+_MAX = 2**23 - 1  # the largest code of a position
+_COLOR_SCALE = 0.15  # 0.15 f_dc + 0.5 is within 0 to 1
+_MAGNITUDE = 2**9 - 1  # a component of a rotation has a sign and 9 bits
 
-# Signs of the harmonics of degrees 1 to 3 where y and z change theirs.
+# Signs of the harmonics of degrees 1 to 3 under (x, -y, -z).
 _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
 _MEAN_SIGNS = np.array([1, -1, -1], dtype=np.float32)
 _QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
@@ -46,28 +46,27 @@ _QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
 
 @dataclass(frozen=True, eq=False)
 class SpzCodes(Codes):
-    """All integers of a file; see `dequantise` for their meaning."""
+    """All integers of a file; `dequantise` decodes them."""
 
     version: int  # 2, 3 or 4
     fractional_bits: int  # 0 to 24: positions are multiples of 2^-fractional_bits world units
-    flags: int  # 1: trained antialiased; 2: `extensions` are there
+    flags: int  # 1: trained antialiased; 2: has `extensions`
     positions: npt.NDArray[np.int32]  # [N, 3] -2^23 to 2^23 - 1
     alphas: Bytes  # [N] opacities in 255ths
     colors: Bytes  # [N, 3] f_dc in steps of 1/38.25; 127.5 is 0
     scales: Bytes  # [N, 3] log scales in 16ths from -10 on
-    largest: Bytes  # [N] which of x, y, z, w (0 to 3) is not stored; 3 throughout in version 2
-    rotations: (
-        Shorts  # [N, 3] the others: 512 (negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
-    )
+    largest: Bytes  # [N] index of the component of xyzw that is not stored; always 3 in version 2
+    # [N, 3] the other components: 512 (negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
+    rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
-    extensions: bytes = b""  # kept as they are
+    extensions: bytes = b""  # kept, not parsed
 
     def __len__(self) -> int:
         return len(self.positions)
 
 
 def parse(data: bytes) -> SpzCodes:
-    """The codes of a file. Raises InputError for anything that is not a whole SPZ of version 2, 3 or 4."""
+    """The codes of a file. Raises InputError if it is not a complete SPZ of version 2, 3 or 4."""
     header, sections = unpack(data)
     n = header.count
     triples = sections[0].reshape(n, 3, 3).astype(np.int32)
@@ -95,7 +94,7 @@ def parse(data: bytes) -> SpzCodes:
 
 
 def serialise(codes: SpzCodes) -> bytes:
-    """A file of the codes, of the version that they name."""
+    """A file of the codes, of their version."""
     n = len(codes)
     fixed = codes.positions.astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
     if codes.version == 2:
@@ -111,7 +110,7 @@ def serialise(codes: SpzCodes) -> bytes:
 
 
 def dequantise(codes: SpzCodes) -> Gaussians:
-    """The model that codes stand for, in the frame of a .ply."""
+    """Decode codes to a model in the frame of a .ply."""
     means = np.ldexp(codes.positions.astype(np.float64), -codes.fractional_bits) * _MEAN_SIGNS
     if codes.version == 2:
         xyz = codes.rotations / 127.5 - 1
@@ -133,11 +132,10 @@ def dequantise(codes: SpzCodes) -> Gaussians:
 def quantise(
     model: Gaussians, *, version: int = VERSION, sh1_bits: int = 5, sh_rest_bits: int = 4
 ) -> SpzCodes:
-    """The codes nearest to a model, its order kept.
+    """The codes nearest to a model, in its order.
 
-    `sh1_bits`, `sh_rest_bits`: how many of the 8 bits of harmonics are used, of degree 1 and of the others,
-    1 to 8; the defaults are those of the format's own library. Raises OutputError for positions beyond
-    8 million world units.
+    `sh1_bits`, `sh_rest_bits`: precision of harmonics of degree 1 and of the others, 1 to 8 bits, by default
+    that of Niantic's library. Raises OutputError for positions beyond 8 million world units.
     """
     means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
     bits = _fractional_bits(means)
@@ -171,7 +169,7 @@ def write_spz(model: Gaussians) -> bytes:
 
 
 def _fractional_bits(means: Floats) -> int:
-    """The usual number of them, or as many as positions leave room for."""
+    """The default, or as many as the largest position leaves."""
     extent = float(np.abs(means).max())
     if not extent < _MAX:
         raise OutputError(
@@ -181,7 +179,7 @@ def _fractional_bits(means: Floats) -> int:
 
 
 def _quantised_harmonics(rest: Floats, sh1_bits: int, sh_rest_bits: int) -> Bytes:
-    """[N, K - 1, 3] codes on a lattice that leaves lower bits alike, which packs better."""
+    """[N, K - 1, 3] codes whose unused low bits are constant, which compresses better."""
     signed = rest * _SH_SIGNS[: rest.shape[1], None]
     codes = rounded(signed.astype(np.float64) * 128) + 128
     step = np.where(np.arange(rest.shape[1]) < 3, 2 ** (8 - sh1_bits), 2 ** (8 - sh_rest_bits))[:, None]

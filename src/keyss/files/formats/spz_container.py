@@ -1,4 +1,4 @@
-"""The container of an SPZ: a header and six sections of bytes, packed by gzip or, from version 4 on, zstd."""
+"""The container of an SPZ: a header and six byte sections, compressed by gzip or, in version 4, zstd."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from keyss.core.errors import InputError
 from keyss.files.formats.common import Bytes, check_count, check_sh_degree, reason
 
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
-EXTENSIONS = 2  # the flag that there are some
+EXTENSIONS = 2  # flag: the file has extensions
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
 _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
-_ENTRY = struct.Struct("<QQ")  # of the table: bytes packed and unpacked
-_ZSTD_LEVEL = 12  # as the format's own library
+_ENTRY = struct.Struct("<QQ")  # of the table: compressed and uncompressed bytes
+_ZSTD_LEVEL = 12  # as in Niantic's library
 _ZSTD_WINDOW = 1 << 27
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of itself."""
+    """The header fields of all versions."""
 
     version: int
     count: int
@@ -39,7 +39,7 @@ class Header:
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of positions, alphas, colours, scales, rotations and harmonics."""
+        """Bytes of the sections: positions, alphas, colours, scales, rotations and harmonics."""
         rotation = 3 if self.version == 2 else 4
         return [self.count * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
 
@@ -78,9 +78,9 @@ def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
         if version not in (2, 3):
             raise InputError(f"expected SPZ of version 2 or 3 in gzip data, found {version}")
         header = _checked(Header(version, count, degree, bits, flags, b""), len(data))
-        most = sum(header.sizes) + _MAX_EXTENSION_BYTES
-        body = stream.decompress(stream.unconsumed_tail, most)
-        if not stream.eof:  # gzip's checksum comes last, and is looked at then
+        limit = sum(header.sizes) + _MAX_EXTENSION_BYTES
+        body = stream.decompress(stream.unconsumed_tail, limit)
+        if not stream.eof:  # zlib checks the trailing checksum in a further call
             body += stream.decompress(stream.unconsumed_tail, 1)
     except zlib.error as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
@@ -119,7 +119,7 @@ def _unpack_zstd(data: bytes) -> tuple[Header, list[Bytes]]:
 
 
 def _zstd(packed: bytes, size: int) -> Bytes:
-    """[size] the bytes of a stream, however many it says that there are."""
+    """[size] the first bytes of a stream. Raises InputError if there are fewer."""
     try:
         with zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW).stream_reader(packed) as reader:
             body = reader.read(size)
