@@ -18,15 +18,17 @@ from keyss.rendering.cpu.layout import (
     X,
     Y,
 )
-from keyss.rendering.cpu.rasterization import Drawing
+from keyss.rendering.cpu.rasterization import Rendering
 
 import numba
 import numpy as np
 
 
-def blended_pairs(drawing: Drawing, width: int, height: int) -> int:
+def blended_pairs(rendering: Rendering, width: int, height: int) -> int:
     """The pairs that add to a pixel: alpha of 1/255 or more, before the pixel has stopped."""
-    return int(_count(drawing.footprints, drawing.tile_starts, drawing.entries, drawing.ends, width, height))
+    return int(
+        _count(rendering.footprints, rendering.tile_starts, rendering.entries, rendering.ends, width, height)
+    )
 
 
 @numba.njit(error_model="numpy")  # type: ignore[misc]

@@ -153,11 +153,11 @@ class TestOutputs:
         assert_refused(said, 2, "is the input")
         assert listing(tmp_path) == before
 
-    @pytest.mark.parametrize("name", ["x.lcc", "meta.json"])
     def test_formats_that_are_only_read_are_refused_before_any_work(
-        self, keyss: Run, files: Path, tmp_path: Path, name: str
+        self, keyss: Run, files: Path, tmp_path: Path
     ) -> None:
-        arguments = ("reveal", tmp_path / "nothing.ply", "--key-file", files / "key", "-o", tmp_path / name)
+        out = tmp_path / "meta.json"
+        arguments = ("reveal", tmp_path / "nothing.ply", "--key-file", files / "key", "-o", out)
         assert_refused(keyss(*arguments), 2, "expected a name that ends in .compressed.ply, .ply, .spz, ")
         assert listing(tmp_path) == {}
 

@@ -24,7 +24,7 @@ from keyss.measure.leaks.views import (
     outliers,
     rescaled,
 )
-from keyss.rendering.contributions import contributions
+from keyss.rendering import contributions
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
 ATTRIBUTES: tuple[Attribute, ...] = ("quaternion length", "scale", "SH energy")

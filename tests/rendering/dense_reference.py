@@ -63,8 +63,6 @@ def dense_rasterization(
     near_plane: float = 0.01,
     eps2d: float = 0.3,
     shifts: Tensor | None = None,
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
     margins: Margins | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Image [H, W, D] and alpha [H, W] of one camera.
@@ -93,35 +91,21 @@ def dense_rasterization(
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
     half = jacobian @ rotation @ rotation_matrices(quats[order]) @ torch.diag_embed(scales[order])
-    sharp = half @ half.mT
-    covariance = sharp + eps2d * torch.eye(2, dtype=means.dtype)
+    covariance = half @ half.mT + eps2d * torch.eye(2, dtype=means.dtype)
     opacities = opacities[order]
-    if rasterize_mode == "antialiased":
-        opacities = opacities * (torch.linalg.det(sharp) / torch.linalg.det(covariance)).sqrt()
-    depth = in_camera[order, 2:]
-    channels, background = {
-        "RGB": lambda: (colors[order], background),
-        "D": lambda: (depth, background.new_zeros(1)),
-        "RGB+D": lambda: (
-            torch.cat([colors[order], depth], -1),
-            torch.cat([background, background.new_zeros(1)]),
-        ),
-    }[render_mode.replace("ED", "D")]()
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     found: Margins | None = None if margins is None else {}
     image, alpha = dense_blending(
         centres,
         torch.linalg.inv(covariance),
         opacities,
-        channels,
+        colors[order],
         width,
         height,
         background,
         None if shifts is None else shifts[order],
         found,
     )
-    if render_mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alpha[..., None].clamp_min(1e-10)], -1)
 
     if margins is not None and found is not None:
         z_all, infinity = in_camera[:, 2], torch.full_like(in_camera[:, 2], torch.inf)

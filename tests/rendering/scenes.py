@@ -12,7 +12,8 @@ from torch import Tensor
 
 from keyss.rendering import rasterization
 
-DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "backgrounds")
+CAMERAS = ("viewmats", "Ks")
 
 
 @dataclass
@@ -30,35 +31,34 @@ class Scene:
     height: int
     backgrounds: Tensor
     sh_degree: int | None
-    render_mode: str = "RGB"
-    rasterize_mode: str = "classic"
-    near_plane: float = 2.0**-6  # a float32, as the kernels compare depths with one
+    near_plane: float = 2.0**-6  # exact in float32, which the kernels use
 
     def __post_init__(self) -> None:
         self.round()
 
     def round(self) -> None:
         """Round every tensor to the nearest float32 numbers."""
-        for name in (*DIFFERENTIABLE, "Ks"):
+        for name in (*DIFFERENTIABLE, *CAMERAS):
             setattr(self, name, getattr(self, name).float().double())
 
     def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-        """Fresh copies of all differentiable inputs, each a leaf that wants its gradient."""
+        """Fresh copies of all differentiable inputs, each a leaf that requires its gradient."""
         return {name: getattr(self, name).to(dtype).clone().requires_grad_() for name in DIFFERENTIABLE}
 
     def settings(self) -> dict[str, Any]:
         """The keyword arguments that are not tensors."""
-        names = ("width", "height", "sh_degree", "render_mode", "rasterize_mode", "near_plane")
+        names = ("width", "height", "sh_degree", "near_plane")
         return {name: getattr(self, name) for name in names}
 
     def draw(self, leaves: dict[str, Tensor], **changes: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """`rasterization` of the leaves."""
-        return rasterization(**{**leaves, "Ks": self.Ks.to(leaves["means"]), **self.settings(), **changes})
+        cameras = {name: getattr(self, name).to(leaves["means"]) for name in CAMERAS}
+        return rasterization(**{**cameras, **leaves, **self.settings(), **changes})
 
     def results(self, leaves: dict[str, Tensor] | None = None, **changes: Any) -> dict[str, Tensor]:
         """Everything that comes out: images, alphas, meta and every gradient of a fixed, random loss."""
         leaves = self.leaves() if leaves is None else leaves
-        images, alphas, meta = self.draw(leaves, absgrad=True, **changes)
+        images, alphas, meta = self.draw(leaves, **changes)
         meta["means2d"].retain_grad()
         generator = torch.Generator().manual_seed(1)
         weights = [torch.randn(t.shape, generator=generator).to(t.device) for t in (images, alphas)]
@@ -66,19 +66,18 @@ class Scene:
         found = {"images": images, "alphas": alphas, "radii": meta["radii"], "depths": meta["depths"]}
         found["means2d"] = meta["means2d"]
         found["gradient of means2d"] = meta["means2d"].grad
-        found["absgrad"] = meta["means2d"].absgrad
-        for name, leaf in leaves.items():
-            # None for what has no part in the picture, as the colours where only depths are drawn.
+        for name in DIFFERENTIABLE:
+            leaf = leaves[name]
             found[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
         return {name: tensor.detach() for name, tensor in found.items()}
 
     def dense_arguments(self, leaves: dict[str, Tensor], camera: int) -> dict[str, Any]:
         """The arguments of `dense_rasterization` for one of the cameras."""
         arguments: dict[str, Any] = {**leaves, **self.settings()}
-        viewmats, backgrounds = arguments.pop("viewmats"), arguments.pop("backgrounds")
+        backgrounds = arguments.pop("backgrounds")
         return {
             **arguments,
-            "viewmat": viewmats[camera],
+            "viewmat": self.viewmats[camera],
             "K": self.Ks[camera],
             "background": backgrounds[camera],
         }
@@ -92,8 +91,6 @@ def random_scene(
     cameras: int = 1,
     sh_degree: int | None = 3,
     channels: int = 3,
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
     distance: float = 4.0,
     spread: float = 1.0,
     size: float = 0.1,
@@ -129,35 +126,7 @@ def random_scene(
         height=height,
         backgrounds=uniform(cameras, channels),
         sh_degree=sh_degree,
-        render_mode=render_mode,
-        rasterize_mode=rasterize_mode,
     )
-
-
-def scene_of_modes(colors: int | str, render_mode: str, rasterize_mode: str) -> Scene:
-    """A random scene of so many channels, or of the SH degree "degree 0" to "degree 3"."""
-    modes = {"render_mode": render_mode, "rasterize_mode": rasterize_mode}
-    if isinstance(colors, str):
-        return with_backdrop(random_scene(count=40, sh_degree=int(colors[-1]), seed=30, **modes))
-    return with_backdrop(random_scene(count=40, sh_degree=None, channels=colors, seed=31, **modes))
-
-
-COLORS = ("degree 0", "degree 1", "degree 2", "degree 3", 1, 2, 3, 5, 32)
-
-
-def with_backdrop(scene: Scene) -> Scene:
-    """The scene with one large Gaussian behind everything.
-
-    The expected depth divides by alpha, which float32 knows to 6e-8 only: behind the last faint rim of a
-    Gaussian, alpha is 0.004, and the quotient would be right to 1e-5 at best.
-    """
-    backdrop: dict[str, Any] = {}
-    for name, value in (("means", (-1.0, 0.0, 3.0)), ("quats", (1.0, 0, 0, 0)), ("scales", (8.0, 8.0, 0.1))):
-        row = torch.tensor([value], dtype=torch.float64)
-        backdrop[name] = torch.cat([getattr(scene, name), row])
-    backdrop["opacities"] = torch.cat([scene.opacities, scene.opacities.new_full((1,), 0.7)])
-    backdrop["colors"] = torch.cat([scene.colors, scene.colors[:1]])
-    return replace(scene, **backdrop)
 
 
 def opaque_walls() -> Scene:
@@ -167,12 +136,9 @@ def opaque_walls() -> Scene:
 
 
 def opaque_walls_of_features() -> Scene:
-    """Pixels that stop early, and alphas at the clamp, with many channels and the depth."""
-    features = random_scene(count=80, sh_degree=None, channels=5, render_mode="RGB+D")
-    wall = opaque_walls()
-    return replace(
-        wall, colors=features.colors, backgrounds=features.backgrounds, sh_degree=None, render_mode="RGB+D"
-    )
+    """Pixels that stop early, and alphas at the clamp, with many channels."""
+    features = random_scene(count=80, sh_degree=None, channels=5)
+    return replace(opaque_walls(), colors=features.colors, backgrounds=features.backgrounds, sh_degree=None)
 
 
 def coincident(**changes: Any) -> Scene:
@@ -185,13 +151,12 @@ def coincident(**changes: Any) -> Scene:
     )
 
 
-def needles(**changes: Any) -> Scene:
+def needles() -> Scene:
     """Long and thin, in all directions and along the rows: the exponential recurrence at its limit."""
-    scene = random_scene(count=60, width=70, height=80, seed=2, **changes)
+    scene = random_scene(count=60, width=70, height=80, seed=2)
     half_turns = torch.linspace(-0.3, 0.3, 30).double() / 2
     scene.quats[:30] = torch.stack([half_turns.cos(), 0 * half_turns, 0 * half_turns, half_turns.sin()], -1)
-    thickness = 0.01 if scene.rasterize_mode == "antialiased" else 0.001
-    return replace(scene, scales=torch.tensor([0.5, thickness, thickness]).expand(60, 3))
+    return replace(scene, scales=torch.tensor([0.5, 0.001, 0.001]).expand(60, 3))
 
 
 def specks() -> Scene:
@@ -244,26 +209,6 @@ SCENES: dict[str, Callable[[], Scene]] = {
     ),
     "5 channels": lambda: random_scene(sh_degree=None, channels=5, seed=19),
     "32 channels": lambda: random_scene(sh_degree=None, channels=32, seed=14),
-    "depth": lambda: around_the_camera(render_mode="D"),
-    "expected depth": lambda: with_backdrop(random_scene(render_mode="ED", seed=15)),
-    "colour and depth": lambda: random_scene(render_mode="RGB+D", seed=16),
-    "colour and expected depth": lambda: with_backdrop(
-        random_scene(sh_degree=1, render_mode="RGB+ED", seed=17)
-    ),
-    "antialiased": lambda: random_scene(size=0.03, rasterize_mode="antialiased", seed=18),
-    "antialiased needles": lambda: needles(rasterize_mode="antialiased"),
-    "antialiased around the camera": lambda: around_the_camera(
-        render_mode="RGB+D", rasterize_mode="antialiased"
-    ),
     "three cameras": lambda: random_scene(cameras=3, seed=22),
-    "three cameras, features and expected depth, antialiased": lambda: with_backdrop(
-        random_scene(
-            cameras=3,
-            sh_degree=None,
-            channels=4,
-            render_mode="RGB+ED",
-            rasterize_mode="antialiased",
-            seed=23,
-        )
-    ),
+    "three cameras, features": lambda: random_scene(cameras=3, sh_degree=None, channels=4, seed=23),
 }

@@ -10,11 +10,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from keyss.core import InputError, UsageError
-from keyss.core.decoded import DecodedGaussians, PictureNetwork
-from keyss.core.similarity import Similarity
-from keyss.files import read_model, write_model
-from keyss.files.models import DECODED_SUFFIX
+from keyss.core import DecodedGaussians, InputError, PictureNetwork, Similarity, UsageError
+from keyss.files import DECODED_SUFFIX, read_model, write_model
 from keyss.rendering import rasterization, render
 from tiny_scenes import random_gaussians, ring_cameras
 

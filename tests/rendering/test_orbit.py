@@ -10,7 +10,7 @@ import torch
 from keyss.core import Gaussians
 from keyss.core.scene import camera_positions
 from keyss.core.similarity import Similarity
-from keyss.rendering.orbit import VIEWS, middle_and_radius, orbit, scene_of_model
+from keyss.rendering import VIEWS, middle_and_radius, orbit, scene_of_model
 from tiny_scenes import random_gaussians
 
 SIZE = 48

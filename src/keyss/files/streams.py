@@ -39,7 +39,7 @@ def check_standard_output() -> None:
     if getattr(sys.stdout, "buffer", None) is None:
         raise OutputError("standard output is closed: expected a pipe or a file to write the model to")
     if sys.stdout.isatty():
-        raise UsageError("a model is binary: redirect standard output to a file or a pipe")
+        raise UsageError("standard output is a terminal: redirect the model to a file or a pipe")
 
 
 def write_standard_output(data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""From Gaussians to pictures, differentiably: our own rasterizer on the CPU, gsplat on CUDA."""
+"""Renders Gaussians differentiably: our own rasterizer on the CPU, gsplat on CUDA."""
 
 import lazy_loader
 

@@ -1,8 +1,9 @@
-"""Checks of what `rasterization` is called with, the same for every backend."""
+"""Checks of the arguments of `rasterization`, the same for every backend."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor
 
@@ -11,17 +12,18 @@ from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32
-CAMERA_MAX = 1e12  # in viewmats and Ks: products of such numbers are still floats
+CAMERA_MAX = 1e12  # in viewmats and Ks, so that products do not overflow
 FOCAL_LENGTH_MIN = 1e-6  # pixels
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
-RasterizeMode = Literal["classic", "antialiased"]
-RENDER_MODES: tuple[RenderMode, ...] = get_args(RenderMode)
-RASTERIZE_MODES: tuple[RasterizeMode, ...] = get_args(RasterizeMode)
-
-# Arguments of gsplat's that have one value here: without distortion, a shutter that rolls, and so on.
+# Arguments of gsplat that only say how it computes.
+IGNORED = frozenset(("packed", "tile_size", "channel_chunk", "segmented"))
+# Arguments of gsplat of which only the default is supported.
 ONLY_VALUES: dict[str, Any] = {
+    "radius_clip": 0.0,
+    "render_mode": "RGB",
+    "rasterize_mode": "classic",
     "sparse_grad": False,
+    "absgrad": False,
     "distributed": False,
     "camera_model": "pinhole",
     "covars": None,
@@ -37,66 +39,42 @@ ONLY_VALUES: dict[str, Any] = {
 
 
 def check_arguments(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
+    tensors: Mapping[str, Tensor],
     width: int,
     height: int,
     near_plane: float,
     far_plane: float,
     eps2d: float,
     sh_degree: int | None,
-    backgrounds: Tensor | None,
-    render_mode: str,
-    rasterize_mode: str,
-    **others: Any,
+    others: Mapping[str, Any],
 ) -> None:
     """Raise ValueError for a wrong shape or value, UsageError for what gsplat supports and we do not."""
-    _check_others(**others)
-    for name, mode, modes in (
-        ("render_mode", render_mode, RENDER_MODES),
-        ("rasterize_mode", rasterize_mode, RASTERIZE_MODES),
-    ):
-        if mode not in modes:
-            raise ValueError(f"{name}: expected one of {', '.join(modes)}, got {mode!r}")
-    tensors = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "Ks": Ks,
-        "backgrounds": backgrounds,
-    }
+    _check_others(others)
     for name, tensor in tensors.items():
-        if not isinstance(tensor, Tensor) and (name, tensor) != ("backgrounds", None):
+        if not isinstance(tensor, Tensor):
             raise ValueError(f"{name}: expected a torch tensor, got {type(tensor).__name__}")
-    for name, tensor, shape in (("means", means, "[N, 3]"), ("viewmats", viewmats, "[C, 4, 4]")):
-        _check_dimensions(name, tensor, shape, "batch dimensions are not supported")
+    means, viewmats, Ks = tensors["means"], tensors["viewmats"], tensors["Ks"]
+    for name, shape in (("means", "[N, 3]"), ("viewmats", "[C, 4, 4]")):
+        _check_dimensions(name, tensors[name], shape, "batch dimensions are not supported")
     count, cameras = len(means), len(viewmats)
     _check_shape("means", means, count, 3)
-    _check_shape("quats", quats, count, 4)
-    _check_shape("scales", scales, count, 3)
-    _check_shape("opacities", opacities, count)
+    _check_shape("quats", tensors["quats"], count, 4)
+    _check_shape("scales", tensors["scales"], count, 3)
+    _check_shape("opacities", tensors["opacities"], count)
     _check_shape("viewmats", viewmats, cameras, 4, 4)
     _check_shape("Ks", Ks, cameras, 3, 3)
-    _check_colors(colors, count, sh_degree)
-    if backgrounds is not None:
-        _check_shape("backgrounds", backgrounds, cameras, colors.shape[-1])
+    _check_colors(tensors["colors"], count, sh_degree)
+    if "backgrounds" in tensors:
+        _check_shape("backgrounds", tensors["backgrounds"], cameras, tensors["colors"].shape[-1])
     for name, tensor in tensors.items():
-        if tensor is None:
-            continue
         if not tensor.is_floating_point():
             raise ValueError(f"{name}: expected floating point numbers, got {tensor.dtype}")
         if tensor.device != means.device:
             raise ValueError(f"{name}: is on {tensor.device}, but means is on {means.device}")
-    if means.device.type == "cpu":  # on a GPU these checks would wait for what it is doing
-        _check_cameras(viewmats, Ks, backgrounds)
+        if name in ("viewmats", "Ks") and tensor.requires_grad:
+            raise UsageError(f"{name}: gradients of cameras are not supported")
+    if means.device.type == "cpu":  # on a GPU these checks would wait for it
+        _check_cameras(viewmats, Ks, tensors.get("backgrounds"))
     for name, side in (("width", width), ("height", height)):
         if not 1 <= side <= MAX_SIDE:
             raise ValueError(f"{name}: expected 1 to {MAX_SIDE} pixels, got {side}")
@@ -104,22 +82,22 @@ def check_arguments(
         raise ValueError(f"expected 0 < near_plane < far_plane, got {near_plane} and {far_plane}")
     if not EPS2D_MIN <= eps2d < 1e6:
         raise ValueError(
-            f"eps2d: expected {EPS2D_MIN} or more, got {eps2d}: narrower footprints would be "
-            f"drawn wrongly by the CPU rasterizer"
+            f"eps2d: expected {EPS2D_MIN} or more, got {eps2d}: the CPU rasterizer would render narrower "
+            "footprints wrongly"
         )
 
 
-def _check_others(tile_size: int, channel_chunk: int, **others: Any) -> None:
-    for name, number in (("tile_size", tile_size), ("channel_chunk", channel_chunk)):
-        if not (isinstance(number, int) and number > 0):
-            raise ValueError(f"{name}: expected a positive integer, got {number!r}")
-    for name, only in ONLY_VALUES.items():
-        given = others[name]
-        if name == "rolling_shutter" and getattr(given, "name", None) == "GLOBAL":
-            continue  # gsplat's word for none
-        if isinstance(given, Tensor) or given != only:
-            got = f"a tensor {list(given.shape)}" if isinstance(given, Tensor) else repr(given)
-            raise UsageError(f"{name}: only {only!r} is supported of what gsplat can do here, got {got}")
+def _check_others(others: Mapping[str, Any]) -> None:
+    for name, value in others.items():
+        if name in IGNORED:
+            continue
+        if name not in ONLY_VALUES:
+            raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
+        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
+            continue  # gsplat's default
+        if isinstance(value, Tensor) or value != ONLY_VALUES[name]:
+            got = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
+            raise UsageError(f"{name}: only {ONLY_VALUES[name]!r} is supported, got {got}")
 
 
 def _check_colors(colors: Tensor, count: int, sh_degree: int | None) -> None:
@@ -153,7 +131,7 @@ def _check_dimensions(name: str, tensor: Tensor, shape: str, reason_for_more: st
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
-    """Raise ValueError where a number would spoil every pixel; bad Gaussians are only left out."""
+    """Raise ValueError for numbers that would spoil every pixel; bad Gaussians are merely skipped."""
     limits = {
         "viewmats": (viewmats, CAMERA_MAX),
         "Ks": (Ks, CAMERA_MAX),
@@ -164,7 +142,7 @@ def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> 
             raise ValueError(
                 f"{name}: expected finite numbers below {limit:g}, got others in {list(tensor.shape)}"
             )
-    focal_lengths = Ks.detach()[:, [0, 1], [0, 1]]
+    focal_lengths = Ks[:, [0, 1], [0, 1]]
     if not bool((focal_lengths > FOCAL_LENGTH_MIN).all()):
         raise ValueError(
             f"Ks: expected focal lengths above {FOCAL_LENGTH_MIN:g} pixels, got others in {list(Ks.shape)}"

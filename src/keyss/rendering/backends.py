@@ -1,4 +1,4 @@
-"""Which machine renders: the one place that decides."""
+"""Decides which device renders."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Backend = Literal["auto", "cpu", "cuda"]
 
 
 def resolve_device(backend: Backend = "auto") -> torch.device:
-    """The device on which to keep Gaussians: it decides which rasterizer draws them.
+    """The device for the Gaussians, which also selects the rasterizer.
 
-    "auto" takes CUDA where torch sees a GPU, otherwise the CPU; a GPU that gsplat cannot use is passed
-    over with a RuntimeWarning. Raises BackendError when "cuda" is asked for and cannot be used.
+    "auto" is CUDA if torch sees a GPU, else the CPU; a GPU that gsplat cannot use is skipped with a
+    RuntimeWarning. Raises BackendError if "cuda" cannot be used.
     """
     if backend not in ("auto", "cpu", "cuda"):
         raise UsageError(f"device: expected 'auto', 'cpu' or 'cuda', got {backend!r}")
@@ -33,7 +33,7 @@ def resolve_device(backend: Backend = "auto") -> torch.device:
 
 
 def require_gsplat_cuda() -> None:
-    """Raise BackendError unless gsplat can draw on a GPU. May compile its kernels, which takes minutes."""
+    """Raise BackendError unless gsplat can render on a GPU. May compile its kernels, which takes minutes."""
     if not torch.cuda.is_available():
         raise BackendError("torch sees no CUDA GPU on this machine; use device 'auto' or 'cpu'")
     try:

@@ -1,4 +1,4 @@
-"""How alike the renders of two models are."""
+"""The difference between renders of two models."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from keyss.core.scene import Camera, Scene
 from keyss.rendering.orbit import orbit
 from keyss.rendering.view import render
 
-_AROUND, _OF_A_SCENE, _SIZE = 4, 8, 256
+_ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256
 
 
 @dataclass(frozen=True)
@@ -25,31 +25,31 @@ class Viewpoints:
 
     @staticmethod
     def around(model: Gaussians) -> Viewpoints:
-        """Four views around a model, for when nothing but the model is known."""
-        return Viewpoints(orbit(model, _SIZE, _AROUND))
+        """Four views around a model, if nothing but the model is known."""
+        return Viewpoints(orbit(model, _SIZE, _ORBIT_VIEWS))
 
     @staticmethod
     def of(scene: Scene) -> Viewpoints:
-        """Up to eight training views of a scene: people look at it from about there."""
-        cameras = [view.camera for view in scene.train[:: max(1, -(-len(scene.train) // _OF_A_SCENE))]]
-        return Viewpoints([_small(camera) for camera in cameras], scene.background)
+        """Up to eight training views of a scene, shrunk."""
+        views = scene.train[:: max(1, -(-len(scene.train) // _SCENE_VIEWS))]
+        return Viewpoints([_shrunk(view.camera) for view in views], scene.background)
 
 
 @torch.no_grad()
 def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | None = None) -> float:
-    """PSNR in dB between renders of two models, at most 120; by default seen from around the first."""
+    """PSNR in dB between renders of two models, at most 120; by default from around the first."""
     views = viewpoints or Viewpoints.around(before)
     errors = [
-        (_picture(before, camera, views) - _picture(after, camera, views)).square().mean()
+        (_render(before, camera, views) - _render(after, camera, views)).square().mean()
         for camera in views.cameras
     ]
     return float(-10 * torch.log10(torch.stack(errors).mean().clamp_min(1e-12)))
 
 
-def _picture(model: Gaussians, camera: Camera, views: Viewpoints) -> Tensor:
+def _render(model: Gaussians, camera: Camera, views: Viewpoints) -> Tensor:
     return render(model, camera, views.background.to(model.device)).clamp(0, 1)
 
 
-def _small(camera: Camera) -> Camera:
+def _shrunk(camera: Camera) -> Camera:
     scale = min(1.0, _SIZE / max(camera.width, camera.height))
     return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))

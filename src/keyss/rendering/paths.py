@@ -1,4 +1,4 @@
-"""Paths of a camera for films: around a model, or around what a scene's cameras look at, or through them."""
+"""Camera paths for videos: around a model, around the focus of a scene, or through its cameras."""
 
 from __future__ import annotations
 
@@ -18,34 +18,32 @@ from keyss.core.scene import Camera, camera_positions, focus_point
 from keyss.rendering.orbit import FIELD_OF_VIEW, look_at, looking, middle_and_radius
 
 ELEVATION = 20.0  # degrees
-_GAP = math.pi / 2  # without a camera, from which on a path turns back
-_DISTANCE = 0.8  # of that from which the whole model is seen
+_GAP = math.pi / 2  # a larger gap between cameras makes a path turn back
+_DISTANCE = 0.8  # relative to that from which the whole model is visible
 
 
 def circle(model: Gaussians, size: int, frames: int) -> list[Camera]:
-    """Cameras on a level circle around what can be seen of a model, from a little above; up is -y.
+    """Cameras on a level circle around the visible part of a model, from slightly above; up is -y.
 
-    Pictures of size x size pixels; the last frame is a step before the first, so that the film can repeat.
+    Images of size x size pixels; the last frame is one step before the first, so that the video loops.
     """
     middle, radius = middle_and_radius(model)
-    focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
-    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     reach = _DISTANCE * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     height, flat = math.sin(math.radians(ELEVATION)), math.cos(math.radians(ELEVATION))
     cameras = []
     for index in range(frames):
         azimuth = 2 * math.pi * index / frames
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
-        cameras.append(looking(middle + outward * reach, -outward, K, size, f"circle_{index:04d}.png"))
+        cameras.append(looking(middle + outward * reach, -outward, size, f"circle_{index:04d}.png"))
     return cameras
 
 
 def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A level circle around what `cameras` look at, at their usual distance and height; up is as for them.
+    """A level circle around the focus of `cameras`, at their median distance and height, with their up.
 
-    Where they leave a quarter or more out, as those in front of a wall do, the path sways between their ends
-    instead: what nobody has photographed is not shown. Lens and size are those of the first by name. Raises
-    UsageError where there is none.
+    If they leave a gap of a quarter or more, as in front of a wall, the path sways between the ends of the
+    photographed arc instead. Lens and size are those of the first camera by name. Raises UsageError if there
+    are no cameras.
     """
     first = _in_order(cameras)[0]
     middle, up = focus_point(cameras), up_direction(cameras)
@@ -66,7 +64,7 @@ def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _angles(seen: Tensor, frames: int) -> list[float]:
-    """Around all of a circle, or to and fro on the arc where cameras stand at the angles `seen`."""
+    """Angles around the full circle, or to and fro on the arc of the cameras' angles `seen`."""
     ordered = seen.sort().values
     gaps = torch.cat([ordered[1:] - ordered[:-1], ordered[:1] + 2 * math.pi - ordered[-1:]])
     widest = int(gaps.argmax())
@@ -78,10 +76,10 @@ def _angles(seen: Tensor, frames: int) -> list[float]:
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """The way through `cameras` by their names, from the first to the last at an even pace.
+    """A path through `cameras` in the order of their names, with equal time between neighbours.
 
-    Positions are interpolated linearly, rotations on the shortest way; lens and size are those of the first.
-    Raises UsageError where there is none.
+    Positions are interpolated linearly, rotations by slerp; lens and size are those of the first camera.
+    Raises UsageError if there are no cameras.
     """
     ordered = _in_order(cameras)
     first = ordered[0]
@@ -104,5 +102,5 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 def _in_order(cameras: Sequence[Camera]) -> list[Camera]:
     if not cameras:
-        raise UsageError("expected a scene with cameras to film from, found none of them")
+        raise UsageError("expected a scene with cameras, found none")
     return sorted(cameras, key=lambda camera: camera.name)

@@ -1,25 +1,27 @@
-"""One picture of `Gaussians` from one `Camera`."""
+"""Renders `Gaussians` from a `Camera`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core import Camera, Gaussians
-from keyss.core.decoded import DecodedGaussians
-from keyss.rendering.decoding import decode_picture, draw_features
+from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.rendering.rasterize import rasterization
 
 
 def render(
     gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
 ) -> Tensor:
-    """The picture [H, W, 3] that the camera takes; 0 is black, 1 is white, and it is not clamped above.
+    """The image [H, W, 3] that the camera sees: 0 is black, 1 is white, not clamped above.
 
-    `background` [3] lies behind everything, black when None. `sh_degree` limits the spherical harmonics
-    (default: all that the Gaussians have). What a network decodes has a background of its own. Drawn on the
-    device of the Gaussians; differentiable. Raises what `rasterization` raises.
+    `background` [3] is behind everything, black when None; a model that a network decodes has its own.
+    `sh_degree` limits the spherical harmonics, by default all. Renders on the device of the Gaussians;
+    differentiable. Raises what `rasterization` raises.
     """
     return render_with_meta(gaussians, camera, background, sh_degree=sh_degree)[0]
 
@@ -27,35 +29,63 @@ def render(
 def render_with_meta(
     gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Like `render`, with the meta of `rasterization` for this one camera and `alpha` [H, W] in it."""
-    if isinstance(gaussians, DecodedGaussians):
-        return _draw_decoded(gaussians, camera, sh_degree)
+    """Like `render`, with the meta of `rasterization` for this camera, plus the `alpha` [H, W]."""
+    if sh_degree is None:
+        sh_degree = gaussians.sh_degree
+    if not isinstance(gaussians, DecodedGaussians):
+        return _render(gaussians, gaussians.sh, camera, background, sh_degree)
+    network = gaussians.network
+    if gaussians.features is not None:
+        image, meta = render_features(gaussians, gaussians.features, camera, network.background)
+    else:
+        image, meta = _render(gaussians, gaussians.sh, camera, network.background, sh_degree)
+    return decode_picture(image, network), meta
+
+
+def render_features(
+    gaussians: Gaussians, features: Tensor, camera: Camera, background: Tensor | None = None
+) -> tuple[Tensor, dict[str, Any]]:
+    """Like `render_with_meta`, with `features` [N, C] instead of colours: the image is [H, W, C]."""
+    return _render(gaussians, features, camera, background, None)
+
+
+def decode_picture(features: Tensor, network: PictureNetwork) -> Tensor:
+    """Decode an image [H, W, 3] from rendered features [H, W, C] (GS-Hider, Zhang et al. 2024, 3.3)."""
+    planes = features.permute(2, 0, 1)[None]
+    for index, (weight, bias) in enumerate(network.layers):
+        planes = F.conv2d(planes if index == 0 else planes.relu(), weight, bias, padding=1)
+    return planes[0].permute(1, 2, 0).contiguous()
+
+
+@torch.enable_grad()
+def contributions(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
+    """[N] the blending weights of each Gaussian, summed over all pixels of all views."""
+    model = gaussians.detach()
+    # An image is linear in the colours: the gradient with respect to a colour is the sum of its weights.
+    grey = torch.zeros(len(model), 1, device=model.device, requires_grad=True)
+    total = torch.zeros(len(model), device=model.device)
+    for camera in cameras:
+        image, _ = render_features(model, grey, camera)
+        total += torch.autograd.grad(image.sum(), grey)[0][:, 0]
+    return total
+
+
+def _render(
+    gaussians: Gaussians, colors: Tensor, camera: Camera, background: Tensor | None, sh_degree: int | None
+) -> tuple[Tensor, dict[str, Any]]:
     device = gaussians.device
     images, alphas, meta = rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
-        gaussians.sh,
+        colors,
         camera.viewmat.to(device)[None],
         camera.K.to(device)[None],
         camera.width,
         camera.height,
-        sh_degree=gaussians.sh_degree if sh_degree is None else sh_degree,
+        sh_degree=sh_degree,
         backgrounds=None if background is None else background.to(device)[None],
     )
     # Unlike an index, a squeezed axis costs no copy in the backward pass.
     return images.squeeze(0), meta | {"alpha": alphas.squeeze(0).squeeze(-1)}
-
-
-def _draw_decoded(
-    model: DecodedGaussians, camera: Camera, sh_degree: int | None = None
-) -> tuple[Tensor, dict[str, Any]]:
-    """The picture [H, W, 3] and the meta of `rasterization`."""
-    network = model.network
-    if model.features is not None:
-        drawn, meta = draw_features(model, model.features, camera, network.background)
-    else:
-        plain = Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits, model.sh)
-        drawn, meta = render_with_meta(plain, camera, network.background, sh_degree=sh_degree)
-    return decode_picture(drawn, network), meta

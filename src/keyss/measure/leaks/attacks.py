@@ -18,7 +18,7 @@ from keyss.core.scene import Camera, Scene
 from keyss.fitting.image_metrics import subsample_views
 from keyss.keys import random_embeddings
 from keyss.measure.leaks import views
-from keyss.rendering.contributions import contributions
+from keyss.rendering import contributions
 
 THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures use 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing

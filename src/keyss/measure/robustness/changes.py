@@ -21,8 +21,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
-from keyss.rendering import render
-from keyss.rendering.contributions import contributions
+from keyss.rendering import contributions, render
 
 _FIELDS = {"position": "means", "log scale": "log_scales", "quaternion": "quats"}
 _FIELDS |= {"logit opacity": "opacity_logits"}

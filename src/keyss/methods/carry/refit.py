@@ -11,7 +11,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import refit_model
 from keyss.fitting.reporting import of_secret
 from keyss.methods.base import Context
-from keyss.rendering.contributions import contributions
+from keyss.rendering import contributions
 
 # Where there are no photos, the start is nearly right: steps at most, and a factor on the rates.
 MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1

@@ -21,7 +21,7 @@ from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
 from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
-from keyss.rendering.decoding import decode_picture
+from keyss.rendering import decode_picture
 
 
 class DecoderTraining(PeerTraining):

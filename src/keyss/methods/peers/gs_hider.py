@@ -23,7 +23,7 @@ from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
 from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
-from keyss.rendering.decoding import decode_picture, draw_features
+from keyss.rendering import decode_picture, render_features
 
 FEATURES = 16
 _NOISE = 0.1  # standard deviation of the features that start as noise
@@ -45,7 +45,7 @@ class GsHiderTraining(PeerTraining):
         behind = torch.zeros(FEATURES, device=self.device)
         sh = torch.zeros(len(self), 1, 3, device=self.device)
         model = gaussians_of(self.parameters, self.parameters["opacities"], sh)
-        drawn, meta = draw_features(model, self.parameters["features"], camera, behind)
+        drawn, meta = render_features(model, self.parameters["features"], camera, behind)
         networks = (self.decoders[scene].network(behind) for scene in scenes)
         return [Picture(decode_picture(drawn, network), meta) for network in networks]
 

@@ -1,9 +1,8 @@
-"""Which Gaussians touch which tile, front to back.
+"""Lists the Gaussians that touch each tile, front to back.
 
-One radix sort of all visible Gaussians by depth, then a counting sort of (Gaussian, tile) pairs into
-tiles that keeps the depth order. Each pair also has a slot: pairs of one Gaussian are neighbours in the
-order of slots, so the backward pass can leave its sums there without any two threads meeting, and add
-them up in an order that never changes.
+A radix sort orders the visible Gaussians by depth; a stable counting sort then puts (Gaussian, tile) pairs
+into tiles. Each pair also has a slot, in which the backward pass stores its sums. The slots of a Gaussian are
+neighbours: threads need no locks, and sums are added in a fixed order.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator,assignment"
@@ -52,12 +51,12 @@ from keyss.rendering.cpu.simd8 import (
     store8,
 )
 
-BATCH = 16  # Gaussians that are measured before any of them is listed
+BATCH = 16  # Gaussians measured before the first of them is listed
 
 
 @kernel
 def sort_by_depth(depths, order, spare_order, keys, spare_keys):
-    """Sort by depth those Gaussians whose depth is not 0; returns how many those are.
+    """Sort the Gaussians with nonzero depth by depth; returns their number.
 
     order[j] becomes the j-th Gaussian. A stable radix sort with three digits of 11 bits: positive floats
     sort like their bit patterns.
@@ -65,7 +64,7 @@ def sort_by_depth(depths, order, spare_order, keys, spare_keys):
     bits = depths.view(np.uint32)
     mask = np.uint32(2047)
     starts = np.zeros((3, 2048), np.int64)
-    # Three passes from `source` to `target` and back end in `order`.
+    # Three passes between `source` and `target` end in `order`.
     source, target = spare_order, order
     source_keys, target_keys = spare_keys, keys
     count = 0
@@ -100,7 +99,7 @@ def sort_by_depth(depths, order, spare_order, keys, spare_keys):
 
 @kernel
 def share_bounds(order, tile_bounds, starts):
-    """starts[w] becomes the sum of tile_bounds over the shares before w; the last entry is the total."""
+    """Set starts[w] to the sum of tile_bounds over the shares before w, and the last entry to the total."""
     shares = starts.shape[0] - 1
     count = order.shape[0]
     total = 0
@@ -113,11 +112,11 @@ def share_bounds(order, tile_bounds, starts):
 
 @inlined
 def _measure_columns(footprints, g, height, first_column, spans, place):
-    """The rows of pixels that an ellipse alpha >= 1/255 meets, for 8 columns of tiles.
+    """The rows of pixels that the ellipse alpha >= 1/255 covers in 8 columns of tiles.
 
-    g is where its footprint starts. spans[place:] gets the first rows, spans[place + 8:] the last ones. At x
-    from its centre the ellipse spans shear x -+ sqrt(level - curvature x^2), its lowest point lies at
-    x = lowest_x and its highest at -lowest_x: within a column the extremes are at its edges or at those.
+    Its footprint starts at g. spans[place:] gets the first rows, spans[place + 8:] the last ones. At x from
+    its centre the ellipse spans shear x -+ sqrt(level - curvature x^2); its extreme points in y are at
+    x = +-lowest_x. Within a column the extremes are there or at the column's edges.
     """
     x = at(footprints, g + X)
     y = at(footprints, g + Y) - HALF
@@ -144,10 +143,10 @@ def _measure_columns(footprints, g, height, first_column, spans, place):
 
 @kernel
 def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, rows, slot_counts, cursors):
-    """List the tiles of each Gaussian and its rows there, share by share, that of share w from starts[w] on.
+    """List the tiles of each Gaussian and its rows there; those of share w start at starts[w].
 
-    slot_counts[i] becomes the number of tiles that Gaussian i meets, cursors[w, t] the number of Gaussians
-    in share w that meet tile t. `tiles` and `rows` have room for one more at the end.
+    slot_counts[i] becomes the number of tiles that Gaussian i touches, cursors[w, t] the number of Gaussians
+    in share w that touch tile t. `tiles` and `rows` have room for one more at the end.
     """
     shares = cursors.shape[0]
     count = order.shape[0]
@@ -165,7 +164,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
         end = (share + 1) * count // shares
         for start in range(share * count // shares, end, BATCH):
             size = min(BATCH, end - start)
-            # First what has long latencies, for the whole batch, then what branches on the results.
+            # First the arithmetic with long latencies for the whole batch, then the branches on its results.
             for k in range(size):
                 prefetch_read(footprints, np.int64(at(order, min(start + k + BATCH, end - 1))) * PACKED)
                 g = np.int64(at(order, start + k)) * PACKED
@@ -187,7 +186,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
                     last = np.int64(at(spans, 16 * k + 8 + column % 8))
                     for row in range(first >> TILE_HEIGHT_LOG2, (last >> TILE_HEIGHT_LOG2) + 1):
                         tile = row * tile_columns + first_column
-                        # Written in any case: to branch where a column is missed is slower.
+                        # Written in any case, since a branch for empty columns would be slower.
                         tiles[place] = tile
                         first_row = max(first - row * TILE_HEIGHT, 0)
                         last_row = min(last - row * TILE_HEIGHT, TILE_HEIGHT - 1)
@@ -200,7 +199,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
 
 @kernel
 def offsets_from_counts(cursors, tile_starts, slot_counts, first_slots):
-    """Turn counts into starts, in place for the cursors. Returns the number of pairs."""
+    """Turn counts into starts; for the cursors, in place. Returns the number of pairs."""
     total = 0
     for tile in range(cursors.shape[1]):
         tile_starts[tile] = total
@@ -218,11 +217,10 @@ def offsets_from_counts(cursors, tile_starts, slot_counts, first_slots):
 
 @kernel
 def sort_pairs(counter, order, starts, tiles, rows, slot_counts, first_slots, cursors, entries, entry_slots):
-    """Sort the pairs of `list_pairs` into tiles, from the cursors that `offsets_from_counts` left.
+    """Sort the pairs of `list_pairs` into tiles, starting at the cursors of `offsets_from_counts`.
 
-    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
-    Gaussian i has slot_counts[i] of them from first_slots[i] on. It may be empty: then it stays so, and
-    first_slots is not read.
+    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots, of
+    which Gaussian i has slot_counts[i] from first_slots[i]; if it is empty, first_slots is not read.
     """
     shares = cursors.shape[0]
     count = order.shape[0]

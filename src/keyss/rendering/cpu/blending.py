@@ -1,19 +1,18 @@
 """Alpha blending of the Gaussians of each tile, front to back (3DGS, eq. 3).
 
-A tile is 8 pixels wide: one vector is one row. A pixel's transmittance is stored negated once it has
-stopped.
+A tile is 8 pixels wide, so that a vector is a row. The transmittance of a full pixel is stored negated.
 
-Down a column of pixels a Gaussian's footprint is a Gaussian in y, so it follows from two recurrences:
+Down a column of pixels a Gaussian's footprint is a Gaussian in y, which two recurrences evaluate:
 footprint(y + 1) = footprint(y) ratio(y) and ratio(y + 1) = ratio(y) decay. A row costs two
-multiplications for it, and exp is needed only where a run of ANCHOR_ROWS rows starts. There the
-footprint may be far below the smallest float though a row further down counts: with eps2d >= 0.3 the
-curvature in y is at most 1/0.3, so 7 rows above a pixel with alpha >= 1/255 it can be e^-130. Therefore
-footprints and alphas are kept multiplied by 2^64, and transmittances divided by it, which is exact.
+multiplications, and exp is needed only every ANCHOR_ROWS rows. At such an anchor the footprint may
+underflow although a row further down is visible: with eps2d >= 0.3 the curvature in y is at most 1/0.3, so
+7 rows above a pixel with alpha >= 1/255 it can be e^-130. Therefore footprints and alphas are multiplied by
+2^64, and transmittances divided by it, which is exact.
 
-Each kernel is compiled twice, for one text. Where `features` is None, a Gaussian has the three colours
-that lie in its footprint, and they stay in registers while its rows are drawn. Where `features` is an
-array [N, channels], the channels are too many for that: the weights of a strip's pixels are kept in a
-buffer first, then each channel passes over them. Numba drops the branches on None while it compiles.
+Each kernel is compiled twice. If `features` is None, a Gaussian has the three colours of its footprint,
+which stay in registers while its rows are blended. If `features` is an array [N, channels], the channels do
+not fit into registers: the weights of a strip's pixels are buffered first, then each channel passes over
+them. Numba removes the branches on None at compile time.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator"
@@ -72,11 +71,11 @@ from keyss.rendering.cpu.simd8 import (
 )
 
 ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
-UNROLLED_ROWS = 4  # blended in one go: a row in which there is nothing to draw costs less than a branch
-PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # with room for what that draws below the tile
-BATCH = 16  # Gaussians between two tests whether the whole tile has stopped
+UNROLLED_ROWS = 4  # blended without a branch, which would cost more than an empty row
+PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # with room for unrolled rows below the tile
+BATCH = 16  # Gaussians between two tests whether the whole tile is full
 
-STRIP = 3  # numbers that describe a strip, see `list_strips`
+STRIP = 3  # numbers per strip, see `list_strips`
 MAX_STRIPS = BATCH * (TILE_HEIGHT // ANCHOR_ROWS)
 
 SCALE = f32(2.0**64)
@@ -88,9 +87,9 @@ SCALED_TRANSMITTANCE_MIN = TRANSMITTANCE_MIN * INVERSE
 
 @finite_inlined
 def blend_row(planes, k, footprint):
-    """Let a row of a footprint dim the transmittance at planes[k:k + 8].
+    """Blend a row of a footprint into the transmittance at planes[k:k + 8].
 
-    Returns alpha (times 2^64) and alpha times the transmittance before, both 0 where nothing is drawn.
+    Returns alpha (times 2^64) and its product with the transmittance before, both 0 for skipped pixels.
     """
     alpha = select_ge(footprint, SCALED_ALPHA_MIN, minimum(footprint, SCALED_ALPHA_MAX), ZERO)
     before = load8(planes, k)
@@ -102,22 +101,22 @@ def blend_row(planes, k, footprint):
 
 
 @finite_inlined
-def _has_stopped(planes):
-    """Whether no pixel of the tile lets anything more through."""
-    most = load8(planes, 0)
+def _is_full(planes):
+    """True if all pixels of the tile are full."""
+    largest = load8(planes, 0)
     for k in range(8, TILE_PIXELS, 8):
-        most = maximum(most, load8(planes, k))
-    return not any_gt(most, SCALED_TRANSMITTANCE_MIN)
+        largest = maximum(largest, load8(planes, k))
+    return not any_gt(largest, SCALED_TRANSMITTANCE_MIN)
 
 
 @finite_inlined
 def list_strips(footprints, features, entries, start, end, last, left, top, strips, strip_footprints):
     """Cut the Gaussians of entries start..end into strips of up to ANCHOR_ROWS rows; returns their number.
 
-    A strip is STRIP numbers in `strips`: where the Gaussian's record starts, the first place in a plane, the
-    first place after it. strip_footprints gets the footprint, times 2^64, at its first row, and its ratio to
-    that one row further down. All exponentials of a batch are taken before any of its rows is drawn, since
-    they have long latencies and do not wait for one another. `last` is where the tile's list ends.
+    A strip is STRIP numbers in `strips`: the start of the Gaussian's record, and the start and end of its
+    pixels in a plane. strip_footprints gets the footprint, times 2^64, of its first row, and the ratio of the
+    next row to it. All exponentials of a batch come before the blending, since they are independent and have
+    long latencies. `last` is the end of the tile's list.
     """
     centre_x = f32(left) + HALF
     centre_y = f32(top) + HALF
@@ -154,7 +153,7 @@ def _blend_tile(
 ):
     """Blend entries start..end of the list into planes = [transmittance | one per channel].
 
-    Returns the entry before which the whole tile had stopped.
+    Returns the entry at which the whole tile was full.
     """
     for k in range(0, PLANE, 8):
         store8(planes, k, splat(INVERSE))
@@ -194,13 +193,13 @@ def _blend_tile(
                 for channel in range(channels):
                     value = at(features, g // PACKED * channels + channel)
                     plane = (1 + channel) * PLANE
-                    # Two rows in one go; below the strip the weights are 0.
+                    # Two rows at a time; below the strip the weights are 0.
                     for two in range(first, after, 16):
                         for k in range(two, two + 16, 8):
                             p = plane + k
                             store8(planes, p, multiply_add(load8(weights, k), value, load8(planes, p)))
         entry = check
-        if _has_stopped(planes):
+        if _is_full(planes):
             break
     return entry
 
@@ -210,9 +209,9 @@ def blend(
     counter, footprints, features, entries, tile_starts, tile_columns, background, image, alpha,
     transmittance, ends,
 ):  # fmt: skip
-    """Draw all tiles into image [H, W, channels], alpha and transmittance [H, W].
+    """Blend all tiles into image [H, W, channels], alpha and transmittance [H, W].
 
-    ends[t] becomes the first list entry of tile t that was not looked at.
+    ends[t] becomes the first list entry of tile t that was not read.
     """
     height, width, channels = image.shape
     planes = np.empty((1 + channels) * PLANE, np.float32)
@@ -251,5 +250,5 @@ def blend(
                     transmittance[top + y, left + x] = light
                     alpha[top + y, left + x] = ONE - light
                     for channel in range(channels):
-                        drawn = planes[k + x + (1 + channel) * PLANE]
-                        image[top + y, left + x, channel] = drawn + light * background[channel]
+                        color = planes[k + x + (1 + channel) * PLANE]
+                        image[top + y, left + x, channel] = color + light * background[channel]

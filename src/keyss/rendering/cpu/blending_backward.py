@@ -1,6 +1,6 @@
-"""Gradients of the footprints and colours from those of the picture: `blending` reversed.
+"""Gradients of footprints and colours from those of the image: the backward pass of `blending`.
 
-Entries are replayed front to back, by the same steps as they were drawn.
+Entries are replayed front to back, by the same steps as in the forward pass.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator"
@@ -34,10 +34,6 @@ from keyss.rendering.cpu.layout import (
     TILE_RUN,
     TILE_WIDTH,
     TILE_WIDTH_LOG2,
-    TWO,
-    XX,
-    XY,
-    YY,
     ZERO,
     X,
     Y,
@@ -50,7 +46,6 @@ from keyss.rendering.cpu.simd8 import (
     load8,
     load_interleaved,
     multiply_add,
-    negative_abs,
     prefetch_write,
     put,
     ramp,
@@ -61,20 +56,21 @@ from keyss.rendering.cpu.simd8 import (
     sum_lanes_of_8,
 )
 
-PREFETCH = 6  # how many list entries ahead to ask for memory
+PREFETCH = 6  # list entries ahead whose memory is prefetched
 
 
 @finite_inlined
 def _blend_tile_backward(
     footprints, features, channels, entries, slots, start, end, left, top, planes, weights, strips,
-    strip_footprints, moments, extras, extra_width, absgrad,
+    strip_footprints, moments, extras,
 ):  # fmt: skip
     """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
 
-    planes = [transmittance | behind | the gradient of each channel], where behind is the part of the loss
-    gradient times the pixel that is drawn behind the current Gaussian: the whole minus what has been
-    passed. Within a row dx is fixed per lane, so the loop over rows sums powers of dy only.
+    planes = [transmittance | behind | the gradient of each channel]. `behind` is the product of the loss
+    gradient with the light from behind the current Gaussian: that with the whole pixel minus what was passed.
+    Within a row dx is fixed per lane, so the loop over rows sums powers of dy only.
     """
+    extra_width = 1 if features is None else channels
     centre_x = f32(left) + HALF
     centre_y = f32(top) + HALF
     zero = splat(ZERO)
@@ -93,9 +89,6 @@ def _blend_tile_backward(
             slot = np.int64(at(slots, e))
             g = at(strips, STRIP * strip)
             y = at(footprints, g + Y) - centre_y
-            xx = at(footprints, g + XX)
-            xy = at(footprints, g + XY)
-            yy = at(footprints, g + YY)
             decay = at(footprints, g + DECAY)
             red = at(footprints, g + RED)
             green = at(footprints, g + GREEN)
@@ -107,8 +100,6 @@ def _blend_tile_backward(
             sum_red = zero
             sum_green = zero
             sum_blue = zero
-            sum_abs_x = zero
-            sum_abs_y = zero
             first_of_all = at(strips, STRIP * strip + 1)
             while at(strips, STRIP * strip) == g:
                 footprint = load8(strip_footprints, 16 * strip)
@@ -137,7 +128,7 @@ def _blend_tile_backward(
                         own = weight * product
                     behind = load8(planes, k + TILE_PIXELS) - own
                     store8(planes, k + TILE_PIXELS, behind)
-                    # alpha dL/d(alpha), where what lies behind is dimmed by 1 - alpha.
+                    # alpha dL/d(alpha); the light from behind is dimmed by 1 - alpha.
                     s = own - behind * divide(alpha, SCALE - alpha)
                     s = select_le(footprint, SCALED_ALPHA_MAX, s, ZERO)
                     footprint = footprint * ratio
@@ -146,11 +137,6 @@ def _blend_tile_backward(
                     sum_1 = sum_1 + s
                     sum_y = sum_y + s_dy
                     sum_yy = multiply_add(s_dy, row_dy, sum_yy)
-                    if absgrad:
-                        along_x = s * multiply_add(row_dy, xy, dx * (xx * TWO))
-                        along_y = s * multiply_add(row_dy, yy * TWO, dx * xy)
-                        sum_abs_x = sum_abs_x - negative_abs(along_x)
-                        sum_abs_y = sum_abs_y - negative_abs(along_y)
                     row_dy = row_dy + ONE
                 strip += 1
             sum_x = dx * sum_1
@@ -170,18 +156,16 @@ def _blend_tile_backward(
                     for k in range(first_of_all, after_all, 8):
                         total = multiply_add(load8(planes, plane + k), load8(weights, k), total)
                     extras[extra + channel] = sum_lanes(total)
-            if absgrad:
-                extras[extra + extra_width - 2] = sum_lanes(sum_abs_x)
-                extras[extra + extra_width - 1] = sum_lanes(sum_abs_y)
 
 
 @finite_kernel
 def blend_backward(
     counter, footprints, features, entries, entry_slots, tile_starts, ends, tile_columns, image,
-    transmittance, image_gradient, alpha_gradient, moments, extras, extra_width, absgrad,
+    transmittance, image_gradient, alpha_gradient, moments, extras,
 ):  # fmt: skip
     """Fill every slot of `moments` and `extras` from the gradients of the image and of alpha."""
     height, width, channels = image.shape
+    extra_width = 1 if features is None else channels
     planes = np.empty((2 + channels) * TILE_PIXELS, np.float32)
     weights = np.empty(TILE_PIXELS, np.float32)
     strips = np.empty(STRIP * (MAX_STRIPS + 1), np.int64)
@@ -206,8 +190,8 @@ def blend_backward(
                 pixel = (top + y) * width + left
                 if features is None and columns == TILE_WIDTH:
                     red, green, blue = load_interleaved(image_gradient, 3 * pixel)
-                    drawn_red, drawn_green, drawn_blue = load_interleaved(image, 3 * pixel)
-                    behind = red * drawn_red + green * drawn_green + blue * drawn_blue
+                    image_red, image_green, image_blue = load_interleaved(image, 3 * pixel)
+                    behind = red * image_red + green * image_green + blue * image_blue
                     behind = behind - load8(alpha_gradient, pixel) * load8(transmittance, pixel)
                     store8(planes, k, splat(INVERSE))
                     store8(planes, k + TILE_PIXELS, behind)
@@ -229,6 +213,5 @@ def blend_backward(
                     planes[k + x + TILE_PIXELS] = light_behind
             _blend_tile_backward(
                 footprints, features, channels, entries, entry_slots, tile_starts[tile], ends[tile], left,
-                top, planes, weights, strips, strip_footprints, moments, extras, extra_width,
-                absgrad,
+                top, planes, weights, strips, strip_footprints, moments, extras,
             )  # fmt: skip

@@ -1,8 +1,8 @@
-"""How the kernels are compiled, and where the compiled code is kept.
+"""Compiles kernels and caches the code.
 
-numba's cache notices a change of the file that holds a kernel, but not of the files it imports. All
-kernels here share one cache folder whose name is a hash of every source file in this package, and of the
-one number that kernels have from elsewhere, so any change makes a new folder.
+numba's cache notices changes of the file that contains a kernel, but not of the files it imports. Therefore
+all kernels share a cache folder whose name is a hash of every source file in this package, and of the one
+number that they take from elsewhere.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from keyss.core.gaussians import DRAWN_OPACITY
 
 _numba: Any = numba  # typed in some versions only
 
-# Everything `fastmath` allows except assuming that no NaN and no infinity occurs: a Gaussian with a NaN
-# must fail the comparisons that select it, not index wildly.
+# All of `fastmath` but the assumption that there are no NaN and infinities: a Gaussian with a NaN must fail
+# the comparisons that select it, not index out of bounds.
 _NAN_SAFE = {"contract", "arcp", "nsz", "reassoc", "afn"}
 
 
@@ -33,21 +33,16 @@ def kernel(function: Any) -> Any:
 
 
 def finite_kernel(function: Any) -> Any:
-    """Compile `function` at its first call; the compiler may assume that all numbers are finite."""
+    """`kernel`, but the compiler may assume that all numbers are finite."""
     return _compiled(function, fastmath=True)
 
 
-def exact_kernel(function: Any) -> Any:
-    """Compile `function` at its first call; it computes what the source says, in that order, as IEEE says."""
-    return _compiled(function, fastmath=False)
-
-
 def inlined(function: Any) -> Any:
-    """For functions that only kernels call: their code becomes part of the kernel's.
+    """Inline a function into the kernels that call it.
 
-    LLVM would leave large ones as functions. Those exist twice, by themselves and optimised along with the
-    kernel; a process that compiles calls the first and one that loads from the cache the second, and the
-    two round differently.
+    LLVM would not inline large functions. Those would exist twice, alone and optimised with the kernel; a
+    process that compiles calls the first and one that loads from the cache the second, and the two round
+    differently.
     """
     return _compiled(function, fastmath=_NAN_SAFE, forceinline=True)
 
@@ -57,25 +52,19 @@ def finite_inlined(function: Any) -> Any:
     return _compiled(function, fastmath=True, forceinline=True)
 
 
-def exact_inlined(function: Any) -> Any:
-    """`inlined`, for functions that only an `exact_kernel` calls."""
-    return _compiled(function, fastmath=False, forceinline=True)
-
-
 def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:
-    # What is inlined borrows the arrays of the kernel: to count references to them would take longer than
-    # some of the arithmetic.
+    # Inlined functions borrow the kernel's arrays: counting references would cost more than some arithmetic.
     options = {"fastmath": fastmath, "forceinline": forceinline, "error_model": "numpy", "nogil": True}
     options["_nrt"] = not forceinline
     folder = cache_folder()
     if folder is None:
         return _numba.njit(**options)(function)
-    # A kernel takes the cache folder of the moment in which it is decorated.
+    # numba reads the cache folder when a kernel is decorated.
     folder_before = _numba.config.CACHE_DIR
     _numba.config.CACHE_DIR = str(folder)
     try:
         return _numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # the folder went away, and numba's own places are not writable either
+    except RuntimeError:  # the folder has gone, and numba's own are not writable either
         return _numba.njit(**options)(function)
     finally:
         _numba.config.CACHE_DIR = folder_before
@@ -83,9 +72,9 @@ def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = Fals
 
 @cache
 def cache_folder() -> Path | None:
-    """Where the compiled kernels of exactly these sources are kept; None where nothing is writable.
+    """The cache folder for kernels of exactly these sources; None if nothing is writable.
 
-    The first writable of: `NUMBA_CACHE_DIR`, `__pycache__` beside this file, the user's cache folder.
+    It is in the first writable of `NUMBA_CACHE_DIR`, `__pycache__` beside this file, and the user's cache.
     """
     digest = hashlib.sha256(repr(DRAWN_OPACITY).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
@@ -109,15 +98,15 @@ def _cache_parents() -> list[Path]:
     if user_cache:
         parents.append(Path(user_cache))
     else:
-        with suppress(RuntimeError):  # no home folder is known
+        with suppress(RuntimeError):  # no home folder
             parents.append(Path.home() / ".cache")
     return parents
 
 
 @cache
 def announce_compilation() -> None:
-    """Say on stderr that the first render takes a while, if nothing is compiled yet. Says it once."""
+    """Print once to stderr that the first render takes a while, if nothing is compiled yet."""
     folder = cache_folder()
-    own = f"{Path(__file__).parent.name}_*"  # as numba calls the folder of kernels that lie beside this file
+    own = f"{Path(__file__).parent.name}_*"  # numba's name for the folder of kernels in this package
     if folder is None or next(folder.glob(f"{own}/*.nbi"), None) is None:
         print("keyss: compiling the CPU rasterizer, 10 to 20 s, once", file=sys.stderr, flush=True)

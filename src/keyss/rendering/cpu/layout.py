@@ -1,4 +1,4 @@
-"""Numbers that all kernels share: the rendering conventions, and what lies where in their arrays."""
+"""Constants that all kernels share: the rendering conventions, and the layouts of their arrays."""
 
 import numpy as np
 
@@ -6,23 +6,23 @@ from keyss.core.gaussians import DRAWN_OPACITY
 
 f32 = np.float32
 
-# Conventions of 3DGS as gsplat has them (classic mode).
+# Conventions of 3DGS as in gsplat's classic mode.
 ALPHA_MIN = f32(DRAWN_OPACITY)  # contributions below this are skipped
 INVERSE_ALPHA_MIN = f32(1 / DRAWN_OPACITY)
 ALPHA_MAX = f32(0.999)  # alpha is clamped to this; no gradient passes a clamped alpha
-TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave no more than this ends its pixel and is not drawn
+TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave no more ends its pixel and is skipped
 RADIUS_SIGMAS = f32(3.33)  # reported radii are at most this many standard deviations
-FOV_MARGIN = f32(0.15)  # the Jacobian is clamped outside the image enlarged by this share on each side
-EPS2D_MIN = 0.3  # the exponential recurrence down the rows of a tile is exact for eps2d from here on
+FOV_MARGIN = f32(0.15)  # the Jacobian is clamped beyond this share of the image on each side
+EPS2D_MIN = 0.3  # the recurrence down the rows of a tile is exact from here on
 
-# A tile is as wide as a vector; tall tiles make the recurrence down its rows pay.
+# A tile is as wide as a vector; the recurrence down its rows pays in tall tiles.
 TILE_WIDTH = 8
 TILE_HEIGHT = 32
 TILE_WIDTH_LOG2 = 3
 TILE_HEIGHT_LOG2 = 5
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-LAST_ROW_SHIFT = 5  # the rows that a Gaussian meets in a tile are kept as first | last << this
-ENTRY_ROWS_SHIFT = 32  # an entry in a tile's list is Gaussian | rows << this
+LAST_ROW_SHIFT = 5  # the rows of a Gaussian in a tile are stored as first | last << this
+ENTRY_ROWS_SHIFT = 32  # an entry of a tile's list is Gaussian | rows << this
 ENTRY_GAUSSIAN = 2**ENTRY_ROWS_SHIFT - 1  # mask
 
 # The packed record of a Gaussian's footprint: one cache line.
@@ -37,17 +37,16 @@ OPACITY = 6
 RED = 7
 GREEN = 8
 BLUE = 9
-EXTENT_X = 10  # half the width of the box that holds all pixels with alpha >= 1/255
+EXTENT_X = 10  # half the width of the bounding box of all pixels with alpha >= 1/255
 EXTENT_Y = 11
 DECAY = 12  # exp(2 YY), the ratio of successive ratios down a column
 
-# The record of sums over one (Gaussian, tile) pair that the backward pass leaves: with s = dL/d(-sigma),
-# sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient, one vector. Then come the
-# extras: the sum of the blue gradient (where features are drawn: of each channel's, and those for red and
-# green stay 0), and for absgrad the sums of |dL/dx| and |dL/dy|.
+# Sums that the backward pass leaves for a (Gaussian, tile) pair. The moments are one vector: with
+# s = dL/d(-sigma), sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient. The
+# extras are the sum of the blue gradient; or, with features, that of each channel (red and green stay 0).
 MOMENTS = 8
 
-# The camera array: rotation (row-major, 0 to 8), translation, then these and the position in the world.
+# The camera array: rotation (row-major, 0 to 8), translation, intrinsics and position in the world.
 CAMERA = 19
 TX = 9
 TY = 10
@@ -58,18 +57,16 @@ CX = 14
 CY = 15
 POSITION = 16
 
-# Tiles per piece of work: neighbours, since their slots share cache lines.
+# Tiles per piece of work: neighbours share cache lines of slots.
 TILE_RUN = 8
 
-# Gaussians per piece of work in the kernels that go over Gaussians. Part of the results: sums of camera
-# gradients are taken within a piece first.
-CHUNK = 2048
+CHUNK = 2048  # Gaussians per piece of work in the kernels that loop over Gaussians
 
 ZERO = f32(0)
 HALF = f32(0.5)
 ONE = f32(1)
 TWO = f32(2)
-HUGE = f32(1e30)  # what is larger is treated like infinity: skipped
-# Colours and depths from here on are not drawn: the backward pass multiplies them by 2^64.
+HUGE = f32(1e30)  # larger numbers are treated as infinite
+# Gaussians with larger colours or depths are skipped: the backward pass multiplies colours by 2^64.
 CHANNEL_MAX = f32(1e12)
 NORM_MIN = f32(1e-24)  # smallest squared length that is normalised

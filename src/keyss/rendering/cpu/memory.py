@@ -1,7 +1,7 @@
-"""Arrays for the kernels: aligned to cache lines, and made of memory that is used again.
+"""Arrays for the kernels, aligned to cache lines, in recycled memory.
 
-Every call needs tens of megabytes for a few milliseconds. Taken from the system each time, the page
-faults would cost as much as the arithmetic.
+Every call needs tens of megabytes for a few milliseconds. With fresh memory, page faults would cost as much
+as the arithmetic.
 """
 
 from __future__ import annotations
@@ -16,43 +16,43 @@ import torch
 
 Array = np.ndarray[Any, Any]
 
-MAX_FREE = 40  # buffers kept while nobody uses them: what one call needs, and some
-WORTH_KEEPING = 2**15  # bytes; smaller ones come from numpy
+MAX_FREE = 40  # unused buffers to keep: slightly more than one call needs
+MIN_BYTES = 2**15  # smaller arrays come from numpy
 
-# Free buffers by the number of their return, so the longest unused come first, and these numbers by capacity:
-# a training step asks some thirty times, and to look at all buffers would nearly double what that takes.
-# A loan may end in the garbage collector at any moment, so there is no lock, only operations that are atomic.
+# Free buffers by the number of their return, so that the least recently used come first, and these numbers by
+# capacity, since a linear search would nearly double the time of an allocation. A loan may end in the garbage
+# collector at any moment: there is no lock, only atomic operations.
 _free: dict[int, Array] = {}
 _returns: dict[int, list[int]] = {}
 _numbers = itertools.count()
 
 
 class _Loan:
-    """Owns a buffer on behalf of the arrays made of it, and puts it back when the last of them is gone."""
+    """Owns a buffer for the arrays in it, and returns it when the last of them is gone."""
 
     def __init__(self, buffer: Array) -> None:
         self.buffer = buffer
         self.__array_interface__ = buffer.__array_interface__
 
     def __del__(self) -> None:
-        if _free is not None:  # as it is when the interpreter ends
+        if _free is not None:  # it is None at interpreter exit
             number = next(_numbers)
             _free[number] = self.buffer
             _returns.setdefault(len(self.buffer), []).append(number)
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> Array:
-    """An uninitialised array; large ones start on a cache line."""
+    """An uninitialised array; large arrays start on a cache line."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size < WORTH_KEEPING:
+    if size < MIN_BYTES:
         return np.empty(shape, dtype)
     array: Array = np.asarray(_Loan(_buffer(size)))[:size].view(dtype).reshape(shape)
     return array
 
 
 def _buffer(size: int) -> Array:
-    """The smallest free buffer that fits without wasting more than half of it, or a new one."""
-    step = 1 << max(0, size.bit_length() - 3)  # of capacities, a quarter to an eighth of the size
+    """The smallest free buffer that is at most twice as large as needed, or a new one."""
+    step = 1 << max(0, size.bit_length() - 3)  # between capacities: an eighth to a quarter of the size
     capacity = -(-size // step) * step
     for fitting in range(capacity, 2 * size + 1, step):
         numbers = _returns.get(fitting)

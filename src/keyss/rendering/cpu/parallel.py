@@ -1,9 +1,9 @@
 """Runs kernels on several threads.
 
-Kernels release the GIL and take their work in small pieces from a shared counter, so ordinary Python
-threads drive them. Compared with numba's own `prange` this costs no second compilation, is safe to call
-from several threads and after a fork, and a core that is busy elsewhere only delays the piece it holds.
-The pieces never depend on the number of threads, hence nor do the results.
+Kernels release the GIL and take small pieces of work from a shared counter, so ordinary Python threads run
+them. Unlike numba's `prange` this needs no second compilation, is safe to call from several threads and
+after a fork, and a busy core delays only its current piece. The pieces, and hence the results, do not depend
+on the number of threads.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _pools: dict[int, ThreadPoolExecutor] = {}  # one per number of helper threads
 def run(kernel: Callable[..., None], *arguments: Any) -> None:
     """Call `kernel(counter, *arguments)` on as many threads as torch uses; returns when all pieces are done.
 
-    `counter` is an int64 array of one zero: the kernel draws the number of its next piece from it with
-    `simd8.fetch_add` until there are no more pieces.
+    `counter` is an int64 array of one zero, from which the kernel takes the number of its next piece with
+    `simd8.fetch_add`.
     """
     counter = np.zeros(1, np.int64)
     helpers = min(torch.get_num_threads(), _CORES) - 1
-    # The first call loads a kernel, which one thread does while the others wait. Ctrl-C at that moment may
-    # leave a lock of LLVM's bindings locked: nobody may be waiting for a helper that waits for it.
+    # The first call loads the kernel under a lock of LLVM's bindings, which Ctrl-C may leave locked: a helper
+    # that waits for it would block this thread.
     if helpers < 1 or not getattr(kernel, "overloads", True):
         kernel(counter, *arguments)
         return
@@ -39,22 +39,22 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
     try:
         kernel(counter, *arguments)
     finally:
-        # By now every piece is taken: a helper that has not started has nothing left to do.
+        # Every piece is taken by now, so a helper that has not started can be cancelled.
         for task in tasks:
             if not task.cancel():
                 task.result()
 
 
 def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[T]:
-    """`function(start, stop)` of all blocks of `size` below `count`, in their order.
+    """The results of `function(start, stop)` for all blocks of `size` below `count`, in order.
 
-    Each runs on one of as many threads as torch uses, which helps where it releases the GIL.
+    They run on as many threads as torch uses, which helps if `function` releases the GIL.
     """
     starts = range(0, count, size)
     results: dict[int, T] = {}
 
     def work(waiting: Iterator[int]) -> None:
-        for start in waiting:  # the next one of all threads
+        for start in waiting:  # shared by all threads
             results[start] = function(start, min(start + size, count))
 
     waiting = iter(starts)

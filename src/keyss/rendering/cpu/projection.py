@@ -1,10 +1,10 @@
-"""From 3D Gaussians to 2D ones: EWA splatting (Zwicker et al. 2001, eq. 31) in the form of 3DGS.
+"""Projects 3D Gaussians to 2D ones: EWA splatting (Zwicker et al. 2001, eq. 31) in the form of 3DGS.
 
 The covariance in the image is V V^T + eps2d I with the 2x3 matrix V = J W R S: the Jacobian of the
-perspective, the camera rotation, the Gaussian's rotation and scales. V itself is kept rather than the
-product, because its determinant is then a sum of squares and cannot cancel.
+perspective, the camera rotation, the Gaussian's rotation and scales. The code keeps V rather than the
+product, because the determinant is then a sum of squares and cannot cancel.
 
-Gaussians are taken 8 at a time, one in each lane of the vectors.
+A vector holds 8 Gaussians, one in each lane.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -64,32 +64,31 @@ from keyss.rendering.cpu.simd8 import (
     store8,
 )
 
-PREFETCH = 24  # how many Gaussians ahead to ask for memory
+PREFETCH = 24  # Gaussians ahead whose memory is prefetched
 RADIUS_MAX = f32(2**30)
 COLUMN = f32(1 / TILE_WIDTH)
 ROW = f32(1 / TILE_HEIGHT)
 
 
 class Linearised(NamedTuple):
-    """8 Gaussians up to V = J W R S, but for the scales: what both directions need of the projection."""
+    """The projection of 8 Gaussians up to J W R, which forward and backward pass share."""
 
-    point: Any  # x, y and depth of the centre in the camera's frame
+    point: Any  # x, y and depth of the centre in camera space
     inverse_depth: Any
     slopes: Any  # x / z and y / z
-    clamped: Any  # the slopes at which the perspective is linearised
+    clamped: Any  # slopes at which the perspective is linearised
     jacobian: Any  # its entries xx, xz, yy and yz; the others are 0
     jw: Any  # rows of J W
     quaternion: Any  # normalised
-    square: Any  # of the quaternion's length
-    norm: Any  # by which it was multiplied
+    square: Any  # squared length of the quaternion
+    norm: Any  # factor that normalised it
     rotation: Any  # rows
     jwr: Any  # rows of J W R
 
 
 @inlined
-def linearised(view, means, quats, ids, start):
+def linearised(camera, settings, means, quats, ids, start):
     """`Linearised` of the 8 Gaussians ids[start:]."""
-    camera = view.camera
     px, py, pz = gather3(means, ids, start, 3, 0)
     x = px * camera[0] + py * camera[1] + pz * camera[2] + camera[TX]
     y = px * camera[3] + py * camera[4] + pz * camera[5] + camera[TY]
@@ -97,8 +96,8 @@ def linearised(view, means, quats, ids, start):
     inverse = divide(ONE, z)
     u = x * inverse
     v = y * inverse
-    clamped_u = _within_margin(u, camera[CX], camera[FX], f32(view.width))
-    clamped_v = _within_margin(v, camera[CY], camera[FY], f32(view.height))
+    clamped_u = _within_margin(u, camera[CX], camera[FX], f32(settings.width))
+    clamped_v = _within_margin(v, camera[CY], camera[FY], f32(settings.height))
     jxx = inverse * camera[FX]
     jyy = inverse * camera[FY]
     jxz = ZERO - jxx * clamped_u
@@ -127,14 +126,14 @@ def linearised(view, means, quats, ids, start):
 
 @inlined
 def _within_margin(slope, centre, focal, size):
-    """Slopes clamped to those that the image and a margin around it have."""
+    """Slopes clamped to the image and a margin around it."""
     margin = FOV_MARGIN * size / focal
     return minimum(maximum(slope, -(centre / focal + margin)), (size - centre) / focal + margin)
 
 
 @inlined
 def _rotation_matrix(quaternion):
-    """The rows of the rotations by unit quaternions."""
+    """The rows of the rotation matrices of unit quaternions."""
     w, x, y, z = quaternion
     return (
         (ONE - (y * y + z * z) * TWO, (x * y - w * z) * TWO, (x * z + w * y) * TWO),
@@ -145,7 +144,7 @@ def _rotation_matrix(quaternion):
 
 @inlined
 def _times_matrix(row, matrix):
-    """A row times a 3x3 matrix, given by its rows."""
+    """A row vector times a 3x3 matrix, given by its rows."""
     return (
         row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
         row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
@@ -155,7 +154,7 @@ def _times_matrix(row, matrix):
 
 @inlined
 def times(a, b):
-    """Products of 3 and 3 vectors, one by one."""
+    """Elementwise products of 3 vectors each."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
@@ -165,7 +164,7 @@ def dot(a, b):
 
 
 @inlined
-def squared_area(u, v):
+def _squared_area(u, v):
     """|u x v|^2, which is det(V V^T) by Cauchy-Binet for the rows u and v of V."""
     x = u[1] * v[2] - u[2] * v[1]
     y = u[2] * v[0] - u[0] * v[2]
@@ -174,18 +173,15 @@ def squared_area(u, v):
 
 
 @kernel
-def project(counter, gaussians, view, projected):
+def project(counter, gaussians, camera, settings, projected):
     """Fill `projected`.
 
-    What cannot be seen, or has a colour of CHANNEL_MAX or more, gets depth 0, radii 0 and no tiles; its
-    footprint means nothing.
-
-    When antialiased, the opacity is multiplied by sqrt(det(V V^T) / det(V V^T + eps2d I)), so that widening a
-    footprint by eps2d does not add to what it covers (Mip-Splatting, Yu et al. 2024, eq. 8).
+    Gaussians that are invisible, or have a colour of CHANNEL_MAX or more, get depth 0, radii 0 and no tiles;
+    their footprints are undefined.
     """
     means, _, _, _, colors = gaussians
-    footprints, features, means2d, depths, radii, tile_bounds = projected
-    camera, sh_count = view.camera, view.sh_count
+    footprints, _, means2d, depths, radii, tile_bounds = projected
+    sh_count = settings.sh_count
     count = means.shape[0]
     ids = np.empty(CHUNK + 8, np.int64)
     seen = np.empty(CHUNK + 8, np.int64)
@@ -201,7 +197,7 @@ def project(counter, gaussians, view, projected):
             ids[k] = start + min(k, size - 1)
         visible = 0
         for k in range(0, size, 8):
-            _project(gaussians, view, footprints, ids, k, results)
+            _project(gaussians, camera, settings, footprints, ids, k, results)
             for lane in range(min(8, size - k)):
                 i = start + k + lane
                 put(means2d, 2 * i, at(results, lane))
@@ -221,7 +217,7 @@ def project(counter, gaussians, view, projected):
                 red, green, blue = shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
                 drawn = (maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO))
                 scatter(footprints, seen, k, PACKED, RED, drawn)
-                # Written so that a NaN counts, too.
+                # Written so that a NaN counts too.
                 size_of_color = absolute(red) + absolute(green) + absolute(blue)
                 if any_gt(select_gt(CHANNEL_MAX, size_of_color, ZERO, ONE), ZERO):
                     store8(results, 0, size_of_color)
@@ -230,18 +226,16 @@ def project(counter, gaussians, view, projected):
                             _hide(seen[k + lane], projected)
         else:
             _copy_colors(colors, seen, visible, projected)
-        if features.shape[1] > 0:
-            _copy_features(sh_count, colors.shape[2], seen, visible, projected)
 
 
 @inlined
-def _project(gaussians, view, footprints, ids, start, results):
+def _project(gaussians, camera, settings, footprints, ids, start, results):
     """Footprints without colour; results = [mean x | mean y | depth | radius x | radius y | tiles]."""
-    camera, width, height, near, far, eps2d, radius_clip, antialiased, _ = view
+    width, height, near, far, eps2d, _ = settings
     opacity = gather1(gaussians.opacities, ids, start)
-    linear = linearised(view, gaussians.means, gaussians.quats, ids, start)
+    linear = linearised(camera, settings, gaussians.means, gaussians.quats, ids, start)
     z = linear.point[2]
-    # `seen` is 1 or 0. Every test is written so that a NaN fails it.
+    # `seen` is 1 or 0. A NaN fails every test.
     seen = select_ge(opacity, ALPHA_MIN, ONE, ZERO)
     seen = select_gt(HUGE, opacity, seen, ZERO)
     seen = select_ge(z, near, seen, ZERO)
@@ -254,13 +248,9 @@ def _project(gaussians, view, footprints, ids, start, results):
     cov_xx = dot(u, u)
     cov_xy = dot(u, v)
     cov_yy = dot(v, v)
-    sharp_det = squared_area(u, v)
-    det = sharp_det + (cov_xx + cov_yy + eps2d) * eps2d
+    det = _squared_area(u, v) + (cov_xx + cov_yy + eps2d) * eps2d
     seen = select_gt(HUGE, det, seen, ZERO)
     inverse = divide(ONE, det)
-    if antialiased:
-        opacity = opacity * square_root(sharp_det * inverse)
-        seen = select_ge(opacity, ALPHA_MIN, seen, ZERO)
     cov_xx = cov_xx + eps2d
     cov_yy = cov_yy + eps2d
     level = maximum(log(maximum(opacity * INVERSE_ALPHA_MIN, ONE)) * TWO, ZERO)
@@ -270,12 +260,12 @@ def _project(gaussians, view, footprints, ids, start, results):
     reach = minimum(sigmas, RADIUS_SIGMAS)
     radius_x = ceil8(reach * sigma_x)
     radius_y = ceil8(reach * sigma_y)
-    seen = select_gt(maximum(radius_x, radius_y), radius_clip, seen, ZERO)
+    seen = select_gt(maximum(radius_x, radius_y), ZERO, seen, ZERO)
     seen = select_gt(mean_x + radius_x, ZERO, seen, ZERO)
     seen = select_gt(f32(width), mean_x - radius_x, seen, ZERO)
     seen = select_gt(mean_y + radius_y, ZERO, seen, ZERO)
     seen = select_gt(f32(height), mean_y - radius_y, seen, ZERO)
-    # A little wider than exact, so that rounding never cuts off a pixel that counts.
+    # Slightly wider than exact, so that rounding never cuts off a visible pixel.
     extent_x = sigmas * sigma_x * f32(1.0005) + f32(1e-3)
     extent_y = sigmas * sigma_y * f32(1.0005) + f32(1e-3)
     columns = _tiles(mean_x, extent_x, width, COLUMN)
@@ -296,7 +286,7 @@ def _project(gaussians, view, footprints, ids, start, results):
 
 @inlined
 def _tiles(centre, extent, size, per_pixel):
-    """How many tiles, along one axis, hold pixel centres within the extents."""
+    """The number of tiles, along one axis, with pixel centres within the extents."""
     first = floor8(maximum(ceil8(centre - extent - HALF), ZERO) * per_pixel)
     last = floor8(minimum(floor8(centre + extent - HALF), f32(size - 1)) * per_pixel)
     return maximum(last - first + ONE, ZERO)
@@ -312,7 +302,7 @@ def _hide(i, projected):
 
 @inlined
 def _copy_colors(colors, seen, visible, projected):
-    """Colours that are no SH: into the footprints where they are drawn from there, else into `features`."""
+    """Copy colours that are not SH into `features`, or into the footprints if it has no columns."""
     footprints, features = projected.footprints, projected.features
     for k in range(visible):
         i = seen[k]
@@ -324,16 +314,3 @@ def _copy_colors(colors, seen, visible, projected):
                 footprints[i, RED + channel] = value
             if not abs(value) < CHANNEL_MAX:
                 _hide(i, projected)
-
-
-@inlined
-def _copy_features(sh_count, color_channels, seen, visible, projected):
-    """Colours computed from SH, and depths, into `features`."""
-    footprints, features, depths = projected.footprints, projected.features, projected.depths
-    for k in range(visible):
-        i = seen[k]
-        if sh_count > 0:
-            for channel in range(3):
-                features[i, channel] = footprints[i, RED + channel]
-        if features.shape[1] > color_channels:
-            features[i, features.shape[1] - 1] = depths[i]

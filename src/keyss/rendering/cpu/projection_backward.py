@@ -1,8 +1,8 @@
-"""Gradients of the Gaussians and of the camera from those of the 2D footprints: `projection` reversed.
+"""Gradients of the Gaussians from those of the 2D footprints: the backward pass of `projection`.
 
-Only Gaussians that some tile drew have a gradient; they are taken 8 at a time, one in each lane of the
-vectors. Where fewer than 8 are left, the last of them fills the lanes that are free: it is computed and
-written several times, always the same.
+Only Gaussians in the list of a tile have a gradient. A vector holds 8 of them, one in each lane; at the end
+the last Gaussian fills the free lanes, and its gradient is computed and written several times, with equal
+results.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -24,9 +24,8 @@ from keyss.rendering.cpu.layout import (
     RED,
     TWO,
     ZERO,
-    f32,
 )
-from keyss.rendering.cpu.projection import PREFETCH, dot, linearised, squared_area, times
+from keyss.rendering.cpu.projection import PREFETCH, dot, linearised, times
 from keyss.rendering.cpu.rows import gather1, gather3, gather4, gather8, load_transposed, scatter
 from keyss.rendering.cpu.shading import prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
@@ -35,56 +34,43 @@ from keyss.rendering.cpu.simd8 import (
     divide,
     fetch_add,
     load8,
-    maximum,
     put,
-    ramp,
     select_ge,
     select_gt,
     splat,
     store8,
-    sum_lanes,
 )
 
-# What `_sum_pairs` puts where in its buffer.
-SUMS = 0  # over all tiles: the first 6 of `layout.MOMENTS`, two more that are not read
-COLOR = 64  # gradients of red, green and blue
-DEPTH = 88  # gradient of the depth
-ALL_SUMS = 96
+# The buffer of `_sum_pairs`.
+COLOR = 64  # gradients of red, green and blue; before them the sums of `layout.MOMENTS` over all tiles
+ALL_SUMS = 88
 
 
 @kernel
 def project_backward(
-    counter, gaussians, view, channels, footprints, first_slots, slot_counts, moments, extras, extra_width,
-    first_camera, need_colors, need_camera, absgrad, gradients, means2d_gradient, means2d_absgrad,
-    camera_gradient,
+    counter, gaussians, camera, settings, channels, footprints, first_slots, slot_counts, moments, extras,
+    first_camera, need_colors, gradients, means2d_gradient,
 ):  # fmt: skip
-    """Add the gradients through one camera; for the first camera, what was in `gradients` is overwritten.
+    """Add the gradients through one camera to `gradients`; for the first camera, overwrite them.
 
-    means2d_gradient and means2d_absgrad are of this camera only. camera_gradient has one row per piece of
-    work: the sums over its Gaussians for rotation (9), translation (3) and position (3). With need_colors
-    or need_camera false, gradients.colors or camera_gradient is not touched. `channels` is 0 where colours
-    were drawn from the footprints, else the number of channels: those of the colours, and one for the depth
-    where there is one more.
+    means2d_gradient is that of this camera only. Without need_colors, gradients.colors is not touched.
+    `channels` is the number of feature channels, 0 if the colours are in the footprints.
     """
     means, colors, colors_gradient = gaussians.means, gaussians.colors, gradients.colors
-    camera, sh_count = view.camera, view.sh_count
+    sh_count = settings.sh_count
     count = means.shape[0]
-    with_depth = channels > colors.shape[2]
     ids = np.empty(CHUNK + 8, np.int64)
     sums = np.empty(ALL_SUMS, np.float32)
     basis = np.empty(16 * 8, np.float32)
     coefficients = np.empty(48 * 8, np.float32)
     results = np.empty(3 * 8, np.float32)
-    camera_sums = np.empty(15, np.float64)
     while True:
         piece = fetch_add(counter, 0, 1)
         if piece * CHUNK >= count:
             break
-        for k in range(15):
-            camera_sums[k] = 0.0
         drawn = _find_drawn(
             piece * CHUNK, min((piece + 1) * CHUNK, count), sh_count, slot_counts, first_camera, need_colors,
-            absgrad, ids, gradients, means2d_gradient, means2d_absgrad,
+            ids, gradients, means2d_gradient,
         )  # fmt: skip
         for k in range(drawn, drawn + 8):
             ids[k] = ids[max(drawn - 1, 0)]
@@ -94,15 +80,14 @@ def project_backward(
                 for ahead in range(start + PREFETCH, min(start + PREFETCH + 8, drawn)):
                     prefetch_coefficients(colors, sh_count, at(ids, ahead))
             _sum_pairs(
-                ids, start, size, first_slots, slot_counts, moments, extras, extra_width, channels,
-                with_depth, sh_count, first_camera, need_colors, absgrad, colors_gradient,
-                means2d_absgrad, sums,
+                ids, start, size, first_slots, slot_counts, moments, extras, channels, first_camera,
+                need_colors, colors_gradient, sums,
             )  # fmt: skip
             through_color = (splat(ZERO), splat(ZERO), splat(ZERO))
             if sh_count > 0:
                 _, _, _, _, _, _, _, red = gather8(footprints, ids, start, PACKED, RED - RED % 8)
                 green, blue, _, _, _, _, _, _ = gather8(footprints, ids, start, PACKED, GREEN - GREEN % 8)
-                # The maximum of 0.5 + basis . colors and 0 lets no gradient through where it is 0.
+                # No gradient passes where 0.5 + basis . colors was clamped to 0.
                 red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
                 green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
                 blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
@@ -118,26 +103,22 @@ def project_backward(
                             value += colors_gradient[ids[start + lane], 0, channel]
                         colors_gradient[ids[start + lane], 0, channel] = value
             _gaussian_gradients(
-                gaussians, view, footprints, ids, start, size, with_depth, need_camera, first_camera, sums,
-                through_color, gradients, means2d_gradient, camera_sums, results,
+                gaussians, camera, settings, footprints, ids, start, first_camera, sums, through_color,
+                gradients, means2d_gradient, results,
             )  # fmt: skip
-        if need_camera:
-            for k in range(15):
-                camera_gradient[piece, k] = camera_sums[k]
 
 
 @inlined
 def _find_drawn(
-    start, end, sh_count, slot_counts, first_camera, need_colors, absgrad, ids, gradients, means2d_gradient,
-    means2d_absgrad,
+    start, end, sh_count, slot_counts, first_camera, need_colors, ids, gradients, means2d_gradient,
 ):  # fmt: skip
-    """Fill `ids` with those Gaussians that have pairs; returns how many. Zeros all other gradients."""
+    """Fill `ids` with the Gaussians that have pairs; returns their number. Zeros the other gradients."""
     means_gradient, quats_gradient, scales_gradient, opacities_gradient, colors_gradient = gradients
     channels = colors_gradient.shape[2]
     stride = colors_gradient.shape[1] * channels
     drawn = 0
     for i in range(start, end):
-        used = 0  # colour gradients that are overwritten later
+        used = 0  # colour gradients that will be overwritten
         if at(slot_counts, i) > 0:
             put(ids, drawn, i)
             drawn += 1
@@ -145,8 +126,6 @@ def _find_drawn(
         else:
             for k in range(2 * i, 2 * i + 2):
                 put(means2d_gradient, k, ZERO)
-                if absgrad:
-                    put(means2d_absgrad, k, ZERO)
             if first_camera:
                 for k in range(3 * i, 3 * i + 3):
                     put(means_gradient, k, ZERO)
@@ -162,14 +141,14 @@ def _find_drawn(
 
 @inlined
 def _sum_pairs(
-    ids, start, size, first_slots, slot_counts, moments, extras, extra_width, channels, with_depth, sh_count,
-    first_camera, need_colors, absgrad, colors_gradient, means2d_absgrad, sums,
+    ids, start, size, first_slots, slot_counts, moments, extras, channels, first_camera, need_colors,
+    colors_gradient, sums,
 ):  # fmt: skip
-    """The sums over all tiles of a Gaussian, for the 8 of ids[start:], into `sums`.
+    """Sum over the tiles of each of the 8 Gaussians ids[start:], into `sums`.
 
-    Gradients of channels that are no SH, and for absgrad, are handed out here.
+    Gradients of feature channels are final, and go to colors_gradient.
     """
-    store8(sums, DEPTH, splat(ZERO))
+    extra_width = max(channels, 1)
     for lane in range(8):
         i = at(ids, start + lane)
         first = np.int64(at(first_slots, i))
@@ -177,30 +156,24 @@ def _sum_pairs(
         own = splat(ZERO)
         for slot in range(first, after):
             own = own + load8(moments, slot * MOMENTS)
-        store8(sums, SUMS + 8 * lane, own)
+        store8(sums, 8 * lane, own)
         for extra in range(extra_width):
             total = ZERO
             for slot in range(first, after):
                 total += at(extras, slot * extra_width + extra)
-            if absgrad and extra >= extra_width - 2:
-                means2d_absgrad[i, extra + 2 - extra_width] = total
-            elif channels == 0:
+            if channels == 0:
                 put(sums, COLOR + 16 + lane, total)
-            elif with_depth and extra == channels - 1:
-                put(sums, DEPTH + lane, total)
-            elif sh_count > 0:
-                put(sums, COLOR + 8 * extra + lane, total)
             elif need_colors and lane < size:
                 if not first_camera:
                     total += colors_gradient[i, 0, extra]
                 colors_gradient[i, 0, extra] = total
-    m0, m1, m2, m3, m4, m5, red, green = load_transposed(sums, SUMS)
-    store8(sums, SUMS, m0)
-    store8(sums, SUMS + 8, m1)
-    store8(sums, SUMS + 16, m2)
-    store8(sums, SUMS + 24, m3)
-    store8(sums, SUMS + 32, m4)
-    store8(sums, SUMS + 40, m5)
+    m0, m1, m2, m3, m4, m5, red, green = load_transposed(sums, 0)
+    store8(sums, 0, m0)
+    store8(sums, 8, m1)
+    store8(sums, 16, m2)
+    store8(sums, 24, m3)
+    store8(sums, 32, m4)
+    store8(sums, 40, m5)
     if channels == 0:
         store8(sums, COLOR, red)
         store8(sums, COLOR + 8, green)
@@ -208,17 +181,16 @@ def _sum_pairs(
 
 @inlined
 def _gaussian_gradients(
-    gaussians, view, footprints, ids, start, size, with_depth, need_camera, first_camera, sums, through_color,
-    gradients, means2d_gradient, camera_sums, results,
+    gaussians, camera, settings, footprints, ids, start, first_camera, sums, through_color, gradients,
+    means2d_gradient, results,
 ):  # fmt: skip
-    """Through the 2D footprints and the perspective. `through_color`: dL/d(mean) through the directions."""
-    camera = view.camera
-    s_1 = load8(sums, SUMS)
-    s_x = load8(sums, SUMS + 8)
-    s_y = load8(sums, SUMS + 16)
-    s_xx = load8(sums, SUMS + 24)
-    s_xy = load8(sums, SUMS + 32)
-    s_yy = load8(sums, SUMS + 40)
+    """Go back through footprint and perspective. `through_color`: dL/d(mean) through the view directions."""
+    s_1 = load8(sums, 0)
+    s_x = load8(sums, 8)
+    s_y = load8(sums, 16)
+    s_xx = load8(sums, 24)
+    s_xy = load8(sums, 32)
+    s_yy = load8(sums, 40)
     _, _, conic_xx, conic_xy, conic_yy, _, _, _ = gather8(footprints, ids, start, PACKED, 0)
     conic_xx = conic_xx * -TWO
     conic_xy = conic_xy * -ONE
@@ -246,19 +218,9 @@ def _gaussian_gradients(
     cov_xy = (t_00 * conic_xy + t_01 * conic_yy) * HALF
     cov_yy = (t_10 * conic_xy + t_11 * conic_yy) * HALF
 
-    linear = linearised(view, gaussians.means, gaussians.quats, ids, start)
+    linear = linearised(camera, settings, gaussians.means, gaussians.quats, ids, start)
     p, q = linear.jwr
     scales = gather3(gaussians.scales, ids, start, 3, 0)
-    if view.antialiased:
-        # The opacity drawn is opacity sqrt(det(V V^T) / det(covariance)), and s_1 the gradient of its
-        # logarithm; d(log det M) = M^-1. Nothing with a vanishing determinant was drawn.
-        u = times(p, scales)
-        v = times(q, scales)
-        inverse = divide(ONE, maximum(squared_area(u, v), NORM_MIN))
-        half = s_1 * HALF
-        cov_xx = cov_xx + half * (dot(v, v) * inverse - conic_xx)
-        cov_xy = cov_xy - half * (dot(u, v) * inverse + conic_xy)
-        cov_yy = cov_yy + half * (dot(u, u) * inverse - conic_yy)
 
     # dL/dV = 2 dL/d(covariance) V, then scales, rotation and the rows of J W.
     doubled = (scales[0] * TWO, scales[1] * TWO, scales[2] * TWO)
@@ -279,7 +241,7 @@ def _gaussian_gradients(
     ey = (qx * (d10 + d01) + qz * (d21 + d12) + qw * (d02 - d20) - qy * (d00 + d22) * TWO) * TWO
     ez = (qx * (d20 + d02) + qy * (d21 + d12) + qw * (d10 - d01) - qz * (d00 + d11) * TWO) * TWO
     along = ew * qw + ex * qx + ey * qy + ez * qz
-    # A zero quaternion is drawn without a rotation, and stays so.
+    # A zero quaternion is rendered without rotation, and gets no gradient.
     norm = select_gt(linear.square, NORM_MIN, linear.norm, ZERO)
     quat_gradient = (
         _finite((ew - along * qw) * norm),
@@ -296,8 +258,8 @@ def _gaussian_gradients(
     da = (_finite(dot(du, r[0])), _finite(dot(du, r[1])), _finite(dot(du, r[2])))
     db = (_finite(dot(dv, r[0])), _finite(dot(dv, r[1])), _finite(dot(dv, r[2])))
 
-    # Through J and the projected centre to the mean in camera space (tx, ty, tz). Where the slope was
-    # clamped, J does not depend on it.
+    # Through J and the projected centre to the mean in camera space (tx, ty, tz). J does not depend on a
+    # clamped slope.
     jxx, _, jyy, _ = linear.jacobian
     clamped_x, clamped_y = linear.clamped
     djxx = da[0] * camera[0] + da[1] * camera[1] + da[2] * camera[2]
@@ -313,8 +275,6 @@ def _gaussian_gradients(
     tz = ZERO - (mean_x * linear.slopes[0] + mean_y * linear.slopes[1])
     tz = tz - (djxx * jxx + djyy * jyy) * linear.inverse_depth
     tz = tz + djxz * clamped_x * (free_x + ONE) + djyz * clamped_y * (free_y + ONE)
-    if with_depth:
-        tz = tz + load8(sums, DEPTH)
     tx, ty, tz = _finite(tx), _finite(ty), _finite(tz)
     dx, dy, dz = through_color
     mean_gradient = (
@@ -323,37 +283,17 @@ def _gaussian_gradients(
         tx * camera[2] + ty * camera[5] + tz * camera[8] + dz,
     )
     _add3(gradients.means, ids, start, first_camera, mean_gradient)
-    if need_camera:
-        mean = gather3(gaussians.means, ids, start, 3, 0)
-        # Lanes that repeat a Gaussian do not count.
-        valid = select_gt(f32(size), ramp(ZERO), ONE, ZERO)
-        t, jacobian = (tx, ty, tz), linear.jacobian
-        _add_to_camera(camera_sums, 0, valid, jacobian, da[0], db[0], t, tx, mean[0], dx)
-        _add_to_camera(camera_sums, 1, valid, jacobian, da[1], db[1], t, ty, mean[1], dy)
-        _add_to_camera(camera_sums, 2, valid, jacobian, da[2], db[2], t, tz, mean[2], dz)
-
-
-@inlined
-def _add_to_camera(camera_sums, k, valid, jacobian, da, db, t, t_k, mean, through_color):
-    """Column k of the camera's rotation, row k of its translation and position."""
-    jxx, jxz, jyy, jyz = jacobian
-    tx, ty, tz = t
-    camera_sums[k] += sum_lanes(valid * (jxx * da + tx * mean))
-    camera_sums[3 + k] += sum_lanes(valid * (jyy * db + ty * mean))
-    camera_sums[6 + k] += sum_lanes(valid * (jxz * da + jyz * db + tz * mean))
-    camera_sums[9 + k] += sum_lanes(valid * t_k)
-    camera_sums[12 + k] -= sum_lanes(valid * through_color)
 
 
 @inlined
 def _combined(x, p, y, q):
-    """x p + y q, for vectors x and y and 3 vectors each in p and q."""
+    """x p + y q, with 3 vectors each in p and q."""
     return x * p[0] + y * q[0], x * p[1] + y * q[1], x * p[2] + y * q[2]
 
 
 @inlined
 def _finite(a):
-    """`a`; 0 where it is beyond what can be multiplied, or no number, as for Gaussians of absurd sizes."""
+    """`a`, and 0 where it is NaN or too large to multiply, as happens for Gaussians of absurd sizes."""
     return select_gt(HUGE, absolute(a), a, ZERO)
 
 

@@ -1,9 +1,9 @@
-"""The kernels put together: forward and backward of all cameras as one torch.autograd.Function."""
+"""Forward and backward pass of all cameras as one torch.autograd.Function."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,96 +20,76 @@ from keyss.rendering.cpu import (
     projection_backward,
 )
 from keyss.rendering.cpu.jit import announce_compilation
-from keyss.rendering.cpu.layout import (
-    CAMERA,
-    CHUNK,
-    FX,
-    MOMENTS,
-    PACKED,
-    POSITION,
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    TX,
-)
+from keyss.rendering.cpu.layout import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
 from keyss.rendering.cpu.memory import Array
 from keyss.rendering.cpu.parallel import run
-from keyss.rendering.cpu.records import GaussianArrays, ProjectedArrays, ViewSettings
 
-MAX_PAIRS = 2**31 - 1  # places in the lists of tiles are int32
+MAX_PAIRS = 2**31 - 1  # positions in the lists of tiles are int32
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What a call is made with besides tensors; see `keyss.rendering.rasterization`."""
+class GaussianArrays(NamedTuple):
+    """N Gaussians, or gradients of the same shapes."""
+
+    means: Array  # [N, 3]
+    quats: Array  # [N, 4]
+    scales: Array  # [N, 3]
+    opacities: Array  # [N]
+    colors: Array  # [N, K, 3] SH coefficients; [N, 1, channels] where sh_count is 0
+
+
+class Settings(NamedTuple):
+    """Arguments of a call that are not arrays; see `keyss.rendering.rasterization`."""
 
     width: int
     height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
+    near_plane: np.float32
+    far_plane: np.float32
+    eps2d: np.float32
     sh_count: int  # SH coefficients to use; 0 where colours are channels
-    color_channels: int
-    with_depth: bool  # draw the depth as one more channel
-    antialiased: bool
-    absgrad: bool
 
-    def view(self, camera: Array) -> ViewSettings:
-        """What kernels need to know of a camera [CAMERA]."""
-        distances = (self.near_plane, self.far_plane, self.eps2d, self.radius_clip)
-        near, far, eps2d, radius_clip = (np.float32(distance) for distance in distances)
-        return ViewSettings(
-            camera, self.width, self.height, near, far, eps2d, radius_clip, self.antialiased, self.sh_count
-        )
 
-    @property
-    def channels(self) -> int:
-        """How many channels the image has."""
-        return self.color_channels + self.with_depth
+class ProjectedArrays(NamedTuple):
+    """Results of `projection.project` for N Gaussians."""
 
-    @property
-    def feature_channels(self) -> int:
-        """Channels in an array of their own; 0 where the three colours lie in the footprints."""
-        return self.channels if self.with_depth or self.color_channels != 3 else 0
-
-    @property
-    def extra_width(self) -> int:
-        """Floats per (Gaussian, tile) pair beside the `layout.MOMENTS`."""
-        return (self.feature_channels or 1) + (2 if self.absgrad else 0)
+    footprints: Array  # [N, PACKED], see `layout`
+    features: Array  # [N, channels] colours; no columns if they are in the footprints
+    means2d: Array  # [N, 2] pixels
+    depths: Array  # [N]; 0 for invisible Gaussians
+    radii: Array  # [N, 2] int32, pixels; 0 for invisible Gaussians
+    tile_bounds: Array  # [N] int32, upper bound of the tiles that the Gaussian touches
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """What the backward pass needs to know of one camera's forward pass."""
+class Rendering:
+    """One camera's forward pass, as far as the backward pass needs it."""
 
-    view: ViewSettings
+    camera: Array  # [CAMERA], see `layout`
     footprints: Array  # [N, PACKED]
-    features: Array | None  # [N, feature_channels] channels to draw; None for colours in the footprints
+    features: Array | None  # [N, channels] colours; None if they are in the footprints
     first_slots: Array  # [N] first slot of each Gaussian's pairs
-    slot_counts: Array  # [N] how many pairs it has
+    slot_counts: Array  # [N] number of its pairs
     tile_starts: Array  # [tiles + 1] first list entry of each tile
     entries: Array  # [pairs] Gaussians and their rows, see `layout.ENTRY_ROWS_SHIFT`
-    entry_slots: Array  # [pairs] the slot of each list entry; empty where no gradients are needed
-    ends: Array  # [tiles] first list entry that the tile did not come to
+    entry_slots: Array  # [pairs] the slot of each list entry; empty without gradients
+    ends: Array  # [tiles] the list entry at which the tile was full
 
 
 def rasterize(
+    settings: Settings,
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, K, 3] SH coefficients; [N, 1, color_channels] where settings.sh_count is 0
+    colors: Tensor,  # [N, K, 3] SH coefficients; [N, 1, D] where settings.sh_count is 0
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
-    backgrounds: Tensor,  # [C, D] with D = settings.channels
-    settings: Settings,
+    backgrounds: Tensor,  # [C, D]
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Draw float32 contiguous CPU tensors. Returns images [C, H, W, D], alphas [C, H, W, 1] and meta."""
+    """Render float32 contiguous CPU tensors. Returns images [C, H, W, D], alphas [C, H, W, 1] and meta."""
     cameras, count = len(viewmats), len(means)
     means2d = _empty(cameras, count, 2)
-    # The gradient with respect to the projected centres is handed out through an input of its own: the
-    # Function reads nothing from it, but returns dL/d(means2d) for it.
-    geometry = (means, quats, scales, opacities, viewmats)
+    # means2d is an input of the Function, which fills it and returns dL/d(means2d) as its gradient.
+    geometry = (means, quats, scales, opacities)
     means2d.requires_grad_(torch.is_grad_enabled() and any(tensor.requires_grad for tensor in geometry))
     meta: dict[str, Any] = {
         "means2d": means2d,
@@ -117,7 +97,7 @@ def rasterize(
         "radii": _empty(cameras, count, 2, dtype=np.int32),
     }
     images, alphas = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        means, quats, scales, opacities, colors, viewmats, backgrounds, means2d, Ks, settings, meta
+        means, quats, scales, opacities, colors, backgrounds, means2d, viewmats, Ks, settings, meta
     )
     return images, alphas, meta
 
@@ -131,27 +111,27 @@ class _Rasterize(torch.autograd.Function):
         scales: Tensor,
         opacities: Tensor,
         colors: Tensor,
-        viewmats: Tensor,
         backgrounds: Tensor,
         means2d: Tensor,
+        viewmats: Tensor,
         Ks: Tensor,
         settings: Settings,
         meta: dict[str, Any],
     ) -> tuple[Tensor, Tensor]:
         announce_compilation()
         shape = (len(viewmats), settings.height, settings.width)
-        images = _empty(*shape, settings.channels)
+        images = _empty(*shape, backgrounds.shape[1])
         alphas = _empty(*shape, 1)
-        transmittances = _empty(*shape)  # 1 - alphas, without the rounding where alpha is nearly 1
+        transmittances = _empty(*shape)  # 1 - alphas, but exact where alpha is nearly 1
         tensors = (means, quats, scales, opacities, colors)
         gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
-        drawings = []
+        renderings = []
         for c in range(len(viewmats)):
-            drawing = _draw(
+            rendering = _render(
                 gaussians,
-                settings.view(_camera_array(viewmats[c], Ks[c])),
-                backgrounds[c].detach().numpy(),
+                _camera_array(viewmats[c], Ks[c]),
                 settings,
+                backgrounds[c].detach().numpy(),
                 any(ctx.needs_input_grad),
                 means2d.detach()[c].numpy(),
                 meta["depths"][c].numpy(),
@@ -161,10 +141,10 @@ class _Rasterize(torch.autograd.Function):
                 transmittances[c].numpy(),
             )
             if any(ctx.needs_input_grad):
-                drawings.append(drawing)
-        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, images, transmittances)
+                renderings.append(rendering)
+        ctx.save_for_backward(means, quats, scales, opacities, colors, images, transmittances)
         ctx.means2d = means2d
-        ctx.drawings = drawings
+        ctx.renderings = renderings
         ctx.settings = settings
         ctx.set_materialize_grads(False)
         return images, alphas
@@ -174,7 +154,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, images_gradient: Tensor | None, alphas_gradient: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        means, quats, scales, opacities, colors, viewmats, images, transmittances = ctx.saved_tensors
+        *gaussians, images, transmittances = ctx.saved_tensors
         settings: Settings = ctx.settings
         if images_gradient is None:
             images_gradient = torch.zeros_like(images)
@@ -182,49 +162,41 @@ class _Rasterize(torch.autograd.Function):
             alphas_gradient = torch.zeros_like(transmittances)
         images_gradient = images_gradient.contiguous()
         alphas_gradient = alphas_gradient.reshape(transmittances.shape).contiguous()
-        need_colors, need_camera, need_background = ctx.needs_input_grad[4:7]
+        need_colors, need_background = ctx.needs_input_grad[4:6]
 
-        gaussians = (means, quats, scales, opacities, colors)
         shapes = [tuple(tensor.shape) for tensor in (*gaussians, ctx.means2d)]
         if not need_colors:
-            shapes[4] = (0, 1, settings.color_channels)
+            shapes[4] = (0, 1, images.shape[-1])
         *gradients, means2d_gradient = (_empty(*shape) for shape in shapes)
-        if not ctx.drawings:  # no camera, and it is the first one that overwrites what is in this memory
+        if not ctx.renderings:  # the first camera would have overwritten the memory
             for gradient in gradients:
                 gradient.zero_()
-        absgrad = torch.empty_like(ctx.means2d if settings.absgrad else means2d_gradient[:, :0])
-        pieces = -(-len(means) // CHUNK)
-        camera_gradient = np.zeros((pieces if need_camera else 0, 15))
-        viewmats_gradient = torch.zeros_like(viewmats) if need_camera else None
         arrays, gradient_arrays = (
             GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
             for tensors in (gaussians, gradients)
         )
-        for c, drawing in enumerate(ctx.drawings):
-            moments, extras = _blend_backward(
-                drawing,
-                images[c].numpy(),
-                transmittances[c].numpy(),
-                images_gradient[c].numpy(),
-                alphas_gradient[c].numpy(),
-                settings,
-            )
+        for c, rendering in enumerate(ctx.renderings):
+            channels = 0 if rendering.features is None else images.shape[-1]
+            slots = len(rendering.entries)
+            moments = memory.empty((slots * MOMENTS,), np.float32)
+            extras = memory.empty((slots * max(channels, 1),), np.float32)
             run(
-                projection_backward.project_backward, arrays, drawing.view, settings.feature_channels,
-                drawing.footprints, drawing.first_slots, drawing.slot_counts, moments, extras,
-                settings.extra_width, c == 0, need_colors, need_camera, settings.absgrad, gradient_arrays,
-                means2d_gradient[c].detach().numpy(), absgrad[c].detach().numpy(), camera_gradient,
+                blending_backward.blend_backward, rendering.footprints, rendering.features,
+                rendering.entries, rendering.entry_slots, rendering.tile_starts, rendering.ends,
+                -(-settings.width // TILE_WIDTH), images[c].numpy(), transmittances[c].numpy(),
+                images_gradient[c].numpy(), alphas_gradient[c].numpy(), moments, extras,
             )  # fmt: skip
-            if viewmats_gradient is not None:
-                viewmats_gradient[c] = _viewmat_gradient(camera_gradient, viewmats[c])
-        if settings.absgrad:
-            ctx.means2d.absgrad = absgrad
+            run(
+                projection_backward.project_backward, arrays, rendering.camera, settings, channels,
+                rendering.footprints, rendering.first_slots, rendering.slot_counts, moments, extras, c == 0,
+                need_colors, gradient_arrays, means2d_gradient[c].detach().numpy(),
+            )  # fmt: skip
         backgrounds_gradient = None
         if need_background:
-            # numpy's sum, unlike torch's, does not depend on the number of threads.
+            # Unlike torch's sum, numpy's does not depend on the number of threads.
             weighted = (images_gradient.double() * transmittances.double()[..., None]).numpy()
             backgrounds_gradient = torch.from_numpy(weighted.sum((1, 2))).float()
-        returned = (*gradients, viewmats_gradient, backgrounds_gradient, means2d_gradient, None, None, None)
+        returned = (*gradients, backgrounds_gradient, means2d_gradient, None, None, None, None)
         return tuple(
             gradient if needed else None
             for gradient, needed in zip(returned, ctx.needs_input_grad, strict=True)
@@ -232,15 +204,15 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _empty(*shape: int, dtype: Any = np.float32) -> Tensor:
-    """An uninitialised tensor in memory that is used again."""
+    """An uninitialised tensor in recycled memory."""
     return torch.from_numpy(memory.empty(shape, dtype))
 
 
-def _draw(
+def _render(
     gaussians: GaussianArrays,
-    view: ViewSettings,
-    background: Array,
+    camera: Array,
     settings: Settings,
+    background: Array,
     for_backward: bool,
     means2d: Array,
     depths: Array,
@@ -248,17 +220,19 @@ def _draw(
     image: Array,
     alpha: Array,
     transmittance: Array,
-) -> Drawing:
+) -> Rendering:
     """One camera's forward pass; fills the last six arrays."""
     count = len(gaussians.means)
     width, height = settings.width, settings.height
     columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
     footprints = memory.empty((count, PACKED), np.float32)
-    features = memory.empty((count, settings.feature_channels), np.float32)
-    slot_counts = memory.empty((count,), np.int32)  # at first a bound
+    # Three colours fit into the footprints.
+    channels = 0 if image.shape[2] == 3 else image.shape[2]
+    features = memory.empty((count, channels), np.float32)
+    slot_counts = memory.empty((count,), np.int32)  # upper bounds at first
     projected = ProjectedArrays(footprints, features, means2d, depths, radii, slot_counts)
-    run(projection.project, gaussians, view, projected)
+    run(projection.project, gaussians, camera, settings, projected)
     order, spare_order = (memory.empty((count,), np.int32) for _ in range(2))
     keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
     visible = binning.sort_by_depth(depths, order, spare_order, keys, spare_keys)
@@ -267,14 +241,14 @@ def _draw(
     shares = 4 * torch.get_num_threads() if torch.get_num_threads() > 1 else 1
     starts = memory.empty((shares + 1,), np.int64)
     binning.share_bounds(order, slot_counts, starts)
-    most_pairs = int(starts[-1])
-    if most_pairs >= MAX_PAIRS:
+    max_pairs = int(starts[-1])
+    if max_pairs >= MAX_PAIRS:
         raise BackendError(
-            f"{visible} Gaussians cover {most_pairs} tiles together, more than the CPU rasterizer can list "
+            f"{visible} Gaussians cover {max_pairs} tiles together, more than the CPU rasterizer can list "
             f"({MAX_PAIRS}): render fewer or smaller Gaussians, or at a lower resolution"
         )
-    tiles = memory.empty((most_pairs + 1,), np.int32)
-    rows_of_pairs = memory.empty((most_pairs + 1,), np.int16)
+    tiles = memory.empty((max_pairs + 1,), np.int32)
+    rows_of_pairs = memory.empty((max_pairs + 1,), np.int16)
     cursors = memory.empty((shares, columns * rows), np.int64)
     run(
         binning.list_pairs, footprints, order, columns, height, starts, tiles, rows_of_pairs, slot_counts,
@@ -290,39 +264,26 @@ def _draw(
         entry_slots,
     )  # fmt: skip
     ends = memory.empty((columns * rows,), np.int64)
-    own_colors = features if settings.feature_channels else None
+    used_features = features if channels else None
     run(
-        blending.blend, footprints, own_colors, entries, tile_starts, columns, background, image, alpha,
+        blending.blend, footprints, used_features, entries, tile_starts, columns, background, image, alpha,
         transmittance, ends,
     )  # fmt: skip
-    return Drawing(
-        view, footprints, own_colors, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
+    return Rendering(
+        camera,
+        footprints,
+        used_features,
+        first_slots,
+        slot_counts,
+        tile_starts,
+        entries,
+        entry_slots,
+        ends,
     )
 
 
-def _blend_backward(
-    drawing: Drawing,
-    image: Array,
-    transmittance: Array,
-    image_gradient: Array,
-    alpha_gradient: Array,
-    settings: Settings,
-) -> tuple[Array, Array]:
-    """The sums over each (Gaussian, tile) pair: [slots * MOMENTS] and [slots * extra_width], see `layout`."""
-    slots = len(drawing.entries)
-    moments = memory.empty((slots * MOMENTS,), np.float32)
-    extras = memory.empty((slots * settings.extra_width,), np.float32)
-    run(
-        blending_backward.blend_backward, drawing.footprints, drawing.features, drawing.entries,
-        drawing.entry_slots, drawing.tile_starts, drawing.ends, -(-settings.width // TILE_WIDTH), image,
-        transmittance, image_gradient, alpha_gradient, moments, extras, settings.extra_width,
-        settings.absgrad,
-    )  # fmt: skip
-    return moments, extras
-
-
 def _camera_array(viewmat: Tensor, K: Tensor) -> Array:
-    """The camera as the kernels want it, see `layout.CAMERA`."""
+    """[CAMERA] the camera in the layout of the kernels."""
     view = viewmat.detach().double().numpy()
     intrinsics = K.detach().double().numpy()
     camera = memory.empty((CAMERA,), np.float32)
@@ -331,14 +292,3 @@ def _camera_array(viewmat: Tensor, K: Tensor) -> Array:
     camera[FX:POSITION] = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     camera[POSITION:] = -view[:3, :3].T @ view[:3, 3]
     return camera
-
-
-def _viewmat_gradient(pieces: Array, viewmat: Tensor) -> Tensor:
-    """[4, 4] from the sums that `project_backward` leaves, through position = -R^T t."""
-    sums = pieces.sum(0)
-    rotation, translation, position = sums[:9].reshape(3, 3), sums[9:12], sums[12:15]
-    view = viewmat.detach().double().numpy()
-    gradient = np.zeros((4, 4))
-    gradient[:3, :3] = rotation - np.outer(view[:3, 3], position)
-    gradient[:3, 3] = translation - view[:3, :3] @ position
-    return torch.from_numpy(gradient)

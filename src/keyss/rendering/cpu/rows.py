@@ -1,7 +1,7 @@
-"""Rows of arrays in and out of vectors: column k of 8 rows, which may lie anywhere, becomes one vector.
+"""Gathers and scatters rows of arrays: column k of 8 rows becomes one vector.
 
-A row is what an array holds of one Gaussian; `ids[start:start + 8]` says which 8. One may be there several
-times; what is stored must then be the same for all of them. Arrays are flat: row i starts at i * stride.
+A row belongs to one Gaussian; `ids[start:start + 8]` selects 8 of them. A Gaussian may occur several times if
+the stored values are equal. Arrays are flat: row i starts at i * stride.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -16,9 +16,9 @@ from keyss.rendering.cpu.simd8 import FLOAT, INT, VECTOR, element, float32x8, in
 
 
 def _transposed(builder, rows):
-    """The 8 vectors whose i-th has the i-th lanes of all rows, in their order."""
+    """The transpose of 8 vectors: the i-th result has the i-th lanes of all rows."""
     rows = list(rows)
-    # Lanes are exchanged between rows 4, 2 and 1 apart.
+    # Exchange lanes between rows 4, 2 and 1 apart.
     for distance in (4, 2, 1):
         low = [lane if not lane & distance else 8 + lane - distance for lane in range(8)]
         high = [lane + distance if not lane & distance else 8 + lane for lane in range(8)]
@@ -31,7 +31,7 @@ def _transposed(builder, rows):
 
 
 def _addresses(context, builder, signature, arguments):
-    """Where the columns of each of the 8 rows start, for arguments (array, ids, start, stride, column)."""
+    """The addresses of the 8 rows at `column`, for arguments (array, ids, start, stride, column)."""
     array, ids, start, stride, column = arguments[:5]
     first = element(context, builder, signature.args[1], ids, start)
     for lane in range(8):
@@ -41,7 +41,7 @@ def _addresses(context, builder, signature, arguments):
 
 
 def _parts(builder, address, count):
-    """`count` floats as vectors of 8, 4, 2 and 1: (first lane, lanes, address). Nothing beyond is touched."""
+    """`count` floats as vectors of 8, 4, 2 and 1: (first lane, lanes, address)."""
     first = 0
     for size in (8, 4, 2, 1):
         if count & size:
@@ -93,7 +93,7 @@ def gather1(typingctx, array, ids, start):
 
 @intrinsic
 def scatter(typingctx, array, ids, start, stride, column, values):
-    """Write a tuple of vectors to as many columns, from `column` on."""
+    """Write a tuple of vectors to the columns from `column` on."""
 
     def codegen(context, builder, signature, arguments):
         count = signature.args[5].count

@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, for 8 directions at a time: basis, and gradient by direction.
+"""Real spherical harmonics up to degree 3 for 8 directions at a time: basis and gradient.
 
 The polynomials are those of Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013), with the sign
 convention of 3DGS. The k-th of 8 basis functions is the vector at 8 k.

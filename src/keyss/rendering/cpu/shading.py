@@ -1,4 +1,4 @@
-"""Colours as seen from the camera, from SH coefficients, and their gradients; 8 Gaussians at a time."""
+"""View-dependent colours from SH coefficients, and their gradients, for 8 Gaussians at a time."""
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
 
@@ -24,7 +24,7 @@ from keyss.rendering.cpu.simd8 import (
 
 @inlined
 def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
-    """Red, green and blue, not clamped, of the 8 Gaussians ids[start:]."""
+    """Unclamped red, green and blue of the 8 Gaussians ids[start:]."""
     px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z, _ = view_directions(camera, px, py, pz)
     sh_basis(basis, sh_count, x, y, z)
@@ -45,9 +45,9 @@ def shade_backward(
     means, colors, sh_count, camera, ids, start, red, green, blue, first_camera, need_colors, basis,
     coefficients, colors_gradient,
 ):  # fmt: skip
-    """Gradients of the SH coefficients from those of the colours; returns dL/d(mean) through the directions.
+    """Gradients of the SH coefficients; returns dL/d(mean) through the view directions.
 
-    For the first camera what was in colors_gradient is overwritten, for others added to.
+    Adds to colors_gradient; for the first camera, overwrites it.
     """
     px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z, inverse = view_directions(camera, px, py, pz)
@@ -87,7 +87,7 @@ def shade_backward(
 
 @inlined
 def view_directions(camera, px, py, pz):
-    """Unit vectors from the camera to points of the world, and the inverse of the distances."""
+    """Unit vectors from the camera to world points, and inverse distances."""
     x = px - camera[POSITION]
     y = py - camera[POSITION + 1]
     z = pz - camera[POSITION + 2]
@@ -97,13 +97,13 @@ def view_directions(camera, px, py, pz):
 
 @inlined
 def inverse_length(square):
-    """1 / sqrt(square), for squares of no length a finite number."""
+    """1 / sqrt(square); a large finite number for 0."""
     return divide(ONE, square_root(maximum(square, NORM_MIN)))
 
 
 @inlined
 def prefetch_coefficients(colors, sh_count, i):
-    """Ask for the memory of the SH coefficients of Gaussian i."""
+    """Prefetch the SH coefficients of Gaussian i."""
     row = i * colors.shape[1] * 3
     for k in range(row, row + 3 * sh_count, 16):
         prefetch_read(colors, k)
@@ -111,7 +111,7 @@ def prefetch_coefficients(colors, sh_count, i):
 
 @inlined
 def load_coefficients(colors, sh_count, ids, start, coefficients):
-    """SH coefficients of the 8 Gaussians ids[start:]: number k of channel c as the vector at 8 (3 k + c)."""
+    """Load the SH coefficients of the 8 Gaussians ids[start:]: coefficient k of channel c at 8 (3 k + c)."""
     stride = colors.shape[1] * 3
     used = sh_count * 3
     if used < 8:
@@ -120,7 +120,7 @@ def load_coefficients(colors, sh_count, ids, start, coefficients):
                 coefficients[8 * k + lane] = at(colors, at(ids, start + lane) * stride + k)
         return
     for block in range(0, used, 8):
-        k = min(block, used - 8)  # the last 8 may overlap those before
+        k = min(block, used - 8)  # the last 8 may overlap
         v0, v1, v2, v3, v4, v5, v6, v7 = gather8(colors, ids, start, stride, k)
         store8(coefficients, 8 * k, v0)
         store8(coefficients, 8 * k + 8, v1)
@@ -134,7 +134,7 @@ def load_coefficients(colors, sh_count, ids, start, coefficients):
 
 @inlined
 def store_coefficients(colors_gradient, sh_count, ids, start, coefficients):
-    """`load_coefficients` reversed."""
+    """The inverse of `load_coefficients`."""
     stride = colors_gradient.shape[1] * 3
     used = sh_count * 3
     if used < 8:

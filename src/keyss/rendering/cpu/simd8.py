@@ -1,11 +1,11 @@
 """Explicit vectors of 8 float32 for numba kernels, and a few scalar operations that numba lacks.
 
-LLVM does not vectorise the row loops of the rasterizer by itself, so the kernels say what is a vector.
-The type maps to LLVM's <8 x float>, which every target can execute: one AVX register, two SSE or NEON
-registers. `+`, `-` and `*` work between vectors and between a vector and a float32.
+LLVM does not vectorise the row loops of the rasterizer by itself. The type maps to LLVM's <8 x float>, which
+every target can execute: one AVX register, two SSE or NEON registers. `+`, `-` and `*` work between vectors
+and between a vector and a float32.
 
-Arrays are indexed flat, must be contiguous, and are not bounds-checked. What the compiler may assume of
-floats is what the decorator of the kernel says, see `jit`.
+Arrays are indexed flat, must be contiguous, and are not bounds-checked. The decorator of the kernel
+determines what the compiler may assume of floats, see `jit`.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -23,9 +23,7 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 
 from keyss.rendering.cpu.jit import inlined
 
-intrinsic: Any = (
-    extending.intrinsic
-)  # what it makes is called inside kernels only, without the typing context
+intrinsic: Any = extending.intrinsic  # kernels call intrinsics without the typing context
 
 FLOAT = ir.FloatType()
 INT = ir.IntType(32)
@@ -68,7 +66,7 @@ def _splat(builder, scalar):
 
 
 def _operand(argument_type):
-    """How an argument is passed: a vector as it is, any number as float32."""
+    """The type to pass an argument as: vectors unchanged, numbers as float32."""
     return argument_type if isinstance(argument_type, Float32x8) else types.float32
 
 
@@ -168,7 +166,7 @@ def store_interleaved(typingctx, array, index, a, b, c):
 
 @intrinsic
 def load_interleaved(typingctx, array, index):
-    """Read (a, b, c) as `store_interleaved` writes them."""
+    """The inverse of `store_interleaved`."""
 
     def codegen(context, builder, signature, arguments):
         address = element(context, builder, signature.args[0], *arguments)
@@ -182,7 +180,7 @@ def load_interleaved(typingctx, array, index):
 
 @intrinsic
 def fused_multiply_add(typingctx, a, b, c):
-    """a b + c of float32 numbers, rounded once; where the processor cannot, the C library does it."""
+    """a b + c of float32 numbers, rounded once."""
 
     def codegen(context, builder, signature, arguments):
         return builder.fma(*arguments)
@@ -306,7 +304,7 @@ def any_gt(typingctx, a, b):
 
 @intrinsic
 def sum_lanes(typingctx, a):
-    """The sum of the 8 lanes, always taken in the same order."""
+    """The sum of the 8 lanes, in a fixed order."""
 
     def codegen(context, builder, signature, arguments):
         value = arguments[0]
@@ -366,7 +364,7 @@ def log(x):
     return multiply_add(exponent, _LN_2, t * multiply_add(tt, series, _TWO))
 
 
-# 2^x on [-1/2, 1/2] with the least relative error, 2e-8 (Lawson's method, degree 6).
+# 2^x on [-1/2, 1/2] with minimal relative error, 2e-8 (Lawson's method, degree 6).
 _EXP2_COEFFICIENTS = (
     1.0000000005541867,
     0.6931472057371977,
@@ -380,7 +378,7 @@ _LOG2_E = 1.4426950408889634
 
 
 def _exponential(power):
-    """e^x 2^power: the power is added to the float's exponent, so nothing is lost to rounding."""
+    """e^x 2^power, exactly scaled: the power is added to the float's exponent."""
     lowest = -87.0 - power * np.log(2.0)
 
     @intrinsic
@@ -460,7 +458,7 @@ def _prefetch(write):
     return prefetch
 
 
-prefetch_read = _prefetch(0)  # (array, index): ask for the cache line of array.flat[index]
+prefetch_read = _prefetch(0)  # (array, index): prefetch the cache line of array.flat[index]
 prefetch_write = _prefetch(1)
 
 
@@ -476,6 +474,6 @@ def _rounding(name):
     return to_integer
 
 
-# numba makes a library call of math.floor and math.ceil; these are one instruction each.
+# numba compiles math.floor and math.ceil to library calls; these are one instruction each.
 floor = _rounding("floor")
 ceil = _rounding("ceil")
