@@ -228,7 +228,7 @@ def test_colmap_without_points_starts_from_random_ones(keyss: Keyss, tmp_path: P
     (scene / "sparse/0/points3D.bin").unlink()
     for out, seed in (("one", 3), ("two", 3), ("three", 4)):
         (warning,) = warnings_of(fitted(keyss, scene, tmp_path / out, "--seed", seed))
-        assert "points3D.bin: there are no points; a fit starts from random ones" in warning
+        assert "points3D.bin: there are no points; a fit starts from random points" in warning
     first, again, other = ((tmp_path / out / "model.ply").read_bytes() for out in ("one", "two", "three"))
     assert first == again
     assert first != other
@@ -255,7 +255,7 @@ def test_nerfstudio_with_all_frames_for_training(keyss: Keyss, tmp_path: Path) -
     names = [f"images/frame_{i:05}.png" for i in range(10)]
     scene = write_nerfstudio(tmp_path / "scene", count=10, train_filenames=names)
     (warning,) = warnings_of(fitted(keyss, scene, tmp_path / "out"))
-    assert "`train_filenames` has all photos; every 8th of them is kept for testing" in warning
+    assert "`train_filenames` has all photos; every 8th of them becomes a test view" in warning
     assert json.loads(keyss("info", scene, "--json").out)["test_views"] == 2
 
 

@@ -24,8 +24,7 @@ from files.scene_files import (
     write_colmap,
     write_nerfstudio,
 )
-from keyss.core import InputError
-from keyss.core.errors import KeyssWarning
+from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
 from keyss.files.colmap import read_colmap
 
@@ -137,7 +136,7 @@ def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
         for path in (tmp_path / "text").iterdir():
             path.rename(model / path.name)
     (model / f"points3D{suffix}").unlink()
-    with pytest.warns(KeyssWarning, match=rf"points3D\{suffix}: there are no points; .* random ones"):
+    with pytest.warns(KeyssWarning, match=rf"points3D\{suffix}: there are no points; .* random points"):
         scene = load_scene(tmp_path / "scene")
     assert scene.points.shape == scene.colors.shape == (0, 3)
     assert len(scene.views) == 3

@@ -16,8 +16,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from files.scene_files import frames, mutations, photo, save, write_json, write_nerfstudio
-from keyss.core import InputError
-from keyss.core.errors import KeyssWarning
+from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
 from keyss.files.lens import undistortion
 from keyss.files.ply_table import read_point_cloud

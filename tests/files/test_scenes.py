@@ -24,8 +24,7 @@ from files.scene_files import (
     write_colmap,
     write_nerfstudio,
 )
-from keyss.core import InputError, UsageError
-from keyss.core.errors import KeyssWarning
+from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.files import load_scene
 
 WRITERS = {"colmap": write_colmap, "blender": write_blender, "nerfstudio": write_nerfstudio}

@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from keyss.core import Camera, Gaussians
-from keyss.core.gaussians import SH_C0
+from keyss.core import SH_C0, Camera, Gaussians
 from keyss.rendering import rasterization, render, render_with_meta
 
 

@@ -7,9 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from keyss.core import Gaussians
-from keyss.core.scene import camera_positions
-from keyss.core.similarity import Similarity
+from keyss.core import Gaussians, Similarity, camera_positions
 from keyss.rendering import VIEWS, middle_and_radius, orbit, scene_of_model
 from tiny_scenes import random_gaussians
 

@@ -18,8 +18,7 @@ import torch
 from PIL import Image
 
 from channels.low_bits.trained_like import trained_like
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera
+from keyss.core import Camera, Gaussians
 from keyss.rendering import render
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cli.said import PROGRAM as KEYSS
-from keyss.core.gaussians import Gaussians
+from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import keyss
-from keyss.files.models import read_model
+from keyss.files import read_model
 from keyss.viewer import export_html
 from viewer.browser import PROGRAM, Visit
 

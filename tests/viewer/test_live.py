@@ -17,10 +17,12 @@ import torch
 
 from cli.said import PROGRAM as KEYSS, SMALL
 from files.scene_files import write_nerfstudio
-from keyss.core.gaussians import Gaussians
-from keyss.files.models import model_of_bytes
-from keyss.fitting.reporting import ModelReporter, Reporter, SilentReporter, of_secret
-from keyss.viewer.live import EVERY, LiveTraining
+from keyss.core import Gaussians
+from keyss.files import model_of_bytes
+from keyss.fitting import Reporter, SilentReporter
+from keyss.fitting.reporting import ModelReporter, of_secret
+from keyss.viewer import LiveTraining
+from keyss.viewer.live import EVERY
 from tiny_scenes import random_gaussians
 from viewer.browser import PATIENCE, PROGRAM, SWITCHES, visit
 

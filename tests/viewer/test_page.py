@@ -14,10 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from keyss.core.errors import OutputError
+from keyss.core import OutputError
 from keyss.files import write_model
-from keyss.viewer import ModelServer, export_html
-from keyss.viewer.page import asset
+from keyss.viewer import ModelServer, asset, export_html
 from tiny_scenes import random_gaussians
 from viewer.browser import ROOT, WEB
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from keyss.channels import channel_for
-from keyss.core.gaussians import Gaussians
-from keyss.files.models import read_model, write_model
+from keyss.core import Gaussians
+from keyss.files import read_model, write_model
 from keyss.methods import HiddenFile, embed_whole
 from keyss.rendering import Viewpoints
 from keyss.viewer import export_html

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from keyss.core.errors import KeyssWarning
+from keyss.core import KeyssWarning
 from keyss.files import read_model
 from keyss.methods.records import whole
 from vectors.make_vectors import FOLDER, counted, decoded, digests, revealed

@@ -1,4 +1,4 @@
-"""Scenes, models and photos on disk: readers that trust no byte, and writers that leave no half file."""
+"""Reads and writes scenes, models and photos; files may be hostile, and writes are atomic."""
 
 import lazy_loader
 

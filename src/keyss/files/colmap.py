@@ -1,8 +1,8 @@
 """Scenes in COLMAP's layout: a sparse model (cameras, images, points; `.bin` or `.txt`) beside `images/`.
 
-Read by hand because pycolmap is a large package for three small files, and trusts them. The bytes may be
-hostile: counts are compared with the bytes that are left before anything is allocated, and a file must end
-where its last record ends. Format: https://colmap.github.io/format.html
+The reader is our own because pycolmap is a large package for three small files, and trusts them. Files may be
+hostile: counts are compared with the remaining bytes before anything is allocated, and a file must end with
+its last record. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from keyss.files.layout import (
 from keyss.files.lens import Lens, make_lens
 from keyss.files.reading import read_file, read_text
 
-# Where the sparse model may lie, best first. The last is where Nerfstudio's scenes keep it.
+# Folders of the sparse model, best first; the last is that of Nerfstudio's scenes.
 MODEL_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 _T = TypeVar("_T")
-_Image = tuple[str, int, NDArray[np.float64]]  # name, id of its camera, [4, 4] world to camera
+_Image = tuple[str, int, NDArray[np.float64]]  # name, camera id, [4, 4] world to camera
 
 # Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
 _PARAMETERS = {
@@ -53,7 +53,7 @@ _PARAMETERS = {
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
 }
-# By the number that stands for a model in cameras.bin.
+# In the order of the model ids of cameras.bin.
 _MODEL_NAMES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
     *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
@@ -62,17 +62,14 @@ _MODEL_NAMES = (
 
 
 def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
-    """The photos in `images/` with the poses and points of the sparse model; every 8th is for testing.
+    """The photos in `images/` with the poses and points of the sparse model; every 8th is a test view.
 
-    Where `images/` has none of the photos, they are taken from the first of `images_2/`, `images_4/` and
-    `images_8/` that has some: the same ones, shrunk. The points are in the order of their ids; a scene may
-    lack them, with a KeyssWarning. Files are `.bin` where `cameras.bin` is there, else `.txt`. Image names
-    may hold subfolders but never leave `images/`. Photos that are not there are refused, or left out with
-    `skip_missing`, see `leave_out_missing`.
+    If `images/` has no photos, the first of `images_2/`, `images_4/` and `images_8/` that has some is used.
+    Points are sorted by id; without points there is a KeyssWarning. Files are `.bin` if `cameras.bin`
+    exists, else `.txt`. Image names may have subfolders. `skip_missing`: see `leave_out_missing`.
 
-    Raises InputError for names that are absolute or contain `..`, and when a file is missing, truncated,
-    longer than it says, or holds values that no reconstruction has (NaN, zero quaternions, unknown cameras,
-    absurd counts or sizes).
+    Raises InputError for names that are absolute or contain `..`, and if a file is missing, truncated, too
+    long, or has impossible values (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
     """
     model = colmap_model_folder(folder)
     if model is None:
@@ -90,38 +87,38 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
         lenses[camera_id] = lens
     photos = []
     for name, camera_id, viewmat in images:
-        inside = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
-        if not name.isprintable() or not inside.parts or inside.anchor or ".." in inside.parts:
+        parsed = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
+        if not name.isprintable() or not parsed.parts or parsed.anchor or ".." in parsed.parts:
             raise InputError(f"{model}: expected image names inside images/, found {name!r}")
         if camera_id not in lenses:
             raise InputError(f"{model}: image {name!r} refers to camera {camera_id}, which does not exist")
         photos.append(Photo(folder / name, name, viewmat, lenses[camera_id]))
     refuse_duplicates(model, photos)
-    images_folder, there = _with_files(folder, photos)
-    missing = sorted({photo.name for photo in photos} - {photo.name for photo in there})
+    images_folder, existing = _existing(folder, photos)
+    missing = sorted({photo.name for photo in photos} - {photo.name for photo in existing})
     leave_out_missing(folder / images_folder, len(photos), missing, skip_missing)
-    return SceneLayout(*hold_out(model, there), points)
+    return SceneLayout(*hold_out(model, existing), points)
 
 
 def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
-    """The first of `places` in a scene's folder that holds a sparse model; None if there is none."""
+    """The first of `places` in a scene's folder with a sparse model, or None."""
     for candidate in (folder / place for place in places):
         if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return candidate
     return None
 
 
-def _with_files(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
-    """(the folder that is taken, those photos that are in it)."""
+def _existing(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
+    """(the folder of images that is used, the photos in it)."""
     for images in _IMAGE_FOLDERS:
-        found = [replace(photo, path=folder / images / photo.name) for photo in photos]
-        if there := [photo for photo in found if photo.path.exists()]:
-            return images, there
+        placed = [replace(photo, path=folder / images / photo.name) for photo in photos]
+        if existing := [photo for photo in placed if photo.path.exists()]:
+            return images, existing
     return _IMAGE_FOLDERS[0], []
 
 
 def _lens(where: str, model: str, width: int, height: int, read: Callable[[int], Sequence[float]]) -> Lens:
-    """A lens by COLMAP's model name; `read` yields so many parameters."""
+    """A lens by COLMAP's model name; `read` returns the given number of parameters."""
     if model not in _PARAMETERS:
         known = ", ".join(_PARAMETERS)
         raise InputError(
@@ -159,7 +156,7 @@ class _Records:
         self.offset += size
 
     def count(self, record_size: int, what: str) -> int:
-        """A count of records of at least `record_size` bytes each, which the rest of the file must hold."""
+        """A number of records of at least `record_size` bytes, which must fit into the rest of the file."""
         (count,) = self.take("<Q", f"the number of {what}")
         self.skip(count * record_size, f"{count} {what} of at least {record_size} bytes")
         self.offset -= count * record_size
@@ -222,7 +219,7 @@ def _points_bin(path: Path) -> PointCloud:
     offsets = np.empty(count, dtype=np.int64)
     offset, track_length = records.offset, struct.Struct("<Q").unpack_from
     try:
-        for i in range(count):  # bare offsets: scenes have millions of points, each with a track to skip
+        for i in range(count):  # offsets only, since there are millions of points with tracks to skip
             offsets[i] = offset
             offset += 51 + 8 * track_length(data, offset + 43)[0]
     except (struct.error, OverflowError):
@@ -241,7 +238,7 @@ def _points(path: Path, read: Callable[[Path], PointCloud]) -> PointCloud:
     points = read(path) if path.exists() else NO_POINTS
     if not len(points.xyz):
         warnings.warn(
-            f"{path}: there are no points; a fit starts from random ones around what the cameras look at",
+            f"{path}: there are no points; a fit starts from random points around the focus of the cameras",
             KeyssWarning,
             stacklevel=2,
         )
@@ -278,19 +275,19 @@ def _points_txt(path: Path) -> PointCloud:
 
 
 def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:
-    """(where, words) of each record, which takes so many `lines`, of which the first has a `layout`.
+    """(where, words) of each record, which has `lines` lines; the first has the given `layout`.
 
-    The last word is all the rest of its line (names of images may hold spaces), or split further if the
-    layout ends in `...`, and then it may be missing.
+    The last word is the rest of the line, since names of images may contain spaces; if the layout ends in
+    `...`, there may be any number of last words.
     """
-    most = len(layout.split())
+    size = len(layout.split())
     is_open = layout.endswith("...")
     numbered = iter(enumerate(read_text(path).split("\n"), 1))
     for number, line in numbered:
         if not line.strip() or line.startswith("#"):
             continue
-        words = line.split() if is_open else line.strip().split(maxsplit=most - 1)
-        if len(words) < most - is_open:
+        words = line.split() if is_open else line.strip().split(maxsplit=size - 1)
+        if len(words) < size - is_open:
             raise InputError(f"{path}, line {number}: expected `{layout}`, found {line[:80]!r}")
         yield f"{path}, line {number}", words
         for _ in range(lines - 1):

@@ -1,4 +1,4 @@
-"""Photos from disk to plain RGB bytes, and pictures to PNG files."""
+"""Reads photos as RGB, and encodes PNG files."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from torch import Tensor
 from keyss.core.errors import InputError
 from keyss.core.scene import Camera
 
-# Only formats that photos of a scene come in: some of Pillow's others start external programs.
+# Only formats of photos: some of Pillow's others start external programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _MAX_PIXELS = 89_000_000  # just under Pillow's own limit for decompression bombs
 
 
 def open_image(path: Path) -> Image.Image:
-    """An image whose pixels are not decoded yet, for whoever needs them in another way than `read_image`.
+    """Open an image without decoding its pixels.
 
-    Raises InputError when the file is missing, is not an image or has more than 89 million pixels.
+    Raises InputError if the file is missing, is not an image or has more than 89 million pixels.
     """
     try:
         image = Image.open(path, formats=_FORMATS)
@@ -46,25 +46,25 @@ def open_image(path: Path) -> Image.Image:
 
 
 def probe_image(path: Path) -> tuple[int, int, bool]:
-    """(width, height, whether it may be transparent) of an image, from its header alone.
+    """(width, height, whether it may be transparent) of an image, from its header.
 
-    EXIF orientation is ignored, as COLMAP does. Raises InputError as `open_image` does.
+    Ignores the EXIF orientation, like COLMAP. Raises InputError as `open_image` does.
     """
     with open_image(path) as image:
         return image.width, image.height, image.has_transparency_data
 
 
 def is_turned(path: Path) -> bool:
-    """Whether EXIF data say that an image is to be shown turned by a quarter. Raises InputError."""
+    """True if the EXIF orientation rotates an image by 90 degrees. Raises InputError."""
     with open_image(path) as image:
         return image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
 
 
 def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """[H, W, 3] sRGB of an image file, laid over `background` ([3] in [0, 1]) where it is transparent.
+    """[H, W, 3] sRGB of an image file, composited over `background` ([3] in [0, 1]).
 
     16 bits are scaled to 8; palettes, grey and CMYK are converted. Raises InputError as `open_image` does,
-    for more than 16 bits, whose range cannot be known, and when the pixels cannot be decoded.
+    for more than 16 bits, whose range is unknown, and if the pixels cannot be decoded.
     """
     with open_image(path) as image:
         try:
@@ -76,17 +76,17 @@ def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]
 
 
 def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """[height, width, 3] by area averaging of a larger image."""
-    import cv2  # which takes a while, and reading models needs no pictures
+    """Shrink an image to [height, width, 3] by area averaging."""
+    import cv2  # slow to import, and models do not need it
 
     # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def picture_names(cameras: Iterable[Camera]) -> list[str]:
-    """A flat file name for a picture from each: folders in the camera's name become part of it.
+    """A PNG file name for each camera, with folders joined by underscores.
 
-    Where two would have one name, the second gets a number: `a.png`, `a-2.png`.
+    Equal names are numbered: `a.png`, `a-2.png`.
     """
     names: list[str] = []
     for camera in cameras:

@@ -1,4 +1,4 @@
-"""What every scene layout is read into before its photos are decoded."""
+"""Scenes before their photos are decoded: the result of reading any scene layout."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.lens import Lens
 
-MAX_COORDINATE = 1e15  # squares of coordinates up to this still fit in float32
+MAX_COORDINATE = 1e15  # its square fits into float32
 
 
 @dataclass(frozen=True)
 class Photo:
-    """An image file, where it was taken from, and through which lens."""
+    """An image file with its pose and lens."""
 
     path: Path
     name: str
@@ -36,7 +36,7 @@ class PointCloud:
 
     @staticmethod
     def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> PointCloud:
-        """The points as float32. Raises InputError when a coordinate is not finite or beyond 1e15."""
+        """The points as float32. Raises InputError if a coordinate is not finite or beyond 1e15."""
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():
             first = int(bad.argmax())
@@ -57,13 +57,13 @@ class SceneLayout:
 
 
 def usual_up(path: Path | str) -> Literal["-y", "z"]:
-    """The way up in a scene, as the programs that write its layout have it; of all else, as COLMAP has it."""
-    names = ("transforms_train.json", "transforms.json")  # of Blender and of Nerfstudio
+    """The up direction by the convention of a scene's layout, for models that of COLMAP."""
+    names = ("transforms_train.json", "transforms.json")  # Blender, Nerfstudio
     return "z" if any((Path(path) / name).is_file() for name in names) else "-y"
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    """(train, test): sorted by name, every 8th photo beginning with the first is for testing.
+    """(train, test): every 8th photo by name, starting with the first, is a test view.
 
     This is the split of Mip-NeRF 360 and of 3DGS. Raises InputError for fewer than 2 photos.
     """
@@ -76,26 +76,23 @@ def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], t
 
 
 def leave_out_missing(where: Path, total: int, missing: Sequence[str], skip_missing: bool) -> None:
-    """Settle that `missing` of the `total` photos which a scene names are not on disk.
+    """Raise InputError if photos of a scene are missing, or, with `skip_missing`, warn (KeyssWarning).
 
-    Raises InputError, unless `skip_missing`: then a KeyssWarning says which ones are left out.
+    `total` is the number of photos with the missing ones. If all are missing, InputError is raised anyway.
     """
     if not missing:
         return
     listed = ", ".join(missing[:5]) + (f" and {len(missing) - 5:,} more" if len(missing) > 5 else "")
     count = f"{len(missing):,} of {total:,} photos"
     if not skip_missing:
-        raise InputError(
-            f"{where}: {count} are missing: {listed}; put them there, or fit, hide and render without them "
-            "with `skip_missing=True`"
-        )
+        raise InputError(f"{where}: {count} are missing: {listed}; `skip_missing=True` leaves them out")
     if len(missing) == total:
         raise InputError(f"{where}: all of its {total:,} photos are missing: {listed}")
     warnings.warn(f"{where}: {count} are missing and left out: {listed}", KeyssWarning, stacklevel=2)
 
 
 def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:
-    """Raises InputError when two photos are one file: it could be in training and test at once."""
+    """Raise InputError if two photos have one name: they could be in training and test set at once."""
     seen: set[str] = set()
     for photo in photos:
         if photo.name in seen:

@@ -1,8 +1,7 @@
-"""Camera lenses as photos come with them, and how a distorted photo becomes a pinhole one.
+"""Camera lenses of photos, and undistortion to pinhole cameras.
 
-Pixel coordinates here have pixel centres at half-integers, as in COLMAP and Nerfstudio: the middle of an
-image is (width / 2, height / 2). OpenCV puts centres at integers, so half a pixel is taken off on the way
-in and added on the way out.
+Pixel centres are at half-integers, as in COLMAP and Nerfstudio: the middle of an image is
+(width / 2, height / 2). OpenCV has them at integers, half a pixel less.
 """
 
 from __future__ import annotations
@@ -45,17 +44,16 @@ class Lens:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def on_image(self, width: int, height: int) -> Lens | None:
-        """The lens for an image of this size: the lens's own, or that size divided by a whole number.
+        """The lens for an image of the lens's size, or of that size divided by a whole number, else None.
 
-        Photos are often shrunk (`images_4`) after their cameras were computed; whole factors of 2 and
-        more are accepted, rounded up or down per side. None when the sizes have nothing to do with each
-        other.
+        Photos are often shrunk (`images_4`) after their cameras were computed; either side may be rounded up
+        or down.
         """
         if (width, height) == (self.width, self.height):
             return self
         factor = round(self.width / width)
-        near = abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
-        if factor < 2 or not near:
+        fits = abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
+        if factor < 2 or not fits:
             return None
         x, y = width / self.width, height / self.height
         return replace(
@@ -66,9 +64,9 @@ class Lens:
 def make_lens(
     where: str, width: int, height: int, parameters: Mapping[str, float], *, fisheye: bool = False
 ) -> Lens:
-    """The lens with named parameters: `f` or `fx` and `fy`, `cx`, `cy`, `k1` ... `k6`, `p1`, `p2`.
+    """A lens from parameters by name: `f` or `fx` and `fy`, `cx`, `cy`, `k1` ... `k6`, `p1`, `p2`.
 
-    Raises InputError, which starts with `where`, when a value is out of any sensible range.
+    Raises InputError, which starts with `where`, if a value is out of range.
     """
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError(
@@ -96,7 +94,7 @@ def make_lens(
 
 @dataclass(frozen=True)
 class Undistortion:
-    """How to resample photos of a distorted lens into those of a pinhole lens of the same size."""
+    """Resamples photos of a distorted lens into those of a pinhole lens of the same size."""
 
     pinhole: Lens
     map_x: NDArray[np.float32]  # [H, W] OpenCV column in the distorted photo, per pixel of the new one
@@ -104,7 +102,7 @@ class Undistortion:
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] undistorted, sampled bilinearly."""
-        import cv2  # models have no lenses, and importing it takes a while
+        import cv2  # slow to import, and models do not need it
 
         border = cv2.BORDER_REPLICATE
         straight = cv2.remap(image, self.map_x, self.map_y, cv2.INTER_LINEAR, borderMode=border)
@@ -112,12 +110,11 @@ class Undistortion:
 
 
 def undistortion(lens: Lens, where: str) -> Undistortion:
-    """The resampling that takes `lens` to the pinhole with the same principal point and size.
+    """The resampling from `lens` to a pinhole lens with the same principal point and size.
 
-    The focal lengths stay as they are, or grow together by the least factor at which every pixel of
-    the new image is seen in the photo: no invented borders, and no upsampling beyond that. The search is
-    our own because OpenCV's moves the principal point and takes content that a lens shows twice for good.
-    Raises InputError, which starts with `where`, when there is no such factor up to 8.
+    The focal lengths are scaled by the smallest factor from 1 to 8 at which every pixel of the new image is
+    visible in the photo. OpenCV's search would move the principal point and accept content that a lens shows
+    twice. Raises InputError, which starts with `where`, if there is no such factor.
     """
     if _covers(lens, 1.0):
         zoom = 1.0
@@ -142,7 +139,7 @@ def _opencv_K(lens: Lens) -> NDArray[np.float64]:
 def _source_coordinates(
     lens: Lens, new_K: NDArray[np.float64], size: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where each pixel of a pinhole image with `new_K` lies in the photo; all in OpenCV's coordinates."""
+    """The positions in the photo of the pixels of a pinhole image with `new_K`, in OpenCV's coordinates."""
     import cv2
 
     prepare = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
@@ -151,10 +148,10 @@ def _source_coordinates(
 
 
 def _covers(lens: Lens, zoom: float) -> bool:
-    """Whether a pinhole with focal lengths times `zoom` sees only what the photo shows, and once.
+    """True if a pinhole with focal lengths times `zoom` sees only content of the photo, and only once.
 
-    Checked on a grid of 128 x 128 cells that includes the corners. A polynomial distortion turns back on
-    itself far from the axis and shows the photo's content a second time; there its Jacobian is negative.
+    Checks a grid of 128 x 128 cells that includes the corners. A polynomial distortion folds back far from
+    the axis and shows content a second time; there its Jacobian is negative.
     """
     cells = 128
     K = _opencv_K(replace(lens, fx=lens.fx * zoom, fy=lens.fy * zoom))

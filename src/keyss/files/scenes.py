@@ -1,4 +1,4 @@
-"""Any known scene layout on disk into a `Scene` with its photos decoded."""
+"""Reads scenes of all layouts, with their photos decoded."""
 
 from __future__ import annotations
 
@@ -35,26 +35,24 @@ def load_scene(
     background: Tensor | Sequence[float] | None = None,
     skip_missing: bool = False,
 ) -> Scene:
-    """Read a scene folder in COLMAP's, NeRF-synthetic's or Nerfstudio's layout, told apart by content.
+    """Read a scene folder in the layout of COLMAP, NeRF-synthetic or Nerfstudio, detected by content.
 
-    `width`: photos wider than this many pixels are shrunk to it by area averaging, their height in
-    proportion and K scaled per axis; photos are never enlarged. Distorted lenses are undistorted before.
-    `background`: three numbers in [0, 1] that lie behind everything and under transparent pixels; by
-    default white when any photo has an alpha channel, else black.
-    `skip_missing`: photos that the scene names but that are not on disk are left out, with a KeyssWarning,
-    before it is settled which photos are for testing.
+    `width`: wider photos are undistorted and then shrunk to this many pixels by area averaging, with K scaled
+    per axis; photos are never enlarged.
+    `background`: three numbers in [0, 1], behind everything and under transparent pixels; by default white
+    if any photo has an alpha channel, else black.
+    `skip_missing`: photos that are missing on disk are left out, with a KeyssWarning, before test views are
+    chosen.
 
-    The test views are the layout's own where it has a split, else every 8th image by name. Camera names
-    are image paths as the layout has them, relative to `images/` for COLMAP and to the scene's folder for
-    the others (`train/r_0.png`). COLMAP's `images/` may be missing where `images_2/`, `images_4/` or
-    `images_8/` has the same photos, shrunk; the largest are taken. A scene may lack points, with a
-    KeyssWarning where COLMAP ought to have made some; training starts from random ones then, see
-    `keyss.fitting.parameters.initial_points`. Rotations are exactly orthonormal up to float32.
+    The test views are those of the layout's split if it has one, else every 8th image by name. Camera names
+    are the layout's image paths, relative to `images/` for COLMAP and to the scene's folder for the others
+    (`train/r_0.png`). If COLMAP's `images/` is missing, the largest of `images_2/`, `images_4/` and
+    `images_8/` is used. A scene may lack points, with a KeyssWarning for COLMAP; see
+    `keyss.fitting.parameters.initial_points`. Rotations are orthonormal up to float32.
 
-    Raises InputError for anything that is not such a scene: an unknown layout, broken or truncated
-    files, missing or undecodable images, images whose size contradicts their camera's (a size divided by
-    a whole number is accepted), fewer than one training and one test image. Raises UsageError for a
-    `width` or `background` out of range.
+    Raises InputError for an unknown layout, broken or truncated files, missing or undecodable images, images
+    whose size contradicts their camera's (it may be divided by a whole number), or fewer than one training
+    and one test image. Raises UsageError for a `width` or `background` out of range.
     """
     if width is not None and width < 1:
         raise UsageError(f"expected a width of at least 1 pixel, got {width}")
@@ -66,12 +64,10 @@ def load_scene(
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
 
     photos = layout.train + layout.test
-    transparent = [
-        probe_image(photo.path)[2] for photo in photos
-    ]  # all, so that a missing photo is found now
+    has_alpha = [probe_image(photo.path)[2] for photo in photos]  # all, to find missing photos now
     if behind is None:
-        behind = torch.full((3,), float(any(transparent)))
-    # Most scenes have one lens; only the last few maps are kept because each is as large as a photo.
+        behind = torch.full((3,), float(any(has_alpha)))
+    # Most scenes have one lens, and a map is as large as a photo, so only the last two are cached.
     undistortions = functools.lru_cache(maxsize=2)(undistortion)
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         decode = functools.partial(_view, width=width, background=behind.numpy(), undistortions=undistortions)
@@ -91,8 +87,8 @@ def _read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
         if not folder.is_dir():
             found = what_it_is(folder) if folder.exists() else "nothing there"
             raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {_KNOWN}")
-        # In this order, since a COLMAP or NeRF-synthetic scene may hold a transforms.json made from it, and
-        # Nerfstudio's scenes hold the COLMAP model that they were made from.
+        # The order matters: COLMAP and NeRF-synthetic scenes may contain a transforms.json made from them,
+        # and Nerfstudio's scenes contain the COLMAP model that they were made from.
         if colmap_model_folder(folder, MODEL_PLACES[:-1]) is not None:
             return read_colmap(folder, skip_missing=skip_missing)
         if (folder / "transforms_train.json").is_file():
@@ -120,11 +116,7 @@ def _view(
         raise InputError(
             f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height} "
             f"(or that divided by a whole number), found {pixels.shape[1]}x{pixels.shape[0]}"
-            + (
-                "; its EXIF data say that it is to be turned: turn its pixels"
-                if is_turned(photo.path)
-                else ""
-            )
+            + ("; its EXIF orientation rotates it: rotate its pixels" if is_turned(photo.path) else "")
         )
     if not lens.is_pinhole:
         straighten = undistortions(lens, str(photo.path.parent))

@@ -1,4 +1,4 @@
-"""Scenes whose posed frames are in JSON: the layouts of NeRF-synthetic and of Nerfstudio."""
+"""Scenes with posed frames in JSON: the layouts of NeRF-synthetic and Nerfstudio."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _Row = tuple[float, float, float, float]
 
 
 class _Intrinsics(msgspec.Struct):
-    """What may stand in the file for all frames and in a frame for itself; pixels and radians."""
+    """Intrinsics of all frames or of one frame, in pixels and radians."""
 
     camera_model: str | None = None
     is_fisheye: bool | None = None
@@ -71,19 +71,18 @@ class _Transforms(_Intrinsics, kw_only=True):
 
 @dataclass(frozen=True)
 class _Posed:
-    """What a JSON file says, and its frames in file order."""
+    """A JSON file, and its frames in file order."""
 
     meta: _Transforms
     names: tuple[str, ...]  # of all frames
-    photos: tuple[Photo, ...]  # of those whose photos are there
+    photos: tuple[Photo, ...]  # without missing ones
 
 
 def read_blender(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
-    """The photos of `transforms_train.json` and `transforms_test.json`; there are no points.
+    """The photos of `transforms_train.json` and `transforms_test.json`, without points.
 
-    Without a test file the validation file takes its place, and without that every 8th training photo.
-    Photos that are not there are refused, or left out with `skip_missing`, see `leave_out_missing`.
-    Raises InputError, also when one photo is in both files.
+    Without a test file, the test views are those of the validation file, else every 8th training photo.
+    `skip_missing`: see `leave_out_missing`. Raises InputError, also if a photo is in both files.
     """
     train = _read(folder / "transforms_train.json", skip_missing).photos
     for split in ("test", "val"):
@@ -96,13 +95,12 @@ def read_blender(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
 
 
 def read_nerfstudio(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
-    """The photos of a `transforms.json` (instant-ngp's too), and the points of its `ply_file_path` if any.
+    """The photos of a `transforms.json` (instant-ngp's too), and the points of its `ply_file_path`, if any.
 
-    `train_filenames` and `test_filenames` (or `val_filenames`) make the split; with only one of the two,
-    the other photos are the other half; with neither, every 8th photo is for testing. So it is, with a
-    KeyssWarning, where `train_filenames` has all photos. Photos that are not there are refused, or left out
-    with `skip_missing`, see `leave_out_missing`. Poses and points are both taken as stored:
-    `applied_transform` says how they once were, and both have it. Raises InputError.
+    `train_filenames` and `test_filenames` (or `val_filenames`) define the split; with only one of them, the
+    other photos are the other part. Without them, or with a KeyssWarning if `train_filenames` has all photos,
+    every 8th photo is a test view. `skip_missing`: see `leave_out_missing`. Poses and points are used as
+    stored, since `applied_transform` was applied to both. Raises InputError.
     """
     path = folder / "transforms.json"
     posed = _read(path, skip_missing)
@@ -115,7 +113,7 @@ def read_nerfstudio(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
 def _read(path: Path, skip_missing: bool) -> _Posed:
     """The frames of a JSON file as photos.
 
-    A frame's own intrinsics go before those of the file. `file_path` is relative to the file's folder,
+    A frame's own intrinsics override those of the file. `file_path` is relative to the file's folder,
     may lack its extension, and must stay inside that folder or its parent. Raises InputError.
     """
     try:
@@ -143,10 +141,10 @@ def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, .
         for listed in (meta.train_filenames, meta.test_filenames or meta.val_filenames)
     )
     if unknown := (train | test) - names:
-        raise InputError(f"{path}: expected lists of frames, found {min(unknown)!r}, which is none")
+        raise InputError(f"{path}: expected lists of frames, found {min(unknown)!r}, which is not a frame")
     if train == names and not test:
         warnings.warn(
-            f"{path}: `train_filenames` has all photos; every 8th of them is kept for testing",
+            f"{path}: `train_filenames` has all photos; every 8th of them becomes a test view",
             KeyssWarning,
             stacklevel=2,
         )
@@ -172,9 +170,7 @@ def _inside(path: Path, file_path: str) -> str:
 
 
 def _image_name(path: Path, file_path: str) -> str:
-    """The name of an image beside a JSON file, with the extension that it may lack there; as it is there
-    if no such file exists.
-    """
+    """The name of an image beside a JSON file, with its extension added if necessary and if it exists."""
     name = _inside(path, file_path)
     extensions = (each for each in ("", *_EXTENSIONS) if os.path.isfile(path.parent / (name + each)))
     return name + next(extensions, "")
@@ -225,7 +221,7 @@ def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Len
         raise InputError(f"{where}: expected `fl_x` or `camera_angle_x`, found neither")
     values = {key: meta[key] for key in _COEFFICIENTS if key in meta}
     if not fisheye and values.pop("k4", 0.0) != 0.0:
-        # Its meaning differs: Nerfstudio's is a 4th radial term, OpenCV's the first of a denominator.
+        # Nerfstudio's k4 is a 4th radial term, OpenCV's the first of a denominator.
         raise InputError(f"{where}: expected k4 = 0 for a lens that is not a fisheye, found {meta['k4']}")
     values["fx"], values["fy"] = fx if fx is not None else fy, fy if fy is not None else fx
     values["cx"], values["cy"] = meta.get("cx", width / 2), meta.get("cy", height / 2)

@@ -1,4 +1,4 @@
-"""Films as MP4, by PyAV (extra `video`)."""
+"""Writes videos as MP4 with PyAV (extra `video`)."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _CODECS = (("libx264", {"crf": "18", "preset": "medium"}), ("mpeg4", {"qscale": 
 
 
 def check_video(path: Path | str) -> None:
-    """Raise UsageError for a name that is no film's, BackendError where PyAV is not installed."""
+    """Raise UsageError if a path does not end in .mp4, BackendError if PyAV is not installed."""
     if Path(path).suffix.lower() != SUFFIX:
-        raise UsageError(f"cannot write a film as {path}: expected a name that ends in {SUFFIX}")
+        raise UsageError(f"cannot write a video as {path}: expected a name that ends in {SUFFIX}")
     _av()
 
 
 def write_video(path: Path | str, frames: Iterator[npt.NDArray[np.uint8]], fps: int) -> int:
-    """Atomically write frames [H, W, 3] of one even size, `fps` a second; returns how many there were.
+    """Atomically write frames [H, W, 3] of one even size at `fps` per second; returns their number.
 
-    H.264 where this build of FFmpeg has it, else MPEG-4; colours as they are seen, 4:2:0.
+    Encodes H.264 if this build of FFmpeg has it, else MPEG-4, in sRGB with 4:2:0 subsampling.
     """
     av = _av()
     data, count = io.BytesIO(), 0
@@ -58,4 +58,4 @@ def _av() -> Any:
     try:
         return import_module("av")
     except ImportError as error:
-        raise BackendError(f"films need the package av (pip install 'keyss[video]'): {error}") from error
+        raise BackendError(f"videos need the package av (pip install 'keyss[video]'): {error}") from error

@@ -18,9 +18,7 @@ from files.formats.examples import (
     random_sog,
     random_spz,
 )
-from keyss.core import Gaussians
-from keyss.core.errors import OutputError
-from keyss.core.similarity import Similarity
+from keyss.core import Gaussians, OutputError, Similarity
 from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.codebooks import codebook_of, nearest, palette_of
 from keyss.files.formats.common import from_smallest_three, morton_order, smallest_three, unit

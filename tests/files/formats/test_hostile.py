@@ -20,7 +20,7 @@ import zstandard
 from PIL import Image
 
 from files.formats.examples import model_of
-from keyss.core.errors import InputError
+from keyss.core import InputError
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats import spz
 from mutations import attempt, damaged, examples

@@ -1,5 +1,5 @@
-"""Formats that models are published in, one module each.
+"""Formats of published models, one module each.
 
-Those that round have two levels: `parse` and `serialise` between bytes and codes, the integers of the file,
-which invert each other exactly; `dequantise` and `quantise` between codes and `Gaussians`.
+Lossy formats have two levels: `parse` and `serialise` convert between bytes and codes, the integers of the
+file, exactly; `dequantise` and `quantise` between codes and `Gaussians`.
 """
