@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from keyss.core import Gaussians, Similarity, camera_positions
-from keyss.rendering import VIEWS, middle_and_radius, orbit, scene_of_model
+from keyss.rendering import VIEWS, middle_and_radius, scene_of_model
+from keyss.rendering.orbit import orbit
 from tiny_scenes import random_gaussians
 
 SIZE = 48

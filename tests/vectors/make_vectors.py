@@ -169,7 +169,7 @@ def write_published() -> None:
     files = {
         "published.spz": spz.write_spz(model),
         "published-2.spz": spz.serialise(random_spz(np.random.default_rng(1), 2, 40, 15)),
-        "published-4.spz": spz.serialise(spz.quantise(model, version=4)),
+        "published-4.spz": spz.serialise(replace(spz.quantise(model), version=4)),
         "published.compressed.ply": compressed_ply.write_compressed_ply(model),
         "published.sog": sog.write_sog(model),
         "published.splat": splat.write_splat(model),

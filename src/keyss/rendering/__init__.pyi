@@ -6,7 +6,6 @@ from .orbit import (
     is_model as is_model,
     look_at as look_at,
     middle_and_radius as middle_and_radius,
-    orbit as orbit,
     scene_of_model as scene_of_model,
 )
 from .paths import around as around, circle as circle, through as through

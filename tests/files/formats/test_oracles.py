@@ -84,7 +84,7 @@ def test_spz_has_the_codes_of_splat_transforms(
     model = model_of(600, degree)
     write_model(tmp_path / "in.ply", model)
     theirs = spz.parse(splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes())
-    assert spz.quantise(model, version=4) == theirs
+    assert replace(spz.quantise(model), version=4) == theirs
 
 
 @DEGREES

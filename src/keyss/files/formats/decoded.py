@@ -17,6 +17,7 @@ from torch import Tensor
 from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import Gaussians
+from keyss.files.formats.common import reason
 
 FORMAT = "keyss-decoded/1"
 
@@ -41,21 +42,15 @@ def write_decoded(model: DecodedGaussians) -> bytes:
 def read_decoded(data: bytes) -> Gaussians:
     """The model of `write_decoded`. Raises InputError."""
     try:
-        tensors = safetensors.torch.load(data)
-    except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(f"expected a model that a network decodes: {str(error)[:200]}") from error
-    wrong = [
-        name for name, each in tensors.items() if each.dtype != torch.float32 or not each.isfinite().all()
-    ]
-    if wrong:
-        raise InputError(f"expected finite numbers of single precision in {', '.join(sorted(wrong))[:200]}")
-    try:
-        return _of_tensors(tensors)
-    except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"expected a model that a network decodes: {str(error)[:200]}") from error
+        return _of_tensors(safetensors.torch.load(data))
+    except (safetensors.SafetensorError, ValueError, KeyError, IndexError, RuntimeError) as error:
+        raise InputError(f"expected a model that a network decodes: {reason(error)}") from error
 
 
 def _of_tensors(tensors: dict[str, Tensor]) -> DecodedGaussians:
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or not tensor.isfinite().all():
+            raise ValueError(f"{name}: expected finite numbers of single precision")
     model = Gaussians(*(tensors.pop(name) for name in _NAMES))
     features, background = tensors.pop("features", None), tensors.pop("background")
     if len(model) == 0:

@@ -1,4 +1,4 @@
-"""SPZ, Niantic's compressed format: reads versions 2, 3 and 4, writes 3 and 4.
+"""SPZ, Niantic's compressed format: reads versions 2, 3 and 4, writes models in version 3.
 
 https://github.com/nianticlabs/spz. `parse` and `serialise` turn bytes into codes and back;
 `spz_container` packs them. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward (RDF):
@@ -37,6 +37,7 @@ _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library
 _MAX = 2**23 - 1  # the largest code of a position
 _COLOR_SCALE = 0.15  # 0.15 f_dc + 0.5 is within 0 to 1
 _MAGNITUDE = 2**9 - 1  # a component of a rotation has a sign and 9 bits
+_SH_STEPS = np.array([8] * 3 + [16] * 12)  # 5 bits for degree 1, 4 above, as in Niantic's library
 
 # Signs of the harmonics of degrees 1 to 3 under (x, -y, -z).
 _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
@@ -129,20 +130,14 @@ def dequantise(codes: SpzCodes) -> Gaussians:
     )
 
 
-def quantise(
-    model: Gaussians, *, version: int = VERSION, sh1_bits: int = 5, sh_rest_bits: int = 4
-) -> SpzCodes:
-    """The codes nearest to a model, in its order.
-
-    `sh1_bits`, `sh_rest_bits`: precision of harmonics of degree 1 and of the others, 1 to 8 bits, by default
-    that of Niantic's library. Raises OutputError for positions beyond 8 million world units.
-    """
+def quantise(model: Gaussians) -> SpzCodes:
+    """The codes nearest to a model, in its order. Raises OutputError for positions beyond 8 million."""
     means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
     bits = _fractional_bits(means)
     largest, xyz = smallest_three(np.roll(unit(quats) * _QUAT_SIGNS, -1, axis=1))
     magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
     return SpzCodes(
-        version=version,
+        version=VERSION,
         fractional_bits=bits,
         flags=0,
         positions=rounded(np.ldexp(means.astype(np.float64), bits) * _MEAN_SIGNS).astype(np.int32),
@@ -151,7 +146,7 @@ def quantise(
         scales=to_bytes((log_scales.astype(np.float64) + 10) * 16),
         largest=largest,
         rotations=magnitudes.astype(np.uint16) | np.where(xyz < 0, 512, 0).astype(np.uint16),
-        sh=_quantised_harmonics(rest, sh1_bits, sh_rest_bits),
+        sh=_quantised_harmonics(rest),
     )
 
 
@@ -178,10 +173,10 @@ def _fractional_bits(means: Floats) -> int:
     return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < _MAX)
 
 
-def _quantised_harmonics(rest: Floats, sh1_bits: int, sh_rest_bits: int) -> Bytes:
-    """[N, K - 1, 3] codes whose unused low bits are constant, which compresses better."""
+def _quantised_harmonics(rest: Floats) -> Bytes:
+    """[N, K - 1, 3] codes that are multiples of `_SH_STEPS`, which compresses better."""
     signed = rest * _SH_SIGNS[: rest.shape[1], None]
     codes = rounded(signed.astype(np.float64) * 128) + 128
-    step = np.where(np.arange(rest.shape[1]) < 3, 2 ** (8 - sh1_bits), 2 ** (8 - sh_rest_bits))[:, None]
+    step = _SH_STEPS[: rest.shape[1], None]
     found: Bytes = (np.floor((codes + step // 2) / step) * step).clip(0, 255).astype(np.uint8)
     return found
