@@ -15,12 +15,11 @@ import pytest
 from channels.low_bits.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels import LOW_BITS
-from keyss.cli import commands, main
-from keyss.cli.flags import options_of
+from keyss.cli import commands, flags, main
 from keyss.core import KeyssError
 from keyss.fitting import SilentReporter
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.methods.registry import METHODS
+from keyss.methods import registry
 
 KEY = "q7Rv2LxT9bWm4KzD"
 SPELLINGS = [
@@ -97,9 +96,11 @@ def test_nothing_that_is_written_or_said_holds_the_key(
 
 
 def test_no_command_takes_a_key_as_an_argument() -> None:
-    asked = [(name, []) for name in commands.MODULES] + [("hide", ["--method", name]) for name in METHODS]
+    asked = [(name, []) for name in commands.MODULES] + [
+        ("hide", ["--method", name]) for name in registry.METHODS
+    ]
     for name, arguments in asked:
-        options = options_of(commands.to_parse(name, arguments))
+        options = flags.options_of(commands.to_parse(name, arguments))
         keys = {name: hint for name, hint in options.items() if "key" in name}
         for name in keys.keys() - {"wrong_keys", "key_encoder"}:
             assert "Path" in str(keys[name]), name

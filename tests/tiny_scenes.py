@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from keyss.core import Camera, Gaussians, Scene, View
-from keyss.core.gaussians import SH_C0
+from keyss.core import SH_C0, Camera, Gaussians, Scene, View
 from keyss.rendering import render
 
 WIDTH, HEIGHT = 40, 30

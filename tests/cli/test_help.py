@@ -12,7 +12,7 @@ import pytest
 
 from cli.said import COMMANDS, Said
 from keyss import __version__
-from keyss.audits.parts import PARTS
+from keyss.audits import PARTS
 from keyss.files import write_model
 from keyss.fitting import PRESETS as FIT_PRESETS
 from keyss.methods import registry

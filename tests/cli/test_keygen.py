@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cli.said import Said, assert_refused
-from keyss.cli.keys import key_of_file
-from keyss.keys import MasterKey
+from keyss.keys import MasterKey, read_key_file
 
 MASTER = "q7Rv2LxT9bWm4KzDq7Rv2L"
 
@@ -57,14 +56,14 @@ class TestKeygen:
             said = keyss("keygen", "-o", path)
         finally:
             os.umask(umask)
-        key = key_of_file(path)
+        key = read_key_file(path)
         assert (said.status, said.err) == (0, "")
         assert str(path) in said.out
         assert key not in said.out
         assert len(key) == 16
         assert path.stat().st_mode & 0o777 == 0o600
         assert_refused(keyss("keygen", "-o", path), 5, "never replaced")
-        assert key_of_file(path) == key
+        assert read_key_file(path) == key
         path.with_name("link").symlink_to(tmp_path / "elsewhere")
         assert_refused(keyss("keygen", "-o", tmp_path / "link"), 5, "never replaced")
         assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "No such file")

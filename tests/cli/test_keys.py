@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from keyss.cli.keys import key_of_file, keys, warn_of_weak_keys
+from keyss.cli import keys
 from keyss.core import InputError, UsageError
 from keyss.keys import DerivedKey, KeyDerivation, generate_key
 
@@ -42,9 +42,9 @@ def test_surrounding_white_space_never_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, key: str
 ) -> None:
     """The file, the environment and whoever passes the text of a file in Python have the same key."""
-    assert keys([write(tmp_path, data)], 1) == [key]
+    assert keys.keys([write(tmp_path, data)], 1) == [key]
     monkeypatch.setenv("KEYSS_KEY", data.decode())
-    assert keys([], 1) == [key]
+    assert keys.keys([], 1) == [key]
     derivation = KeyDerivation(salt=bytes(16))
     assert DerivedKey(data.decode(), derivation).equals(DerivedKey(key, derivation))
 
@@ -61,43 +61,43 @@ def test_surrounding_white_space_never_counts(
 )
 def test_files_that_hold_no_key_are_refused(tmp_path: Path, data: bytes, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        key_of_file(write(tmp_path, data))
+        keys.key_of_file(write(tmp_path, data))
 
 
 def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        key_of_file(tmp_path / "missing")
+        keys.key_of_file(tmp_path / "missing")
     with pytest.raises(InputError, match="cannot be read"):
-        key_of_file(tmp_path)
+        keys.key_of_file(tmp_path)
 
 
 def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KEYSS_KEY", "from the environment")
-    assert keys([write(tmp_path, b"from the file\n")], 1) == ["from the file"]
-    assert keys([], 1) == ["from the environment"]
+    assert keys.keys([write(tmp_path, b"from the file\n")], 1) == ["from the file"]
+    assert keys.keys([], 1) == ["from the environment"]
     with pytest.raises(UsageError, match="2 secrets"):
-        keys([], 2)
+        keys.keys([], 2)
     monkeypatch.setenv("KEYSS_KEY", "")
     with pytest.raises(UsageError, match="KEYSS_KEY: the key is empty"):
-        keys([], 1)
+        keys.keys([], 1)
     monkeypatch.setenv("KEYSS_KEY", os.fsdecode(b"\xff"))
     with pytest.raises(UsageError, match="UTF-8"):
-        keys([], 1)
+        keys.keys([], 1)
 
 
 def test_as_many_files_as_secrets(tmp_path: Path) -> None:
     path = write(tmp_path, b"k")
-    assert keys([path, path], 2) == ["k", "k"]
+    assert keys.keys([path, path], 2) == ["k", "k"]
     with pytest.raises(UsageError, match="got 1"):
-        keys([path], 2)
+        keys.keys([path], 2)
     with pytest.raises(UsageError, match="one --key-file, got 2"):
-        keys([path, path], 1)
+        keys.keys([path, path], 1)
 
 
 def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
     with pytest.raises(UsageError, match="no key"):
-        keys([], 1)
+        keys.keys([], 1)
 
 
 class TestPrompt:
@@ -111,18 +111,18 @@ class TestPrompt:
 
     def test_asks_once_to_open_and_twice_to_lock(self, typed: list[str]) -> None:
         typed += ["one", "one", "two", "two"]
-        assert keys([], 2, confirm=True) == ["one", "two"]
+        assert keys.keys([], 2, confirm=True) == ["one", "two"]
         typed += ["three"]
-        assert keys([], 1) == ["three"]
+        assert keys.keys([], 1) == ["three"]
         assert typed == []
 
     def test_refuses_a_slip(self, typed: list[str]) -> None:
         typed += ["one", "onw"]
         with pytest.raises(UsageError, match="differ"):
-            keys([], 1, confirm=True)
+            keys.keys([], 1, confirm=True)
         typed += [""]
         with pytest.raises(UsageError, match="empty"):
-            keys([], 1, confirm=True)
+            keys.keys([], 1, confirm=True)
 
     def test_an_end_of_input_is_no_key(self, typed: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         def ctrl_d(prompt: str) -> str:
@@ -130,7 +130,7 @@ class TestPrompt:
 
         monkeypatch.setattr(getpass, "getpass", ctrl_d)
         with pytest.raises(UsageError, match="no key was typed"):
-            keys([], 1)
+            keys.keys([], 1)
 
 
 def test_a_key_file_that_others_can_read_gets_a_warning_without_the_key(
@@ -138,19 +138,19 @@ def test_a_key_file_that_others_can_read_gets_a_warning_without_the_key(
 ) -> None:
     path = write(tmp_path, b"tell nobody")
     path.chmod(0o600)
-    key_of_file(path)
+    keys.key_of_file(path)
     assert capsys.readouterr().err == ""
     path.chmod(0o640)
-    key_of_file(path)
+    keys.key_of_file(path)
     said = capsys.readouterr().err
     assert "others can read" in said
     assert "tell nobody" not in said
 
 
 def test_weak_keys_get_a_warning_without_the_key(capsys: pytest.CaptureFixture[str]) -> None:
-    warn_of_weak_keys([generate_key(20)])
+    keys.warn_of_weak_keys([generate_key(20)])
     assert capsys.readouterr().err == ""
-    warn_of_weak_keys([generate_key(20), "hunter2"])
+    keys.warn_of_weak_keys([generate_key(20), "hunter2"])
     said = capsys.readouterr().err
     assert "key 2: " in said
     assert "bits" in said

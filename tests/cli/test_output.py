@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import COMMANDS, PROGRAM, Said
-from keyss.cli import main
-from keyss.cli.characters import REPLACING
+from keyss.cli import characters, main
 from keyss.files import read_model
 
 NARROW = ["ascii", "cp1252", *(pytest.param(name, marks=pytest.mark.slow) for name in ("latin-1", "cp437"))]
@@ -110,13 +109,15 @@ def test_help_is_made_of_characters_with_a_likeness_in_ascii(
     keyss: Callable[..., Said], command: str
 ) -> None:
     said = keyss(command, "--help").out
-    assert said.encode("ascii", REPLACING).count(b"?") == said.count("?")
+    assert said.encode("ascii", characters.REPLACING).count(b"?") == said.count("?")
 
 
 def test_what_cannot_be_shown_is_replaced() -> None:
-    assert "╭ • 7 ≤ 8…".encode("ascii", REPLACING) == b"+ * 7 <= 8..."
-    assert "ä鍵".encode("cp1252", REPLACING) == b"\xe4?"
-    assert os.fsdecode(b"\xff.ply").encode("utf-8", REPLACING) == b"\xff.ply"  # a file's name as it is
+    assert "╭ • 7 ≤ 8…".encode("ascii", characters.REPLACING) == b"+ * 7 <= 8..."
+    assert "ä鍵".encode("cp1252", characters.REPLACING) == b"\xe4?"
+    assert (
+        os.fsdecode(b"\xff.ply").encode("utf-8", characters.REPLACING) == b"\xff.ply"
+    )  # a file's name as it is
 
 
 def test_numbers_in_a_locale_without_characters(world: Path, tmp_path: Path) -> None:
@@ -137,7 +138,7 @@ def test_json_is_json_in_any_encoding(
     keyss: Callable[..., Said], world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
 ) -> None:
     shutil.copytree(world / "b", tmp_path / "ä鍵")
-    stream = io.TextIOWrapper(io.BytesIO(), encoding, REPLACING)
+    stream = io.TextIOWrapper(io.BytesIO(), encoding, characters.REPLACING)
     monkeypatch.setattr("sys.stdout", stream)
     assert main(["info", str(tmp_path / "ä鍵"), "--json"]) == 0
     assert json.loads(stream.buffer.getvalue().decode(encoding))["name"] == "ä鍵"  # type: ignore[attr-defined]

@@ -16,12 +16,10 @@ from channels.colours.made import cover
 from channels.low_bits.trained_like import trained_like
 from cli.said import Said, assert_refused, listing
 from keyss import write_model
-from keyss.channels import Payload
-from keyss.channels.packing import pack_payload, unpack_payload
+from keyss.channels import Payload, packing
 from keyss.cli import main
 from keyss.core import InputError, UsageError
-from keyss.methods import HiddenFile
-from keyss.methods.hidden_file import NAME
+from keyss.methods import HiddenFile, hidden_file
 from methods.carry.carried import embed
 
 Keyss = Callable[..., Said]
@@ -112,7 +110,7 @@ def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
 def test_any_bytes_and_any_name_come_back(data: bytes, name: str) -> None:
     file = HiddenFile(name.encode(errors="replace").decode(), data)
     assert HiddenFile.of(file.payload()) == file
-    assert unpack_payload(pack_payload(file.payload())) == file.payload()
+    assert packing.unpack_payload(packing.pack_payload(file.payload())) == file.payload()
 
 
 _BOMB = b"\x09file" + zlib.compress(bytes(10**6))
@@ -121,13 +119,13 @@ _BOMB = b"\x09file" + zlib.compress(bytes(10**6))
 @pytest.mark.parametrize("data", [b"", b"\1", b"\x09filejunk", _BOMB, b"\x09fil"])
 def test_what_no_writer_packed_is_refused(data: bytes) -> None:
     with pytest.raises(InputError):
-        unpack_payload(data)
+        packing.unpack_payload(data)
 
 
 @given(st.binary(max_size=300))
 def test_payloads_of_others_are_read_or_refused(data: bytes) -> None:
     try:
-        found = HiddenFile.of(Payload(NAME, data))
+        found = HiddenFile.of(Payload(hidden_file.NAME, data))
     except InputError:
         return
     assert len(found.data) <= len(data)

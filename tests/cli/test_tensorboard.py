@@ -11,7 +11,7 @@ import pytest
 
 from cli.said import SMALL, Said, assert_refused
 from files.scene_files import write_nerfstudio
-from keyss.cli.reporting import FOLDER, tensorboard_reporter
+from keyss.cli import reporting
 from keyss.files import read_model
 from keyss.fitting.reporting import SeveralReporter
 
@@ -48,7 +48,7 @@ def test_losses_come_back(keyss: Run, scene: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_two_trainings_at_the_same_time_have_a_run_each(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    cover = tensorboard_reporter(tmp_path)
+    cover = reporting.tensorboard_reporter(tmp_path)
     assert isinstance(cover, SeveralReporter)
     secret = cover.beside()
     for title, each in (("cover", cover), ("secret", secret)):
@@ -57,7 +57,7 @@ def test_two_trainings_at_the_same_time_have_a_run_each(tmp_path: Path) -> None:
         each.update(10, 100, {"loss": factor})
         each.finish()
     for title, loss in (("cover", 1.0), ("secret", 2.0)):
-        found = events.EventAccumulator(str(tmp_path / FOLDER / title))
+        found = events.EventAccumulator(str(tmp_path / reporting.FOLDER / title))
         found.Reload()
         assert [each.value for each in found.Scalars("loss")] == [loss]
 

@@ -17,7 +17,7 @@ import keyss as library
 from cli.said import Said, assert_refused
 from files.scene_files import write_nerfstudio
 from keyss import load_scene, write_model
-from keyss.api.filming import shown, wiped
+from keyss.api import filming
 from keyss.core import Camera, Gaussians, UsageError
 from keyss.rendering import around, circle, look_at, middle_and_radius, render, through
 from tiny_scenes import random_gaussians
@@ -157,10 +157,10 @@ def test_around_stays_where_cameras_were() -> None:
 
 def test_wipes() -> None:
     black, grey = np.zeros((4, 10, 3), np.uint8), np.full((4, 10, 3), 99, np.uint8)
-    assert (wiped(black, grey, 0) == 0).all()
-    assert (wiped(black, grey, 1) == 99).all()
-    assert wiped(black, grey, 0.5)[0, :, 0].tolist() == [99] * 4 + [255] * 2 + [0] * 4
-    assert [shown(time) for time in (0, 0.5, 1)] == [0, 1, 0]
+    assert (filming.wiped(black, grey, 0) == 0).all()
+    assert (filming.wiped(black, grey, 1) == 99).all()
+    assert filming.wiped(black, grey, 0.5)[0, :, 0].tolist() == [99] * 4 + [255] * 2 + [0] * 4
+    assert [filming.shown(time) for time in (0, 0.5, 1)] == [0, 1, 0]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from cli.conftest import keyss  # noqa: F401  fixture
 from cli.said import Said
 from keyss import CarryOptions
 from keyss.core import InputError, OutputError, WrongKeyError
-from keyss.keys.master import MasterKey
+from keyss.keys import MasterKey
 from keyss.many import ManyResult, assets, cell, hide_batch, processes
 from many.fakes import REAL
 from tiny_scenes import random_gaussians

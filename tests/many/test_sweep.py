@@ -18,7 +18,7 @@ import scipy.stats
 
 from keyss.core import InputError, OutputError
 from keyss.many import Forecast, ManyResult, cell, processes, spec, sweep, tables
-from keyss.runs.folder import MANIFEST
+from keyss.runs import MANIFEST
 from many.fakes import DRIVER, REAL, fake, real_spec, training_spec, write_spec
 from many.killing import kill_until_done, results
 from other_processes import until

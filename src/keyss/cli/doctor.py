@@ -5,18 +5,15 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from importlib import metadata
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 from keyss.cli.arguments import Device, switch
+from keyss.core.errors import BackendError, KeyssError
 
-if TYPE_CHECKING:
-    import torch
-
-# What each extra of pyproject.toml installs, and what that is for.
+# The first package that each extra of pyproject.toml installs, and its purpose.
 EXTRAS = {
     "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
@@ -25,17 +22,12 @@ EXTRAS = {
     "tensorboard": ("tensorboard", "losses during training"),
     "video": ("av", "keyss render --video"),
 }
-_LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
+LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
 _TOLERANCE = 1e-4  # of a pixel's value from 0 to 1
 
 
-@dataclass(frozen=True)
-class Finding:
-    """The state of one component: "missing" if it is optional, "broken" if it is required."""
-
-    name: str
-    state: Literal["ok", "missing", "broken"]
-    says: str
+class _Missing(Exception):
+    """An optional component is not there."""
 
 
 def doctor(
@@ -43,146 +35,123 @@ def doctor(
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
     device: Device = "auto",
 ) -> None:
-    """Check the installation: versions, GPU, extras, a test render, a key derivation.
+    """Check the installation: versions, devices, optional packages, a test render.
 
     Exit status: 0 everything required works, 6 something does not. The first call compiles the rasterizer,
     10 to 20 s; on a machine with a GPU, gsplat may compile for minutes.
 
     example: keyss doctor
     """
-    from keyss.core.errors import BackendError
-
-    found = list(findings(device))
+    checks: dict[str, Callable[[], str]] = {"keyss": _keyss}
+    checks |= {name: partial(_library, name) for name in LIBRARIES}
+    checks |= {"cores": _cores, "GPU": _gpu, "kernel cache": _cache, "test frame": partial(_frame, device)}
+    checks |= {f"[{name}]": partial(_extra, name) for name in EXTRAS}
+    checks |= {"splat-transform": _splat_transform}
+    results = {name: _result(check) for name, check in checks.items()}
     if json_:
         from keyss.cli.tables import print_json
 
-        print_json({each.name: {"state": each.state, "says": each.says} for each in found})
+        print_json({name: {"state": state, "says": text} for name, (state, text) in results.items()})
     else:
-        width = max(len(each.name) for each in found)
-        for each in found:
-            print(f"{each.state:<7}  {each.name:<{width}}  {each.says}")
-    if broken := [each.name for each in found if each.state == "broken"]:
+        width = max(map(len, results))
+        for name, (state, text) in results.items():
+            print(f"{state:<7}  {name:<{width}}  {text}")
+    if broken := [name for name, (state, _) in results.items() if state == "broken"]:
         raise BackendError(f"required components do not work: {', '.join(broken)} (see above)")
 
 
-def findings(device: Literal["auto", "cpu", "cuda"]) -> Iterator[Finding]:
-    """What `keyss doctor` prints, in order."""
+def _result(check: Callable[[], str]) -> tuple[str, str]:
+    """The state of a component ("ok", "missing" if it is optional, "broken" otherwise) and a description."""
+    try:
+        return "ok", check()
+    except _Missing as error:
+        return "missing", str(error)
+    except KeyssError as error:
+        return "broken", str(error)
+    except Exception as error:
+        return "broken", f"{type(error).__name__}: {error}"
+
+
+def _keyss() -> str:
     from keyss import __version__
 
-    python, system = platform.python_version(), platform.platform()
-    yield Finding("keyss", "ok", f"{__version__}, Python {python}, {system}")
-    yield from map(_library, _LIBRARIES)
-    yield from _checks(
-        ("cores", _cores), ("GPU", _gpu), ("kernel cache", _cache), ("key derivation", _derivation)
-    )
-    yield from _checks(("test frame", lambda: _frame(device)))
-    for extra, (package, use) in EXTRAS.items():
-        version = _version(package)
-        hint = f"for {use}: pip install 'keyss[{extra}]'"
-        says = f"{package} {version}, for {use}" if version else hint
-        yield Finding(f"[{extra}]", "ok" if version else "missing", says)
-    yield from _checks(("splat-transform", _program))
+    return f"{__version__}, Python {platform.python_version()}, {platform.platform()}"
 
 
-def _checks(*checks: tuple[str, Callable[[], tuple[bool, str]]]) -> Iterator[Finding]:
-    """Run checks, each of which returns whether its component is there, and a description."""
-    for name, check in checks:
-        try:
-            there, says = check()
-            yield Finding(name, "ok" if there else "missing", says)
-        except Exception as error:
-            yield Finding(name, "broken", f"{type(error).__name__}: {error}")
-
-
-def _version(package: str) -> str | None:
-    with suppress(metadata.PackageNotFoundError):
+def _library(package: str) -> str:
+    try:
         return metadata.version(package)
-    return None
+    except metadata.PackageNotFoundError:
+        raise BackendError(f"pip install {package}") from None
 
 
-def _library(package: str) -> Finding:
-    version = _version(package)
-    return Finding(package, "ok" if version else "broken", version or f"pip install {package}")
+def _extra(name: str) -> str:
+    package, purpose = EXTRAS[name]
+    try:
+        return f"{package} {_library(package)}, for {purpose}"
+    except BackendError:
+        raise _Missing(f"for {purpose}: pip install 'keyss[{name}]'") from None
 
 
-def _cores() -> tuple[bool, str]:
+def _cores() -> str:
     import torch
 
     from keyss._processes import usable_cores
 
-    return True, f"{usable_cores()} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
+    return f"{usable_cores()} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
 
 
-def _gpu() -> tuple[bool, str]:
+def _gpu() -> str:
     import torch
 
     if not torch.cuda.is_available():
-        return False, "torch finds no CUDA GPU; the CPU is used"
+        raise _Missing("torch finds no CUDA GPU; the CPU is used")
     properties = torch.cuda.get_device_properties(0)
-    return True, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB, CUDA {torch.version.cuda}"
+    return f"{properties.name}, {properties.total_memory / 1e9:.0f} GB, CUDA {torch.version.cuda}"
 
 
-def _cache() -> tuple[bool, str]:
+def _cache() -> str:
     from keyss.rendering.cpu.jit import cache_folder
 
     folder = cache_folder()
     if folder is None:
-        return False, "no writable folder: every command compiles the kernels again, 10 to 20 s"
-    return True, str(folder)
+        raise _Missing("no writable folder: every command compiles the kernels again, 10 to 20 s")
+    return str(folder)
 
 
-def _derivation() -> tuple[bool, str]:
-    from keyss.keys import DerivedKey, KeyDerivation
-
-    start = time.perf_counter()
-    derivation = KeyDerivation(salt=bytes(16))
-    DerivedKey("doctor", derivation)
-    return True, f"Argon2id with {derivation.memory_kib >> 10} MiB in {time.perf_counter() - start:.2f} s"
-
-
-def _frame(device: Literal["auto", "cpu", "cuda"]) -> tuple[bool, str]:
+def _frame(device: Device) -> str:
     """Render one Gaussian, and check a pixel in its middle and one in a corner."""
     import torch
 
-    from keyss.core import BackendError, Camera, Gaussians
-    from keyss.core.gaussians import SH_C0
+    from keyss.core import SH_C0, Camera, Gaussians
     from keyss.rendering import render, resolve_device
 
-    size, color = 65, torch.tensor([0.9, 0.5, 0.1])
-    chosen = resolve_device(device)
-    logit = 2.0
+    size, color, target = 65, torch.tensor([0.9, 0.5, 0.1]), resolve_device(device)
     model = Gaussians(
         means=torch.tensor([[0.0, 0.0, 4.0]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         log_scales=torch.full((1, 3), -1.5),
-        opacity_logits=torch.tensor([logit]),
+        opacity_logits=torch.tensor([2.0]),
         sh=((color - 0.5) / SH_C0)[None, None],
     )
     K = torch.tensor([[80.0, 0, size / 2], [0, 80.0, size / 2], [0, 0, 1]])
     camera = Camera(torch.eye(4), K, size, size, "doctor.png")
-    moved = model.to(chosen)
     with torch.no_grad():
-        render(moved, camera)  # compiles the kernels, unless they are cached
+        render(model.to(target), camera)  # compiles the kernels, unless they are cached
         start = time.perf_counter()
-        image = render(moved, camera).cpu()
+        image = render(model.to(target), camera).cpu()
         seconds = time.perf_counter() - start
-    meant = color * torch.sigmoid(torch.tensor(logit))
-    if not _near(image[size // 2, size // 2], meant) or not _near(image[0, 0], torch.zeros(3)):
-        raise BackendError(f"the render on {chosen} is wrong")
-    who = "gsplat" if chosen.type == "cuda" else "the CPU rasterizer"
-    return True, f"rendered by {who} on {chosen} in {1e3 * seconds:.1f} ms"
+    errors = image[size // 2, size // 2] - color * model.opacities, image[0, 0]
+    if max(float(error.abs().max()) for error in errors) > _TOLERANCE:
+        raise BackendError(f"the render on {target} is wrong")
+    backend = "gsplat" if target.type == "cuda" else "the CPU rasterizer"
+    return f"rendered by {backend} on {target} in {1e3 * seconds:.1f} ms"
 
 
-def _near(found: torch.Tensor, meant: torch.Tensor) -> bool:
-    return bool(((found - meant).abs() <= _TOLERANCE).all())
-
-
-def _program() -> tuple[bool, str]:
-    """The third-party converter that audits use."""
-    from keyss.core.errors import BackendError
+def _splat_transform() -> str:
     from keyss.measure.robustness.conversions import find_splat_transform
 
     try:
-        return True, find_splat_transform()
+        return find_splat_transform()
     except BackendError as error:
-        return False, f"for conversions in audits: {error}"
+        raise _Missing(f"for conversions in audits: {error}") from error
