@@ -32,9 +32,8 @@ from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.measure.images import psnr
-from keyss.methods import most_visible
+from keyss.methods import fitted, most_visible, pruned
 from keyss.methods.records import whole
-from keyss.methods.records.precision import fitted
 from keyss.rendering import render
 from keyss.rendering.difference import psnr_between
 from keyss.rendering.orbit import scene_of_model
@@ -81,7 +80,9 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         untouched = format_.dequantise(format_.quantise(model))
         start = time.monotonic()
         room = CodesChannel(name).prepare(cover[1])
-        kept, encoded = fitted(own, room.capacity - room.overhead, prune=True)
+        left = room.capacity - room.overhead
+        kept = pruned(own, left)
+        encoded = fitted(kept, left)
         stego = room.embed([(KEY, Payload("carry", encoded))])
         file = format_.serialise(stego.codes)
         hiding = time.monotonic() - start

@@ -32,8 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from keyss import read_model, write_model
 from channels.low_bits.trained_like import trained_like
 from keyss.channels import LOW_BITS
-from keyss.methods import embed_models, embed_whole, most_visible, record_request
-from keyss.rendering.difference import Viewpoints
+from keyss.methods import embed_models, most_visible, pruned, record_request
 from keyss.runs.revealing import reveal_model
 
 KEY = "the key of the benchmark: 7Vw3-Qp"
@@ -136,11 +135,11 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
                 secret = most_visible(
                     secret, prepared.record_capacity([record_request(hidden, secret.sh_degree)])
                 )
-            stego = embed_models(prepared, [KEY], [secret]).stego
         else:
-            room, views = options.place.prepare(cover), Viewpoints.around(secret)
-            stego = embed_whole(room, [KEY], [secret], [views], prune=options.prune).stego
-        write_model(published, stego)
+            prepared = options.place.prepare(cover)
+            if options.prune:
+                secret = pruned(secret, prepared.capacity - prepared.overhead)
+        write_model(published, embed_models(prepared, [KEY], [secret]).gaussians)
     else:
         revealed = reveal_model(read_model(published), KEY, device=torch.device("cpu")).gaussians
         write_model(folder / "revealed.ply", revealed)

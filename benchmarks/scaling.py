@@ -106,7 +106,7 @@ def carry_seconds(size: Size) -> float:
 
         def carry() -> None:
             prepared, hidden = LOW_BITS.prepare(read_model(cover)), read_model(secret)
-            stego = embed_models(prepared, keys, [hidden] * secrets).stego
+            stego = embed_models(prepared, keys, [hidden] * secrets).gaussians
             write_model(Path(name) / "stego.ply", stego)
 
         return best_of(1, carry)
@@ -119,7 +119,7 @@ def reveal_seconds(size: Size) -> float:
         key, stego = "the key of the benchmark, 9fK2", Path(name) / "stego.ply"
         hidden = trained(count, 1)
         prepared = LOW_BITS.prepare(trained(count, 0))
-        write_model(stego, embed_models(prepared, [key], [hidden[:count]]).stego)
+        write_model(stego, embed_models(prepared, [key], [hidden[:count]]).gaussians)
 
         def reveal() -> None:
             found = reveal_model(read_model(stego), key, device=torch.device("cpu"))

@@ -19,7 +19,7 @@ from keyss import write_model
 from keyss.channels import Payload, packing
 from keyss.cli import main
 from keyss.core import InputError, UsageError
-from keyss.methods import HiddenFile, hidden_file
+from keyss.methods import HiddenFile
 from methods.carry.carried import embed
 
 Keyss = Callable[..., Said]
@@ -125,7 +125,7 @@ def test_what_no_writer_packed_is_refused(data: bytes) -> None:
 @given(st.binary(max_size=300))
 def test_payloads_of_others_are_read_or_refused(data: bytes) -> None:
     try:
-        found = HiddenFile.of(Payload(hidden_file.NAME, data))
+        found = HiddenFile.of(Payload("file", data))
     except InputError:
         return
     assert len(found.data) <= len(data)

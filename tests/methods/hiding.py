@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import pytest
 import torch
 
-from keyss.core import Gaussians, KeyssWarning, Scene
-from keyss.core.similarity import Similarity
-from keyss.fitting.image_metrics import mean_psnr
-from keyss.fitting.reporting import Reporter
+from fitting.test_plain import InterruptAt
+from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, Scene, Similarity
+from keyss.fitting import Reporter, mean_psnr
 from keyss.methods import Context, MethodOptions, Opened, Source, registry, with_plain_models
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -53,6 +53,27 @@ def hide_scenes(
         cover, *secrets = with_plain_models(sources, options.fits(len(sources)), context)
         stego = method.hide(cover, secrets, options, context)
     return Hidden(stego.gaussians, stego.opened)
+
+
+def check_resumes(options: MethodOptions, checkpoints: Path, stage: str) -> None:
+    """Check that a run interrupted in a plain fit, and then in `stage`, resumes to the same bits.
+
+    A run with other options does not resume it.
+    """
+    scenes, keys = three_scenes()[0][:2], ["a key"]
+
+    def run(resume: bool, interrupt: InterruptAt | None = None) -> Hidden:
+        return hide_scenes(scenes, keys, options, checkpoints=checkpoints, resume=resume, reporter=interrupt)
+
+    whole = hide_scenes(scenes, keys, options)
+    with pytest.raises(Interrupted):
+        run(False, InterruptAt(17, "plain model of the secret"))
+    with pytest.raises(Interrupted):
+        run(True, InterruptAt(23, stage))
+    assert same(run(True).stego, whole.stego)
+    changed = options.with_fit(sh0_rate=1e-3)
+    with pytest.raises(InputError, match="other settings"):
+        hide_scenes(scenes, keys, changed, checkpoints=checkpoints, resume=True)
 
 
 def moved(scene: Scene, frame: Similarity) -> Scene:

@@ -12,7 +12,7 @@ from channels.low_bits.trained_like import keys, trained_like
 from files.test_ply import assert_same_bits
 from keyss.channels import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians, InputError
-from keyss.methods.dither import dither
+from keyss.methods import dither
 from keyss.rendering import psnr_between
 from methods.carry.carried import embed_derived, extract_derived
 

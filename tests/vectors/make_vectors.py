@@ -63,7 +63,7 @@ from keyss.methods import (  # noqa: E402  # noqa: E402
     choose_anchors,
 )
 from keyss.methods.records import whole  # noqa: E402
-from keyss.methods.records.encoding import METHOD  # noqa: E402
+from keyss.methods.records.embedding import METHOD  # noqa: E402
 from keyss.methods.records.opening import unpack  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.keyss.hiding import some_secret  # noqa: E402

@@ -18,7 +18,7 @@ from keyss.core.similarity import Similarity
 from keyss.files import write_model
 from keyss.methods import HiddenFile
 from keyss.methods.records import whole
-from keyss.methods.records.encoding import METHOD
+from keyss.methods.records.embedding import METHOD
 from measure.lifelike import lifelike
 
 NAMES = ("appended.ply", "appended-moved.spz", "colours.spz", "colours-moved.splat")

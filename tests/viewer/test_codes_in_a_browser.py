@@ -11,8 +11,7 @@ import pytest
 from keyss.channels import SUFFIXES, channel_for
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
-from keyss.methods import embed_whole
-from keyss.rendering import Viewpoints
+from keyss.methods import embed_models
 from keyss.viewer import export_html
 from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
 
@@ -31,11 +30,10 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> PUBLISHED:
     for publish, suffix in SUFFIXES.items():
         room = channel_for(publish).prepare(made(4000, 0))  # type: ignore[arg-type]
         secrets = [made(100, seed).with_sh_degree(1) for seed in (1, 2)]
-        views = [Viewpoints.around(each) for each in secrets]
-        hidden = embed_whole(room, KEYS, secrets, views, prune=False, entropy=bytes(32))
-        write_model(folder / f"stego{suffix}", hidden.stego)
+        hidden = embed_models(room, KEYS, secrets, entropy=bytes(32))
+        write_model(folder / f"stego{suffix}", hidden.gaussians)
         (page,) = export_html(folder / f"stego{suffix}", folder / f"{publish}.html")
-        found[suffix] = page, [each.gaussians for each in hidden.opened]
+        found[suffix] = page, [each.reveal(hidden.gaussians) for each in hidden.opened]
     return found
 
 

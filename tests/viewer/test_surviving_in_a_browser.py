@@ -11,8 +11,7 @@ import pytest
 from keyss.channels import channel_for
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
-from keyss.methods import HiddenFile, embed_whole
-from keyss.rendering import Viewpoints
+from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from measure.lifelike import lifelike
 from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
@@ -35,11 +34,11 @@ def published(tmp_path_factory: pytest.TempPathFactory, secret: Gaussians) -> tu
     """A folder with a model as it was published and as others converted it, and what its key opens."""
     folder = tmp_path_factory.mktemp("published")
     room = channel_for("any", "appended").prepare(made(4000, 0))
-    hidden = embed_whole(room, [KEY], [secret], [Viewpoints.around(secret)], prune=False, entropy=bytes(32))
-    write_model(folder / "stego.ply", hidden.stego)
+    hidden = embed_models(room, [KEY], [secret], entropy=bytes(32))
+    write_model(folder / "stego.ply", hidden.gaussians)
     for suffix in SUFFIXES[1:]:
         write_model(folder / f"stego{suffix}", read_model(folder / "stego.ply"))
-    return folder, hidden.opened[0].gaussians
+    return folder, hidden.opened[0].reveal(hidden.gaussians)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

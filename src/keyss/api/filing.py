@@ -13,7 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model
 from keyss.files.reading import read_file
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
-from keyss.methods.hidden_file import HiddenFile
+from keyss.methods.opened import HiddenFile
 from keyss.rendering.difference import psnr_between
 from keyss.runs.files import STEGOS, stego_name, writers
 from keyss.runs.folder import RunFolder

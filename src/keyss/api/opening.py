@@ -12,8 +12,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
 from keyss.files.models import check_model_output, is_model_path, write_model
 from keyss.files.streams import is_standard
-from keyss.methods.hidden_file import HiddenFile, OpensAFileError
-from keyss.methods.opened import Frame
+from keyss.methods.opened import Frame, HiddenFile, OpensAFileError
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.folder import check_not_published
 from keyss.runs.revealing import Revealed, reveal_model, revealed_file

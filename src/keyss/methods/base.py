@@ -1,14 +1,13 @@
-"""What every method is: from scenes and keys to one published model, and from it and a key to a secret.
+"""The protocol of methods: from scenes and keys to a published model, and from it and a key to a secret.
 
 A method lives in a folder of its own and is entered once, in `keyss.methods.registry`. Nothing outside its
-folder tests for its name: what it can do it declares, and what it finds it gives back as these types.
+folder tests for its name: it declares its capabilities, and returns its results as these types.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
@@ -16,7 +15,7 @@ from typing import Any, ClassVar, Protocol, Self
 import torch
 
 from keyss.channels import AnyChannel, Channel, Payload, Publish, channel_for
-from keyss.core.errors import KeyssError, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import PRESETS, FitConfig
@@ -27,11 +26,11 @@ from keyss.methods.plan import Plan
 
 @dataclass(frozen=True)
 class Source:
-    """The cover or a secret: what is given of it, and later its pictures and its plain model."""
+    """The cover or a secret: the plain model or the photos that are given, and later both."""
 
-    given: Gaussians | None  # a plain 3DGS model on the CPU; None: one is fitted to the photos
-    photos: bool  # False: only the model is given, and renders of it take the place of photos
-    key: str = field(default="", repr=False)  # of a secret, where the method has keys
+    given: Gaussians | None  # plain 3DGS model on the CPU; None: one is fitted to the photos
+    photos: bool  # False: only the model is given, and renders of it replace photos
+    key: str = field(default="", repr=False)  # of a secret, if the method has keys
     loaded: Scene | None = None
     fitted: Gaussians | None = None
 
@@ -45,18 +44,18 @@ class Source:
     @property
     def model(self) -> Gaussians:
         """The plain model, in the scene's own frame, on the CPU."""
-        found = self.fitted if self.given is None else self.given
-        if found is None:
+        model = self.fitted if self.given is None else self.given
+        if model is None:
             raise ValueError("the plain model is not fitted yet")
-        return found
+        return model
 
 
 @dataclass(frozen=True)
 class Training:
-    """What a method's own training is for one scene: what makes a plain model of it comparable."""
+    """The method's own training of one scene, which a bound has to match."""
 
-    steps: int = 0  # in which it is drawn
-    continues: bool = True  # from its plain model, whose steps count too
+    steps: int = 0  # that render the scene
+    continues: bool = True  # starts from the plain model, whose steps count too
 
 
 @dataclass(frozen=True)
@@ -64,62 +63,62 @@ class Context:
     """Where and how to compute."""
 
     device: torch.device
-    checkpoints: Path | None = None  # folder for the state of what is interrupted
+    checkpoints: Path | None = None  # folder for the state of interrupted trainings
     resume: bool = False
     reporter: Reporter | None = None
-    # 32 bytes that nobody else can know, for a run that is to be repeated to the byte; None: the system's.
+    # 32 bytes that nobody else can know, which make a run repeatable to the byte; None: the system's.
     entropy: bytes | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
 class Stego:
-    """What hiding gives."""
+    """The result of hiding."""
 
-    gaussians: Gaussians  # to be published
-    opened: tuple[Opened, ...]  # the secrets as they come out again with their keys
+    gaussians: Gaussians  # the published model
+    opened: tuple[Opened, ...]  # the secrets as their keys open them
     iterations: int = 0  # of the method's own training
-    details: Mapping[str, Any] = field(default_factory=dict)  # numbers of its own, for metrics.json
-    verified: bool = False  # whether `opened` was read from `gaussians` with the keys
-    handed: tuple[Payload, ...] = ()  # for each secret what is handed over, where the method does that
+    details: Mapping[str, Any] = field(default_factory=dict)  # the method's own numbers, for metrics.json
+    verified: bool = False  # True if `opened` was read from `gaussians` with the keys
+    handed: tuple[Payload, ...] = ()  # the file that is handed over for each secret, if there are any
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capabilities:
-    """What a method can do; what it cannot is said where it is asked for, and in comparisons."""
+    """The capabilities of a method."""
 
-    keys: bool = True  # a key opens each secret; else whoever has what is handed over sees it
-    hands_over: bool = False  # there is a file for each secret beside the published model
-    standard: bool = True  # what is published is a 3DGS model, which every viewer draws
-    models: bool = True  # and so is what a secret is revealed as; else a network makes its pictures
+    keys: bool = True  # a key opens each secret; else whoever has the handed-over file sees it
+    hands_over: bool = False  # each secret has a file beside the published model
+    standard: bool = True  # the published model is a 3DGS model, which every viewer renders
+    models: bool = True  # revealed secrets are 3DGS models; else a network renders their images
 
 
 @dataclass(frozen=True)
 class CommandLineOption:
-    """Annotates a field of options that the command line has too, under the same name.
+    """Annotates a field of options that is a command-line option of the same name.
 
-    A truth value becomes a flag, everything else takes one value.
+    A bool becomes a flag, everything else takes one value.
     """
 
     help: str
     metavar: str | None = None  # stands for the value in the help
-    default: str | None = None  # what None stands for
-    parse: Callable[[str], Any] | None = None  # makes the value of text, where the type does not
+    default: str | None = None  # the meaning of None
+    parse: Callable[[str], Any] | None = None  # from text to the value, if the type does not
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions:
-    """What every method can be told; each has a class of its own that adds to it."""
+    """The options of every method; each method extends this class."""
 
-    method: ClassVar[str]  # its name in files and on the command line, 1 to 15 ASCII characters
+    method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
-    publish: Publish = "ply"  # format that the published model is passed on in; any: it may be converted
-    # Of models that may be converted: appended Gaussians hold everything, and everybody can see that they are
-    # there; colours hold little and show less.
+    publish: Publish = "ply"  # format of the published model; any: it may be converted
+    # For models that may be converted: appended Gaussians have room for everything, and everybody sees them;
+    # colours have little room and show less.
     channel: AnyChannel = "appended"
 
     def __post_init__(self) -> None:
-        """Raise UsageError for what does not go together."""
+        """Raise UsageError for options that contradict each other."""
         if self.channel != "appended" and self.publish != "any":
             raise UsageError(
                 f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
@@ -134,30 +133,30 @@ class MethodOptions:
 
     @property
     def place(self) -> Channel:
-        """The channel that secrets lie in."""
+        """The channel that carries the secrets."""
         return channel_for(self.publish, self.channel)
 
     @property
     def trains(self) -> bool:
-        """Whether hiding is a training of its own, after the plain models; prepared."""
-        return any(each.steps for each in self.training(2))
+        """True if hiding trains after the plain models are fitted; for prepared options."""
+        return any(training.steps for training in self.training(2))
 
     @property
     def may_train(self) -> bool:
-        """Whether steps may count when models of all scenes are given; known before scenes are."""
+        """True if hiding may train although models of all scenes are given; for options as given."""
         return self.trains
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """How plain models of the cover and of each secret are fitted; of `scenes` together, prepared."""
+        """The fits of the plain models of `scenes`, the cover first; for prepared options."""
         return [self.fit] * scenes
 
     def training(self, scenes: int) -> tuple[Training, ...]:
-        """The method's own training of the cover and of each secret; of `scenes` together, prepared."""
+        """The method's own training of each of `scenes`, the cover first; for prepared options."""
         return (Training(),) * scenes
 
     @classmethod
     def variants(cls) -> Mapping[str, Self]:
-        """Other kinds of the method, by name, that a comparison lists beside it."""
+        """Options of other variants that a comparison adds, by name."""
         return {}
 
     def with_fit(self, **changes: Any) -> Self:
@@ -168,34 +167,20 @@ class MethodOptions:
 class Method(Protocol):
     """One way to hide secrets."""
 
-    @property
-    def name(self) -> str:
-        """That of its options."""
-
-    @property
-    def summary(self) -> str:
-        """One line that goes on from the name."""
-
-    @property
-    def most_secrets(self) -> int:
-        """How many secrets one model can have."""
-
-    @property
-    def capabilities(self) -> Capabilities:
-        """What it can and cannot do."""
-
-    @property
-    def options(self) -> type[MethodOptions]:
-        """The class of its options."""
+    name: str  # that of its options
+    summary: str  # one line that continues the name
+    most_secrets: int  # in one model
+    capabilities: Capabilities
+    options: type[MethodOptions]
 
     def prepare(self, sources: Sequence[Source], options: Any) -> Any:
-        """The options with all that depends on the scenes: the cover, then the secrets.
+        """The options completed for these scenes, the cover first.
 
-        Refuses what cannot work, before anything is trained. Raises UsageError and InputError.
+        Raises UsageError and InputError for what cannot work, before anything is trained.
         """
 
     def plan(self, sources: Sequence[Source], options: Any) -> Plan:
-        """What will come of it, as far as a method knows; `options` are prepared."""
+        """The fields of the plan that a method knows; `options` are prepared."""
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: Any, context: Context) -> Stego:
         """Hide the secrets; `options` are prepared and have a seed.
@@ -205,22 +190,13 @@ class Method(Protocol):
 
 
 def role_of(index: int, scenes: int) -> str:
-    """What scene `index` of so many is called: the cover comes first, and a single secret has no number."""
+    """The name of scene `index` of so many: the cover comes first, and a single secret has no number."""
     return "cover" if index == 0 else "secret" if scenes == 2 else f"secret {index}"
 
 
 def check_above_zero(options: object, *names: str) -> None:
-    """Raise UsageError for an option that is not a number above 0: what is divided by it would be none."""
+    """Raise UsageError for an option that is not a finite number above 0."""
     for name in names:
         value = getattr(options, name)
         if not 0 < value < math.inf:
             raise UsageError(f"`{name}`: expected a number above 0, got {value}")
-
-
-@contextmanager
-def advising(kind: type[KeyssError], advice: str) -> Iterator[None]:
-    """Adds to the message of an error from below, such as a channel's, what a user of the method can do."""
-    try:
-        yield
-    except kind as error:
-        raise type(error)(f"{error}; {advice}") from error

@@ -1,10 +1,10 @@
 """New low bits for models that came through a coarser format.
 
-Where a property takes few different values, as after 8 or 16 bits, or has low bits that are not uniform, as
-after an added offset, each value is moved by a random amount below half of the distance to the next value
-that occurs: less than the format's own precision, so that it would be rounded back. The values then lie in
-steps rather than on them. That is not how trained values lie, and who looks for it can see it; what cannot be
-seen is whether anything is in the low bits.
+If a property has few different values, as after 8 or 16 bits, or low bits that are not uniform, as after an
+added offset, each value is moved by a random amount below half of the distance to the nearest other value:
+less than the format's own precision, which would round it back. The values are then spread around the steps
+of the format. Trained values are not: an expert sees the difference, but not whether the low bits
+carry anything.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from keyss.keys.derivation import stream
 
 _BITS, _CHANCE = 9, 1e-6  # low bits that depend on each other are not random
 _FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
-_SPARSE = 0.1  # share of different values above which a format is finer than the gaps between them
-_TYPICAL = 0.9  # quantile of the distances beyond which one is a gap in the data
+_SPARSE = 0.1  # share of different values above which the steps of a format are finer than gaps in the data
+_TYPICAL = 0.9  # quantile of the distances above which a distance is a gap in the data
 _SAMPLE = 20_000  # Gaussians
-_UNIT = 1e-5  # by which the length of a unit quaternion may differ from 1
-_FAINT = 1e-3  # standard deviation of harmonics that a model does not have
+_UNIT = 1e-5  # the largest difference between 1 and the length of a unit quaternion
+_FAINT = 1e-3  # standard deviation of new harmonics
 
 Floats = npt.NDArray[np.float32]
 
@@ -33,7 +33,7 @@ Floats = npt.NDArray[np.float32]
 def dither(model: Gaussians, entropy: bytes) -> Gaussians:
     """`model` with new low bits where they are not random; positions and constant colours stay.
 
-    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay as they are, and so do
+    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay unchanged, and so do
     quaternions of unit length, which is known exactly: see `keyss.channels.low_bits.bits`.
     """
     changed = {}
@@ -52,15 +52,10 @@ def dither(model: Gaussians, entropy: bytes) -> Gaussians:
     return Gaussians(means=model.means, **changed)
 
 
-def sampled(model: Gaussians) -> Gaussians:
-    """Every n-th Gaussian of a large model: what low bits are like is seen in these, too, and at once."""
-    return model[:: max(1, len(model) // _SAMPLE)]
-
-
 def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics up to `sh_degree`, those that it does not have too small to be seen.
+    """`model` with harmonics up to `sh_degree`, the new ones random and too small to be seen.
 
-    Zeros have no low bits that could be replaced. A model of this degree or more stays as it is.
+    Zeros have no low bits that could be replaced. A model of this degree or more stays unchanged.
     """
     count = 3 * ((sh_degree + 1) ** 2 - model.sh.shape[1])
     if count <= 0:
@@ -73,7 +68,7 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
 
 
 def _is_natural(values: Floats) -> bool:
-    """Whether values are random to the last bit, but for a few zeros, which training leaves, too."""
+    """True if the values are random to the last bit, except a few zeros, which training leaves too."""
     measured = values[values != 0]
     if len(measured) > _FEW * len(values):
         values = measured

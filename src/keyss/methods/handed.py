@@ -1,9 +1,9 @@
-"""Files that are handed over: what somebody needs beside the published model to see a secret.
+"""Files that are handed over: with one and the published model, a secret can be seen.
 
-Methods whose secrets do not lie in the published model alone have one for each. It is sealed with the
-secret's key where the method has keys; else whoever has the file sees the secret.
+Methods that do not store all of a secret in the published model have one for each secret. It is sealed with
+the secret's key if the method has keys; else whoever has the file sees the secret.
 
-    magic (16 bytes) | method (15) | 1 if sealed, else 0 | salt (16, zeros where not sealed) | content
+    magic (16 bytes) | method (15) | 1 if sealed, else 0 | salt (16, zeros if not sealed) | content
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ SUFFIX = ".keyss"
 MAX_BYTES = 1 << 30
 _MAGIC = b"keyss handed 1\0\0"
 _HEADER = len(_MAGIC) + METHOD_BYTES + 1 + SALT_BYTES
-_NOT_ONE = "expected a file that was handed over, as `keyss hide` writes them for some methods"
+_EXPECTED = "expected a file that was handed over, as `keyss hide` writes them for some methods"
 
 
 def pack(payload: Payload, key: str | None) -> bytes:
-    """The bytes of a file, sealed if there is a key."""
+    """The bytes of the file, sealed if there is a key."""
     start = _MAGIC + pack_method(payload.method)
     if key is None:
         return start + bytes(1 + SALT_BYTES) + payload.data
@@ -33,22 +33,22 @@ def pack(payload: Payload, key: str | None) -> bytes:
 
 
 def is_sealed(data: bytes) -> bool:
-    """Whether it takes a key. Raises InputError for anything but such a file."""
+    """True if the file takes a key. Raises InputError for other files."""
     if len(data) < _HEADER or not data.startswith(_MAGIC):
-        raise InputError(f"{_NOT_ONE}, got something else")
+        raise InputError(f"{_EXPECTED}, got something else")
     sealed = data[len(_MAGIC) + METHOD_BYTES]
     if sealed not in (0, 1):
-        raise InputError(f"{_NOT_ONE}, got a damaged one")
+        raise InputError(f"{_EXPECTED}, got a damaged one")
     return bool(sealed)
 
 
 def unpack(data: bytes, key: str | None) -> Payload:
-    """What `pack` got. Raises InputError, WrongKeyError, and UsageError for one key too few or too many."""
+    """The payload of `pack`. Raises InputError, WrongKeyError, UsageError for a missing or unneeded key."""
     sealed, header, content = is_sealed(data), data[:_HEADER], data[_HEADER:]
     try:
         method = unpack_method(header[len(_MAGIC) :])
     except UnicodeDecodeError as error:
-        raise InputError(f"{_NOT_ONE}, got a damaged one") from error
+        raise InputError(f"{_EXPECTED}, got a damaged one") from error
     if not sealed:
         if key is not None:
             raise UsageError(f"the method {method} has no keys: whoever has this file sees the secret")

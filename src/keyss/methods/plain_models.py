@@ -1,4 +1,4 @@
-"""Plain models beside a method: those before it, given or fitted here, and those it is compared with."""
+"""Plain models that a method starts from, and bounds that its results are compared with."""
 
 from __future__ import annotations
 
@@ -20,27 +20,21 @@ def with_plain_models(
 ) -> list[Source]:
     """The sources with plain models on the CPU, in their own frames; those that are not given are fitted.
 
-    Each has a seed of its own, which follows from that of its config: one model tells nothing of the seeds of
-    others. See `fit_scenes` for what it raises.
+    Each fit has its own seed, derived from that of its config, and tells nothing of the seeds of others.
+    Raises what `fit_scenes` raises.
     """
     missing = {
-        index: _fit(
-            source.scene,
-            replace(config, seed=config.seed_of(f"plain model {index}")),
-            f"{plain_stage(role_of(index, len(sources)))} ({source.scene.name})",
-            f"plain-{index}",
-            index,
-            context,
-        )
+        index: (source.scene, config)
         for index, (source, config) in enumerate(zip(sources, configs, strict=True))
         if source.given is None
     }
-    fitted = _fitted(missing, context)
+    titles = [plain_stage(role_of(index, len(sources))) for index in range(len(sources))]
+    fitted = _fit_all(missing, "plain model", titles, context)
     return [replace(source, fitted=fitted.get(index)) for index, source in enumerate(sources)]
 
 
 def plain_stage(role: str) -> str:
-    """What the fitting of the plain model of `role_of` is called."""
+    """The title of the fit of a plain model; `role`: see `role_of`."""
     return f"plain model of the {role}"
 
 
@@ -48,12 +42,12 @@ def plain_stage(role: str) -> str:
 class Bound:
     """Plain 3DGS of as many Gaussians and as many training steps as a scene had, for comparison."""
 
-    steps: int | None  # of the scene, in all; None: its plain model was given, and nothing is known of it
-    equal: bool  # whether its plain model has as many, so that it is the bound itself
+    steps: int | None  # of the scene in total; None: unknown, because its plain model was given
+    equal: bool  # True if the plain model has as many steps and is the bound itself
 
     @staticmethod
     def of(training: Training, plain_steps: int | None) -> Bound:
-        """Of a scene whose plain model had `plain_steps`, where they are known."""
+        """The bound of a scene; `plain_steps`: steps of its plain model, if they are known."""
         if not training.continues:
             return Bound(training.steps, training.steps == plain_steps)
         if not training.steps:
@@ -61,41 +55,39 @@ class Bound:
         return Bound(None if plain_steps is None else plain_steps + training.steps, False)
 
     def config(self, fit: FitConfig, gaussians: int | None = None) -> FitConfig:
-        """How it is fitted, with `gaussians` at most. Raises ValueError where `steps` are not known."""
+        """The fit, with at most so many `gaussians`. Raises ValueError if `steps` are not known."""
         if self.steps is None:
             raise ValueError("the number of steps is not known")
-        most = fit.max_gaussians if gaussians is None else max(16, gaussians)
-        return replace(fit, iterations=self.steps, max_gaussians=most)
+        limit = fit.max_gaussians if gaussians is None else max(16, gaussians)
+        return replace(fit, iterations=self.steps, max_gaussians=limit)
 
 
 def fit_bounds(
     scenes: Sequence[Scene], configs: Mapping[int, FitConfig], context: Context
 ) -> dict[int, Gaussians]:
-    """The bounds of some scenes of a hiding, by their index, from seeds of their own; see `plain_models`."""
-    fits = {
-        index: _fit(
-            scenes[index],
-            replace(config, seed=config.seed_of(f"bound {index}")),
-            f"plain 3DGS of as many steps ({scenes[index].name})",
-            f"bound-{index}",
-            index,
-            context,
-        )
-        for index, config in configs.items()
-    }
-    return _fitted(fits, context)
+    """The bounds of some scenes, by index; see `with_plain_models`."""
+    fits = {index: (scenes[index], config) for index, config in configs.items()}
+    return _fit_all(fits, "bound", ["plain 3DGS of as many steps"] * len(scenes), context)
 
 
-def _fit(scene: Scene, config: FitConfig, title: str, name: str, index: int, context: Context) -> Fit:
-    return Fit(
-        scene,
-        config,
-        title,
-        context.checkpoints / f"{name}.safetensors" if context.checkpoints else None,
-        context.reporter if index == 0 else of_secret(context.reporter),
+def _fit_all(
+    fits: Mapping[int, tuple[Scene, FitConfig]], kind: str, titles: Sequence[str], context: Context
+) -> dict[int, Gaussians]:
+    """Fit scenes by index, the cover first; `kind` names the seeds and the checkpoints."""
+    models = fit_scenes(
+        [
+            Fit(
+                scene,
+                replace(config, seed=config.seed_of(f"{kind} {index}")),
+                f"{titles[index]} ({scene.name})",
+                context.checkpoints / f"{kind.split()[0]}-{index}.safetensors"
+                if context.checkpoints
+                else None,
+                context.reporter if index == 0 else of_secret(context.reporter),
+            )
+            for index, (scene, config) in fits.items()
+        ],
+        device=context.device,
+        resume=context.resume,
     )
-
-
-def _fitted(fits: Mapping[int, Fit], context: Context) -> dict[int, Gaussians]:
-    models = fit_scenes(list(fits.values()), device=context.device, resume=context.resume)
     return dict(zip(fits, models, strict=True))

@@ -13,7 +13,7 @@ from keyss.fitting.parameters import initial_gaussians, initial_points
 
 
 def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
-    """An equal share of the cap for every scene, all in one frame; the others get what one leaves over."""
+    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points."""
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
     counts = divided([len(points) for points, _ in clouds], fit.max_gaussians)
     parts = [
@@ -24,7 +24,7 @@ def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Ge
 
 
 def divided(available: Sequence[int], total: int) -> list[int]:
-    """`total` items in equal shares, nowhere more than `available`; what one leaves goes to the others."""
+    """`total` items in equal shares, each at most what is `available`; the others share the rest."""
     shares = [0] * len(available)
     left = total
     for done, index in enumerate(sorted(range(len(available)), key=lambda i: available[i])):

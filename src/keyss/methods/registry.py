@@ -1,4 +1,4 @@
-"""The methods there are, each entered with one line and loaded when it is needed."""
+"""All methods, each entered with one line and loaded when it is needed."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, NamedTuple
 from keyss.channels import Content, open_content, quick_attempt
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.methods import handed, hidden_file
+from keyss.methods import handed
 from keyss.methods.decoy import Decoy
-from keyss.methods.hidden_file import HiddenFile, OpensAFileError
-from keyss.methods.opened import Opened
+from keyss.methods.opened import FILE, HiddenFile, Opened, OpensAFileError
 
 if TYPE_CHECKING:
     from keyss.methods.base import Method, MethodOptions
 
 
 class Modules(NamedTuple):
-    """Where a method is."""
+    """The modules of a method."""
 
     hiding: str  # has METHOD, a `keyss.methods.base.Method`
-    opening: str  # has `unpack`: from what a channel gave, or what was handed over, to an `Opened`
+    opening: str  # has `unpack`, from the content of a channel or a handed-over file to an `Opened`
 
 
 _ROOM = "keyss.methods"
@@ -52,7 +51,7 @@ def get(name: str) -> Method:
 
 
 def of_options(options: MethodOptions) -> Method:
-    """The method whose options these are. Raises UsageError."""
+    """The method with options of this class. Raises UsageError."""
     name = getattr(options, "method", None)
     if name not in METHODS or type(options) is not get(name).options:
         raise UsageError(f"expected options of a method ({', '.join(METHODS)}), got {type(options).__name__}")
@@ -60,32 +59,32 @@ def of_options(options: MethodOptions) -> Method:
 
 
 def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
-    """What `key` opens in a model (see `keyss.channels.opening`).
+    """The secret that `key` opens in a model (see `keyss.channels.opening`).
 
-    With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: others would take a
-    wrong key longer than a right one. Otherwise raises WrongKeyError. Raises InputError for what is damaged.
+    With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: with more, a wrong key
+    would take longer than a right one. Otherwise raises WrongKeyError. Raises InputError for damage.
     """
     if not decoy:
         return _unpacked(open_content(stego, key))
-    found = quick_attempt(stego, key)
-    if found is None:
+    attempt = quick_attempt(stego, key)
+    if attempt is None:
         raise WrongKeyError()
-    if found.content is None:
-        return Decoy.of(stego, found.key, appended=found.appended)
-    return _unpacked(found.content)
+    if attempt.content is None:
+        return Decoy.of(stego, attempt.key, appended=attempt.appended)
+    return _unpacked(attempt.content)
 
 
 def open_handed(data: bytes, key: str | None) -> Opened:
     """The secret in a file that was handed over (see `keyss.methods.handed`).
 
-    Raises UsageError for a key where none is needed or the other way round, WrongKeyError, InputError.
+    Raises WrongKeyError, InputError, and UsageError for a key missing or unneeded.
     """
     return _unpacked(handed.unpack(data, key))
 
 
 def _unpacked(content: Content) -> Opened:
     name = content.method
-    if name == hidden_file.NAME:
+    if name == FILE:
         raise OpensAFileError(HiddenFile.of(content))
     if name not in METHODS:
         raise InputError(

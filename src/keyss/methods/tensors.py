@@ -1,4 +1,4 @@
-"""Tensors with a JSON header as bytes: a safetensors file whose metadata has the header as its one entry."""
+"""Tensors with a JSON header as bytes: a safetensors file with the header as its only metadata entry."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FrameRecord:
 
     @property
     def similarity(self) -> Similarity:
-        """Raises ValueError for what is none."""
+        """The similarity. Raises ValueError if these numbers are none."""
         rotation, translation = (
             torch.tensor(values, dtype=torch.float64) for values in (self.rotation, self.translation)
         )
@@ -48,7 +48,7 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class Header:
-    """What every header has."""
+    """The common part of all headers."""
 
     format: str
     version: int
@@ -66,9 +66,9 @@ def pack_tensors(tensors: Mapping[str, Tensor], header: Header) -> bytes:
 def unpack_tensors(
     data: bytes, kind: type[HeaderT], format: str, version: int
 ) -> tuple[HeaderT, dict[str, Tensor]]:
-    """What `pack_tensors` got; the tensors are finite. Call it within `damage_refused`.
+    """The header and the tensors of `pack_tensors`, all finite. Call it within `damage_refused`.
 
-    Raises InputError for another format or version. The header has the types and bounds of `kind`.
+    `kind`: the class of the header, which has its types and bounds. Raises InputError for another version.
     """
     tensors = safetensors.torch.load(data)  # checks the sizes
     size = int.from_bytes(data[:8], "little")
@@ -89,7 +89,7 @@ def unpack_tensors(
 
 @contextmanager
 def damage_refused(what: str) -> Iterator[None]:
-    """Whatever reading damaged bytes raises becomes an InputError that begins with `what`."""
+    """Turn the errors that reading damaged bytes raises into an InputError that begins with `what`."""
     try:
         yield
     except _DAMAGE as error:

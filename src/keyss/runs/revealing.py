@@ -11,8 +11,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.reading import read_file
 from keyss.methods import handed as handing, registry
-from keyss.methods.hidden_file import HiddenFile, OpensAFileError
-from keyss.methods.opened import Frame, Opened, Remains
+from keyss.methods.opened import Frame, HiddenFile, Opened, OpensAFileError, Remains
 from keyss.runs.sources import PathLike
 
 # Pruning compensation makes up for the loss of nine tenths at most (`keyss.core.pruning_compensation`): with

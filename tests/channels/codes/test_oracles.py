@@ -15,8 +15,7 @@ from files.formats.conftest import splat_transform  # noqa: F401
 from keyss.channels import SUFFIXES, Payload, channel_for
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model, write_model
-from keyss.methods import embed_whole, registry
-from keyss.rendering import Viewpoints
+from keyss.methods import embed_models, registry
 
 EVERY = pytest.mark.parametrize("name", SUFFIXES)
 # How far two files may be apart: positions in sizes of the Gaussian (the middle one of its scales), half of
@@ -83,15 +82,15 @@ def test_splat_transform_reads_it(
 def test_it_opens_from_the_very_file_and_from_no_other(name: str, tmp_path: Path) -> None:
     room, secret = channel_for(name).prepare(model_of()), model_of(200, seed=3)  # type: ignore[arg-type]
     _, stego = files(name, tmp_path)
-    made = embed_whole(room, ["key"], [secret], [Viewpoints.around(secret)], prune=False)
-    write_model(stego, made.stego)
+    made = embed_models(room, ["key"], [secret])
+    write_model(stego, made.gaussians)
     again = read_model(stego)
     found = registry.open_model(again, "key").reveal(again)
     assert len(found) == 200
-    assert torch.equal(found.means, made.opened[0].gaussians.means)
+    assert torch.equal(found.means, made.opened[0].reveal(again).means)
     # A file that is written of the model as it is keeps what it carries; a changed model carries nothing.
     write_model(tmp_path / f"copy{SUFFIXES[name]}", again)
     assert (tmp_path / f"copy{SUFFIXES[name]}").read_bytes() == stego.read_bytes()
     with pytest.raises(WrongKeyError):
         registry.open_model(again[:-1], "key")
-    assert FORMATS[SUFFIXES[name]].parse(stego.read_bytes()) == made.stego.codes  # type: ignore[attr-defined]
+    assert FORMATS[SUFFIXES[name]].parse(stego.read_bytes()) == made.gaussians.codes  # type: ignore[attr-defined]

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from keyss.channels import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
-from keyss.methods import CarriedSecret, encode_all
-from keyss.methods.records.opening import unpack
+from keyss.methods import CarriedSecret, encode_all, unpack
 
 
 def embed(

@@ -10,21 +10,18 @@ from typing import Any
 import pytest
 import torch
 
-from fitting.test_plain import InterruptAt
 from keyss import FitConfig, Gaussians, KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
 from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.core.similarity import Similarity
 from keyss.fitting.density import combine_densification
-from keyss.fitting.loop import Interrupted
-from keyss.fitting.reporting import SilentReporter
 from keyss.keys import random_embeddings
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
 from keyss.methods.keyss import method
 from keyss.methods.keyss.training import possibly_seen
 from keyss.rendering import render, render_with_meta
 from keyss.rendering.orbit import orbit
-from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
+from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, same, three_scenes
 from methods.keyss.hiding import KEYS, OPTIONS, PUBLISHED, SMALL
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -157,22 +154,8 @@ def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -
 
 @pytest.mark.parametrize("options", [OPTIONS, replace(PUBLISHED, residuals="one-sided")])
 def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path, options: KeyssOptions) -> None:
-    scenes = three_scenes()[0][:2]
     options = replace(options, fit=replace(OPTIONS.fit, iterations=40, grow_every=5))
-
-    def run(resume: bool, reporter: SilentReporter | None = None) -> Hidden:
-        return hide_scenes(scenes, KEYS[:1], options, checkpoints=tmp_path, resume=resume, reporter=reporter)
-
-    whole = hide_scenes(scenes, KEYS[:1], options)
-    with pytest.raises(Interrupted):
-        run(False, InterruptAt(17, "plain model of the secret"))
-    with pytest.raises(Interrupted):
-        run(True, InterruptAt(23, "hide"))
-    resumed = run(True)
-    assert same(resumed.stego, whole.stego)
-    changed = replace(options, fit=replace(options.fit, sh0_rate=1e-3))
-    with pytest.raises(InputError, match="other settings"):
-        hide_scenes(scenes, KEYS[:1], changed, checkpoints=tmp_path, resume=True)
+    check_resumes(options, tmp_path, "hide")
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:

@@ -14,12 +14,11 @@ import keyss
 from keyss import FitConfig, Secret
 from keyss.audits import audit
 from keyss.cli import main
-from keyss.core import InputError, UsageError, WrongKeyError
-from keyss.core.decoded import DecodedGaussians
-from keyss.core.similarity import Similarity
-from keyss.fitting.checkpoint import State
+from keyss.core import DecodedGaussians, InputError, Similarity, UsageError, WrongKeyError
+from keyss.fitting import State
 from keyss.methods import JointTraining, PeerOptions, PlacedScene, registry
-from keyss.runs.files import handed_names, stego_in
+from keyss.runs import stego_in
+from keyss.runs.files import handed_names
 from test_api import write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, Secret
-from keyss.core.gaussians import DRAWN_OPACITY
+from keyss.core import DRAWN_OPACITY
 from keyss.files import write_model
 from keyss.methods import Codec, Table, outliers
 from keyss.rendering import render

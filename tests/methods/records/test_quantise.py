@@ -22,7 +22,7 @@ VALUES = arrays.arrays(np.float64, st.integers(1, 30), elements=FINITE)
 def test_a_line_is_off_by_half_a_step_at_most_and_clips_beyond_its_ends(
     values: np.ndarray, spread: float, reach: float, bits: int
 ) -> None:
-    line = Line(1.5, spread if spread > 1e-3 else 0.0, reach)
+    line = Line(1.5, spread if spread > 1e-3 else 0.0, reach, far_reach=1.0)
 
     def position(x: np.ndarray) -> np.ndarray:
         return np.arcsinh((x - 1.5) / line.spread) if line.spread else x - 1.5
@@ -51,19 +51,20 @@ def test_every_attribute_comes_back_within_the_error_of_its_bits(
     assert Codec.unpack(codec.pack()) == codec
     scales = model.log_scales.double()
     off = outliers(model)
-    for part, line in ((~off, codec.lines[3]), (off, codec.far[3])):
-        step = 2 * line.reach / ((1 << table.bits[1]) - 1)
+    line = codec.lines[3]
+    for part, reach in ((~off, line.reach), (off, line.far_reach)):
+        step = 2 * reach / ((1 << table.bits[1]) - 1)
         error = (back.log_scales - scales).abs().amax(1).numpy()[part]
         assert error.max(initial=0) <= 0.51 * step + 1e-6 * float(scales.abs().max()) + 1e-6
-    for axis in range(3):
-        for part, line in ((~off, codec.lines[axis]), (off, codec.far[axis])):
+    for axis, line in enumerate(codec.lines[:3]):
+        for part, reach in ((~off, line.reach), (off, line.far_reach)):
             was, now = (m.means[:, axis].double().numpy()[part] for m in (model, back))
             error = np.arcsinh((was - line.centre) / line.spread) - np.arcsinh(
                 (now - line.centre) / line.spread
             )
             # What comes back is rounded to single precision, half a unit in the last place.
             rounded = np.spacing(np.abs(now).astype(np.float32)).astype(np.float64) / 2 / line.spread
-            assert (np.abs(error) <= 1.1 * line.reach / ((1 << table.bits[0]) - 1) + rounded + 1e-5).all()
+            assert (np.abs(error) <= 1.1 * reach / ((1 << table.bits[0]) - 1) + rounded + 1e-5).all()
     assert torch.isfinite(back.sh).all()
     length = model.quats.double().norm(dim=1)
     unit = model.quats.double() / length[:, None].clamp_min(1e-60)
@@ -130,5 +131,6 @@ def test_damaged_parameters_are_an_input_error_or_bounded_numbers(data: bytes) -
 def test_lines_that_could_give_numbers_out_of_bounds_are_refused(
     centre: float, spread: float, reach: float
 ) -> None:
-    with pytest.raises(ValueError, match="no such line"):
-        Line(centre, spread, reach)
+    for reaches in ((reach, 1), (1, reach)):
+        with pytest.raises(ValueError, match="no such line"):
+            Line(centre, spread, *reaches)

@@ -9,12 +9,10 @@ import pytest
 import torch
 
 from channels.codes.published import model_of
-from keyss.core import InputError
+from keyss.core import InputError, Scene, UsageError, View
 from keyss.core.colour import OPPONENT
-from keyss.core.scene import Scene, View
-from keyss.methods import Table
+from keyss.methods import Table, fitted, good_enough, pruned
 from keyss.methods.records import whole
-from keyss.methods.records.precision import fitted, good_enough, pruned
 from keyss.rendering import Viewpoints, psnr_between
 from keyss.rendering.orbit import orbit
 
@@ -91,9 +89,7 @@ def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     found = good_enough(model, viewpoints)
     opened = whole.decode(whole.encode(model, found))
     assert 44 <= psnr_between(model, opened, viewpoints) < 48
-    kept, data = fitted(model, 1 << 20, prune=False, short=True, viewpoints=viewpoints)
-    assert kept is model
-    assert data == whole.encode(model, found)
+    assert fitted(model, 1 << 20, short=True, viewpoints=viewpoints) == whole.encode(model, found)
 
 
 def test_large_pictures_are_compared_at_a_smaller_size() -> None:
@@ -114,8 +110,9 @@ def test_large_pictures_are_compared_at_a_smaller_size() -> None:
 
 def test_what_is_seen_least_is_left_out_until_it_fits() -> None:
     model = model_of(800, sh_degree=1)
-    kept, data = fitted(model, 4000, prune=True)
-    assert len(data) <= 4000
+    kept = pruned(model, 4000)
     assert 200 < len(kept) < 800
-    assert len(pruned(model, 4000)) == len(kept)
+    assert len(fitted(kept, 4000)) <= 4000
     assert pruned(model, 1 << 20) is model
+    with pytest.raises(UsageError, match=r"800 Gaussians takes .* room for 4,000"):
+        fitted(model, 4000)

@@ -7,18 +7,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from keyss.core.errors import KeyssWarning
-from keyss.core.gaussians import Gaussians
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.methods.base import Capabilities, Context, Source, Stego, role_of
 from keyss.methods.carry.options import CarryOptions
 from keyss.methods.carry.refit import MODEL_ITERATIONS, refitted
-from keyss.methods.carry.room import RecordRoom, SecretRoom, Wanted, room_for
+from keyss.methods.carry.room import PayloadRoom, SecretSize, room_for
 from keyss.methods.plan import Plan
-from keyss.methods.records.embedding import Embedded
+from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
 from keyss.rendering.difference import Viewpoints, psnr_between
 
-_SMALLER = (
+_FEWER = (
     "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
     "keys can notice that there are other secrets"
 )
@@ -46,49 +45,59 @@ class CarryMethod:
         options = options.with_fit(sh_degree=degree)
         if cover.given is None and options.place.records:  # whose low bits may not be random
             options = replace(options, dither=True)
-        room, wanted = room_for(cover.given, options), _wanted(secrets, options)
-        sizes = room.sizes(wanted)
-        fits = [size == each.size for size, each in zip(sizes, wanted, strict=True)]
-        if options.refit == "never" and not options.prune_to_fit:
-            room.check(wanted)
+        room = room_for(cover.given, options)
+        options = replace(options, max_secret_degree=room.max_secret_degree)
+        secret_sizes = _secret_sizes(secrets, options)
+        sizes = room.sizes(secret_sizes)
+        cut = [size != secret.size for size, secret in zip(sizes, secret_sizes, strict=True)]
         if options.refit == "always":
-            fits = [False] * len(fits)
-        elif options.refit == "never" or options.prune_to_fit:
-            fits = [True] * len(fits)
-        elif not all(fits) and sizes != [room.sizes([each])[0] for each in wanted]:
-            warnings.warn(_SMALLER, KeyssWarning, stacklevel=2)
+            cut = [True] * len(cut)
+        elif options.prune_to_fit or options.refit == "never":
+            if not options.prune_to_fit:
+                _check_fit(secret_sizes, sizes, room.more_room)
+            cut = [False] * len(cut)
+        elif any(cut) and sizes != [room.sizes([secret])[0] for secret in secret_sizes]:
+            warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
         steps = [
             options.iterations
-            or (options.fit.iterations if each.photos else min(options.fit.iterations, MODEL_ITERATIONS))
-            for each in secrets
+            or (options.fit.iterations if secret.photos else min(options.fit.iterations, MODEL_ITERATIONS))
+            for secret in secrets
         ]
-        return replace(
-            options, refits=tuple(0 if fit else each for fit, each in zip(fits, steps, strict=True))
-        )
+        return replace(options, refits=tuple(n if c else 0 for n, c in zip(steps, cut, strict=True)))
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
-        """The room in the cover; notes tell what is lost of the cover and of harmonics."""
+        """The room in the cover before refits; notes tell what the cover and the secrets lose."""
         cover, *secrets = sources
-        room, wanted = room_for(cover.given, options), _wanted(secrets, options)
-        sizes = room.sizes(wanted)
-        found, notes = room.plan(wanted), []
-        for index, (each, degree) in enumerate(
-            zip(sources, [room.sh_degree, *(degree for _, degree in sizes)], strict=True)
-        ):
-            if each.given is not None and each.given.sh_degree > degree:
-                psnr = psnr_between(each.given, each.given.with_sh_degree(degree))
+        room, secret_sizes = room_for(cover.given, options), _secret_sizes(secrets, options)
+        sizes = room.sizes(secret_sizes)
+        appended, notes = room.appended(secret_sizes), []
+        if cover.given is not None and room.prepared is not None and room.prepared.cover is not cover.given:
+            psnr = psnr_between(cover.given, room.prepared.cover)
+            notes.append(f"new harmonics or low bits leave the cover at {psnr:.1f} dB PSNR against itself")
+        for index, (secret, (_, degree)) in enumerate(zip(secrets, sizes, strict=True)):
+            if secret.given is not None and secret.given.sh_degree > degree:
+                psnr = psnr_between(secret.given, secret.given.with_sh_degree(degree))
                 notes.append(
-                    f"the {role_of(index, len(sources))} of SH degree {each.given.sh_degree} gets degree "
-                    f"{degree}: {psnr:.1f} dB PSNR against itself"
+                    f"the {role_of(index + 1, len(sources))} of SH degree {secret.given.sh_degree} gets "
+                    f"degree {degree}: {psnr:.1f} dB PSNR against itself"
                 )
-        if (changed := _dithered(room, cover.given)) is not None:
-            notes.append(f"dithering leaves the cover at {changed:.1f} dB PSNR against itself")
-        drawn = [count if steps else 0 for steps, (count, _) in zip(options.refits, sizes, strict=True)]
-        return replace(
-            found,
+        if appended:
+            notes.append(
+                f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}"
+            )
+        elif isinstance(room, PayloadRoom):
+            how = "about" if room.prepared is None else "exactly"
+            notes.append(f"the {room.channel.place} have room for {how} {room.room.capacity:,} bytes")
+        counts = [count for count, _ in sizes]
+        drawn = (count if steps else 0 for steps, count in zip(options.refits, counts, strict=True))
+        return Plan(
+            gaussians=room.gaussians + appended,
+            sh_degree=room.sh_degree,
+            asked=sum(secret.count for secret in secret_sizes),
+            capacity=sum(counts),
             steps=max(options.refits),
             drawn=(0, *drawn),
-            notes=(*notes, *found.notes),
+            notes=tuple(notes),
         )
 
     def hide(
@@ -100,82 +109,58 @@ class CarryMethod:
         checkpoint of another run.
         """
         room = room_for(cover.model, options, context.entropy)
-        plain = [each.model for each in secrets]
-        viewpoints = [Viewpoints.of(each.scene) for each in secrets]
+        assert room.prepared is not None  # the cover is fitted
+        plain = [secret.model for secret in secrets]
+        viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
         models = list(plain)
         if any(options.refits):
-            sizes = room.refit_sizes(plain, viewpoints)
-            for index, (secret, steps, (count, degree)) in enumerate(
-                zip(secrets, options.refits, sizes, strict=True)
-            ):
+            fitting = room.prune(plain, viewpoints)
+            for index, (secret, steps, fits) in enumerate(zip(secrets, options.refits, fitting, strict=True)):
                 if steps:
+                    cut = len(fits) < len(secret.model)
                     models[index] = refitted(
-                        secret.model.with_sh_degree(degree),
+                        secret.model.with_sh_degree(fits.sh_degree),
                         secret.scene,
-                        count,
+                        max(1, int(room.refit_share * len(fits))) if cut else len(fits),
                         replace(options.fit, iterations=steps),
                         context,
                         photos=secret.photos,
                         name=role_of(index + 1, len(secrets) + 1),
                     )
-        embedded = room.embed([each.key for each in secrets], models, viewpoints, context.entropy)
-        details = embedded.details | _losses(room, cover.model, plain, models, embedded)
-        return Stego(
-            embedded.stego,
-            embedded.opened,
-            max(options.refits),
-            details,
-            verified=True,
+        details: dict[str, Any] = {"gaussians_before_pruning": [len(model) for model in plain]}
+        if any(clamped := [out_of_range(model) for model in models]):
+            details["gaussians_with_clamped_numbers"] = clamped
+        stego = embed_models(
+            room.prepared,
+            [secret.key for secret in secrets],
+            room.prune(models, viewpoints),
+            viewpoints=viewpoints,
+            entropy=context.entropy,
+        )
+        return replace(
+            stego,
+            iterations=max(options.refits),
+            details={**details, **stego.details},
         )
 
 
-def _wanted(secrets: Sequence[Source], options: CarryOptions) -> list[Wanted]:
+def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[SecretSize]:
     fits = options.fits(1 + len(secrets))[1:]
     return [
-        Wanted(fit.max_gaussians, fit.sh_degree) if each.given is None else Wanted.of(each.given)
-        for each, fit in zip(secrets, fits, strict=True)
+        SecretSize(fit.max_gaussians, fit.sh_degree) if secret.given is None else SecretSize.of(secret.given)
+        for secret, fit in zip(secrets, fits, strict=True)
     ]
 
 
-def _dithered(room: SecretRoom, cover: Gaussians | None) -> float | None:
-    """PSNR in dB of a cover that was changed before anything lies in it against the one that was given."""
-    prepared = room.prepared if isinstance(room, RecordRoom) else None
-    return (
-        None
-        if cover is None or prepared is None or prepared.cover is cover
-        else psnr_between(cover, prepared.cover)
-    )
-
-
-def _losses(
-    room: SecretRoom,
-    cover: Gaussians,
-    plain: Sequence[Gaussians],
-    models: Sequence[Gaussians],
-    found: Embedded,
-) -> dict[str, Any]:
-    """Numbers for metrics.json of what cover and secrets lost; `models`: after refits."""
-    kept = [each.gaussians for each in found.opened]
-    details: dict[str, Any] = {"gaussians_before_pruning": list(map(len, plain))}
-    pairs = list(zip(models, kept, strict=True))
-    if any(len(after) < len(before) for before, after in pairs):
-        details["share_kept_by_pruning"] = [round(len(after) / len(before), 4) for before, after in pairs]
-        details["pruned_secret_psnr_against_the_whole"] = [
-            round(psnr_between(before, after), 1) if len(after) < len(before) else None
-            for before, after in pairs
-        ]
-    fewer = [
-        round(psnr_between(before, before.with_sh_degree(after.sh_degree)), 1)
-        for before, after in zip((cover, *plain), (found.stego, *kept), strict=True)
-        if before.sh_degree > after.sh_degree
-    ]
-    if fewer:
-        details["psnr_of_fewer_harmonics"] = fewer
-    if any(clamped := list(map(out_of_range, models))):
-        details["gaussians_with_clamped_numbers"] = clamped
-    if (changed := _dithered(room, cover)) is not None:
-        details["dithered_cover_psnr_against_the_one_before"] = round(changed, 1)
-    return details
+def _check_fit(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]], more_room: str) -> None:
+    """Raise UsageError for given secrets that do not fit as they are."""
+    for secret, (count, degree) in zip(secrets, sizes, strict=True):
+        if secret.model is not None and secret.size != (count, degree):
+            raise UsageError(
+                f"a secret of {secret.count:,} Gaussians of SH degree {secret.sh_degree} does not fit as it "
+                f"is: there is room for {count:,} of degree {degree}; `prune_to_fit=True` leaves out the "
+                f'least visible, `refit="auto"` refits it, {more_room}'
+            )
 
 
 METHOD = CarryMethod()

@@ -8,12 +8,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from keyss.core.errors import UsageError
 from keyss.fitting.config import FitConfig
 from keyss.methods.base import CommandLineOption, MethodOptions, Training
-from keyss.methods.records.encoding import record_degree
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarryOptions(MethodOptions):
-    """Plain models are fitted by `fit`, those of secrets for twice as many steps, refits included."""
+    """Options of carrying; `fit` is that of plain models, and those of secrets get twice the steps."""
 
     method: ClassVar[str] = "carry"
 
@@ -34,9 +33,11 @@ class CarryOptions(MethodOptions):
             "Degree of the published model's spherical harmonics, 0 to 3.", metavar="N", default="the cover's"
         ),
     ] = None
-    iterations: int | None = None  # of a refit; None: those of `fit`, and fewer where there are no photos
+    iterations: int | None = None  # of a refit; None: those of `fit`, and fewer without photos
 
-    # Set by `prepare`: steps of the refit of each secret, 0 for those that are carried as they are.
+    # Set by `prepare`: the highest SH degree of secrets, and steps of the refit of each secret, 0 for those
+    # that are carried as they are.
+    max_secret_degree: int = 3
     refits: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -46,14 +47,12 @@ class CarryOptions(MethodOptions):
 
     @property
     def may_train(self) -> bool:
-        """Unless refits are ruled out."""
+        """True unless refits are ruled out."""
         return self.refit != "never" and not self.prune_to_fit
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """Of a secret twice the steps where no refit follows, and no more harmonics than can be carried."""
-        degree = self.fit.sh_degree
-        if self.place.records:
-            degree = record_degree(degree) or 0
+        """Secrets get twice the steps if no refit follows, and no more harmonics than can be carried."""
+        degree = min(self.fit.sh_degree, self.max_secret_degree)
         of_secrets = [
             replace(self.fit, sh_degree=degree, iterations=self.fit.iterations * (1 if steps else 2))
             for steps in self.refits or (0,) * (scenes - 1)
@@ -65,6 +64,6 @@ class CarryOptions(MethodOptions):
         return (Training(), *map(Training, self.refits or (0,) * (scenes - 1)))
 
     def with_fit(self, **changes: Any) -> Self:
-        """The same with changed fields of `fit`; `iterations` are those of refits too."""
+        """The same with changed fields of `fit`; `iterations` also changes those of refits."""
         found = super().with_fit(**changes)
         return replace(found, iterations=changes["iterations"]) if "iterations" in changes else found

@@ -1,4 +1,4 @@
-"""Refits: secrets trained on, with as many Gaussians as the cover has room for."""
+"""Refits: further training of secrets with as many Gaussians as the cover has room for."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from keyss.fitting.reporting import of_secret
 from keyss.methods.base import Context
 from keyss.rendering import contributions
 
-# Where there are no photos, the start is nearly right: steps at most, and a factor on the rates.
+# Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
 MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
 
@@ -28,14 +28,14 @@ def refitted(
     photos: bool,
     name: str,
 ) -> Gaussians:
-    """`secret` trained on with the `count` Gaussians that contribute most.
+    """Train the `count` Gaussians of `secret` that contribute most.
 
     Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
     """
     return refit_model(
         scene,
         most_contributing(secret, scene, count),
-        # Each is a run of its own: it must not depend on the other secrets.
+        # A refit must not depend on the other secrets.
         replace(fit, seed=fit.seed_of(name)),
         rate=1.0 if photos else _MODEL_RATE,
         device=context.device,
@@ -49,7 +49,7 @@ def refitted(
 
 
 def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
-    """The `count` Gaussians that add most to what the training views show, in their order."""
+    """The `count` Gaussians with the largest blending weights in the training views, in their order."""
     if count >= len(plain):
         return plain
     cameras = [view.camera for view in subsample_views(scene.train, _SELECTION_VIEWS)]

@@ -8,8 +8,7 @@ from typing import ClassVar
 
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Capabilities, Context, Source, Stego, Training
-from keyss.methods.peers.method import Peer
-from keyss.methods.peers.options import PeerOptions
+from keyss.methods.peers.method import Peer, PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 from keyss.methods.plan import Plan
 
@@ -18,12 +17,12 @@ _NAMES = tuple(each.name for each in fields(Gaussians))
 
 @dataclass(frozen=True, kw_only=True)
 class BoundOptions(PeerOptions):
-    """Of plain models; there is no other training."""
+    """Options of the plain models."""
 
     method: ClassVar[str] = "3dgs"
 
     def training(self, scenes: int) -> tuple[Training, ...]:
-        """None."""
+        """No training beside that of plain models."""
         return (Training(),) * scenes
 
 
@@ -36,7 +35,7 @@ class BoundMethod(Peer):
     options = BoundOptions
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
-        """Both as they are."""
+        """Both models as they are."""
         fit = options.fit
         cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
         degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree

@@ -17,22 +17,21 @@ from keyss.fitting.parameters import to_gaussians
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
 from keyss.methods.joint_options import Scenes
-from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
+from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
-from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 from keyss.rendering import decode_picture
 
 
 class DecoderTraining(PeerTraining):
-    """Plain Gaussians, and a network."""
+    """The training of plain Gaussians and a network."""
 
     def prepare(self, start: Gaussians) -> None:
         self.decoder = Convolutions(3)
         self.networks.append(self.decoder)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
-        """The network turns the cover's picture, with its background, into the secret's."""
+        """The cover is rendered with its background; the network turns that into the secret's image."""
         cover = self.render(to_gaussians(self.parameters), 0, camera, sh_degree)
         network = self.decoder.network(self.backgrounds[0])
         return [

@@ -19,9 +19,8 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
+from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
-from keyss.methods.peers.options import PeerOptions
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 from keyss.rendering import decode_picture, render_features
 
@@ -30,7 +29,7 @@ _NOISE = 0.1  # standard deviation of the features that start as noise
 
 
 class GsHiderTraining(PeerTraining):
-    """Features instead of harmonics, a scene decoder and a message decoder."""
+    """The training of features instead of harmonics, a scene decoder and a message decoder."""
 
     def prepare(self, start: Gaussians) -> None:
         """Three features start as the points' colours, the others as noise."""
@@ -41,12 +40,12 @@ class GsHiderTraining(PeerTraining):
         self.networks.extend(self.decoders)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
-        """All from one render of the features."""
-        behind = torch.zeros(FEATURES, device=self.device)
+        """All images come from one render of the features."""
+        background = torch.zeros(FEATURES, device=self.device)
         sh = torch.zeros(len(self), 1, 3, device=self.device)
         model = gaussians_of(self.parameters, self.parameters["opacities"], sh)
-        drawn, meta = render_features(model, self.parameters["features"], camera, behind)
-        networks = (self.decoders[scene].network(behind) for scene in scenes)
+        drawn, meta = render_features(model, self.parameters["features"], camera, background)
+        networks = (self.decoders[scene].network(background) for scene in scenes)
         return [Picture(decode_picture(drawn, network), meta) for network in networks]
 
 
@@ -69,10 +68,9 @@ class GsHiderMethod(JointPeer):
 
     def publish(self, run: GsHiderTraining) -> tuple[Gaussians, HandedTensors]:
         kept = run.kept()
-        behind = torch.zeros(FEATURES)
+        background = torch.zeros(FEATURES, device=run.device)
         cover, secret = (
-            each.network(behind.to(run.device)).map(lambda values: values.detach().cpu())
-            for each in run.decoders
+            decoder.network(background).map(lambda values: values.detach().cpu()) for decoder in run.decoders
         )
         plain = gaussians_of(kept, kept["opacities"], torch.zeros(len(kept["means"]), 1, 3))
         stego = DecodedGaussians.of(plain, cover, kept["features"])

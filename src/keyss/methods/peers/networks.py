@@ -14,7 +14,7 @@ WIDTH, LAYERS = 64, 5
 
 
 class Convolutions(torch.nn.Module):
-    """From pictures of so many channels to RGB."""
+    """A network from images with so many channels to RGB."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -24,18 +24,18 @@ class Convolutions(torch.nn.Module):
         )
 
     def network(self, background: Tensor) -> PictureNetwork:
-        """For pictures with `background` [C]; attached to the graph."""
+        """The network for images with `background` [C]; attached to the graph."""
         weights = list(self.parameters())
         return PictureNetwork(tuple(zip(weights[::2], weights[1::2], strict=True)), background)
 
 
 def weights_of(channels: int) -> int:
-    """Weights of such a network, biases not counted."""
+    """The number of weights of `Convolutions`, without biases."""
     return sum(9 * before * after for before, after in pairwise([channels, *[WIDTH] * (LAYERS - 1), 3]))
 
 
 def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
-    """By names, to be handed over."""
+    """The tensors of a network by name."""
     tensors = {"background": network.background}
     for index, (weight, bias) in enumerate(network.layers):
         tensors |= {f"weight.{index}": weight, f"bias.{index}": bias}
@@ -43,7 +43,7 @@ def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
 
 
 def network_of(handed: HandedTensors) -> PictureNetwork:
-    """What `network_tensors` gave. Raises InputError, ValueError and TypeError for damage."""
+    """The network of `network_tensors`. Raises InputError, ValueError and TypeError for damage."""
     names = [f"{kind}.{index}" for index in range(LAYERS) for kind in ("weight", "bias")]
     background, *rest = handed.taken(["background", *names])
     return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)

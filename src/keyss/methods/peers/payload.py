@@ -1,4 +1,4 @@
-"""The file that a peer hands over, as bytes, and the secret that it reveals."""
+"""The file that a peer hands over, and the secret that it reveals."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ class _Header(Header):
 
 @dataclass(frozen=True)
 class HandedTensors:
-    """Tensors, and where the secret is in the cover's frame."""
+    """Tensors to hand over, and where the secret is in the cover's frame."""
 
     tensors: Mapping[str, Tensor]  # float32 or uint8
     frame: Similarity | None = None  # from the secret's into the cover's; None: never placed there
-    rows: int | None = None  # Gaussians of the published model, where they must be there in their order
+    rows: int | None = None  # Gaussians of the published model, if they are needed in their order
 
     def payload(self, method: str) -> Payload:
-        """As it is handed over by the method of that name."""
+        """The file of the method of that name."""
         frame = None if self.frame is None else FrameRecord.of(self.frame)
         return Payload(method, pack_tensors(self.tensors, _Header(FORMAT, VERSION, self.rows, frame)))
 
     @staticmethod
     def of(content: Content) -> HandedTensors:
-        """What `payload` gave. Raises InputError for anything else."""
+        """The tensors of `payload`. Raises InputError for anything else."""
         with damage_refused(DAMAGED):
             if not isinstance(content, Payload):
                 raise ValueError("expected one string of bytes, got records")
@@ -50,12 +50,15 @@ class HandedTensors:
         return HandedTensors(tensors, frame, header.rows)
 
     def taken(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
-        """Tensors by name, and no others: uint8 those `of_bytes`, else float32. Raises InputError."""
-        wanted = {name: torch.uint8 if name in of_bytes else torch.float32 for name in names}
-        if wanted != {name: value.dtype for name, value in self.tensors.items()}:
+        """The tensors of these names: uint8 those `of_bytes`, else float32.
+
+        Raises InputError for other types, and if there are more or fewer.
+        """
+        expected = {name: torch.uint8 if name in of_bytes else torch.float32 for name in names}
+        if expected != {name: value.dtype for name, value in self.tensors.items()}:
             found = ", ".join(sorted(self.tensors))[:200]
-            raise InputError(f"{DAMAGED}: expected {', '.join(wanted)}, found {found}")
-        return [self.tensors[name] for name in wanted]
+            raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
+        return [self.tensors[name] for name in expected]
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class HandedSecret:
     """An `Opened`: a handed-over file applied to the published model."""
 
     handed: HandedTensors
-    show: Callable[[Gaussians], Gaussians]  # of a model on the CPU, in the cover's frame; raises ValueError
+    show: Callable[[Gaussians], Gaussians]  # from a model on the CPU, in the cover's frame; raises ValueError
     decode: None = None
 
     @property
@@ -71,7 +74,7 @@ class HandedSecret:
         return self.handed.frame
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """See `Opened.reveal`; nothing is left in a model that has other Gaussians."""
+        """See `Opened.reveal`; raises InputError for a model with other Gaussians."""
         rows = self.handed.rows
         if rows is not None and len(stego) != rows:
             raise InputError(
@@ -87,7 +90,7 @@ class HandedSecret:
         return self.frame.inverse().apply_gaussians(shown)
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """All of it: otherwise nothing is revealed."""
+        """All of the secret: damage reveals nothing."""
         return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:

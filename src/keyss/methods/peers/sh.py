@@ -15,25 +15,23 @@ from keyss.core.scene import Camera
 from keyss.fitting.parameters import make_optimizers
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
-from keyss.methods.peers.options import PeerOptions
+from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 
-_OF = ("sh", "secret_sh")  # parameters that colour the cover and the secret
+_NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
 
 
 class ShTraining(PeerTraining):
-    """Two sets of harmonics; everything else is shared."""
+    """The training of two sets of harmonics; everything else is shared."""
 
     def prepare(self, start: Gaussians) -> None:
-        """The secret's start like the cover's: every point has the colour of its own scene."""
-        fit = self.options.fit
-        optimizer = make_optimizers(self.parameters, fit, self.extent)["sh"]
-        self.add(_OF[1], start.sh.clone(), optimizer)
+        """Both start equal: every point has the colour of its own scene."""
+        optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
+        self.add(_NAMES[1], start.sh.clone(), optimizer)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         opacities = self.parameters["opacities"]
-        models = [gaussians_of(self.parameters, opacities, self.parameters[name]) for name in _OF]
+        models = [gaussians_of(self.parameters, opacities, self.parameters[name]) for name in _NAMES]
         return [self.render(models[scene], scene, camera, sh_degree) for scene in scenes]
 
 
@@ -56,10 +54,10 @@ class ShMethod(JointPeer):
     def publish(self, run: ShTraining) -> tuple[Gaussians, HandedTensors]:
         kept = run.kept()
         stego = gaussians_of(kept, kept["opacities"], kept["sh"])
-        return stego, HandedTensors({_OF[1]: kept[_OF[1]]}, run.frame, rows=len(stego))
+        return stego, HandedTensors({_NAMES[1]: kept[_NAMES[1]]}, run.frame, rows=len(stego))
 
     def open(self, handed: HandedTensors) -> HandedSecret:
-        (sh,) = handed.taken([_OF[1]])
+        (sh,) = handed.taken([_NAMES[1]])
         return HandedSecret(handed, lambda stego: replace(stego, sh=sh))
 
 

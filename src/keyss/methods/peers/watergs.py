@@ -4,12 +4,13 @@ Both scenes share positions, scales and rotations. The secret's harmonics lie en
 cover's, and a small convolutional autoencoder maps the cover's opacities to its own. The published file is a
 3DGS model; the autoencoder and the cipher's key are handed over, sealed with the secret's key.
 
-The paper leaves the number of bits and the time of the autoencoder's training open. Here:
+The paper leaves open how many bits there are and when the autoencoder is trained. Here:
 
-- *importance-graded* both ways: the secret's constant coefficients get most bits, degree 3 the fewest, and
-  the bits that matter most lie where they cost the cover least, at the bottom of its highest degrees;
-- once growth has stopped, the Gaussians are sorted along a Morton curve, where neighbours in the list are
-  neighbours in space; the autoencoder is fitted to the secret's opacities and replaces them for the rest of
+- Bits are graded by importance on both sides: the secret's constant coefficients get the most bits and degree
+  3 the fewest, and the most important bits are stored where they cost the cover least, at the bottom of its
+  highest degrees.
+- When growth stops, the Gaussians are sorted along a Morton curve, so that neighbours in the list are
+  neighbours in space. The autoencoder is fitted to the secret's opacities and replaces them for the rest of
   the training, in which everything else adapts to it.
 """
 
@@ -38,15 +39,14 @@ from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import JointPeer, PeerTraining, gaussians_of
-from keyss.methods.peers.options import PeerOptions
+from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
 from keyss.methods.peers.payload import HandedSecret, HandedTensors
 
-COVER_BITS = (8, 10, 12, 14)  # of the 23 of a mantissa, by degree
-SECRET_BITS = (16, 13, 11, 10)  # of a coefficient where there is room for all, by degree
+COVER_BITS = (8, 10, 12, 14)  # low bits in use, of the 23 of a mantissa, by degree
+SECRET_BITS = (16, 13, 11, 10)  # of a coefficient if there is room for all, by degree
 WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # of the autoencoder, along the list of Gaussians
-_FIT_STEPS = 200  # of the autoencoder, to the secret's own opacities
-_RANGE = 0.999  # of the coefficients of a degree, but for the constant ones; larger ones are cut off
+_FIT_STEPS = 200  # that fit the autoencoder to the secret's own opacities
+_RANGE = 0.999  # quantile of the coefficients above degree 0 at which they are clipped
 _BLOCK = 1 << 14  # Gaussians at a time
 _CIPHER_BYTES = 32
 
@@ -57,23 +57,24 @@ Bits = npt.NDArray[np.uint8]
 def graded_bits(degree: int) -> tuple[int, ...]:
     """Bits of a secret's coefficients by degree, in a model of SH `degree`: as many as have room."""
     room = sum((2 * each + 1) * COVER_BITS[each] for each in range(degree + 1))
-    for less in range(SECRET_BITS[0]):
-        found = tuple(max(0, SECRET_BITS[each] - less) for each in range(degree + 1))
-        if sum((2 * each + 1) * bits for each, bits in enumerate(found)) <= room:
-            return found
-    raise ValueError(f"no room for harmonics of degree {degree}")
+    candidates = (
+        [max(0, bits - less) for bits in SECRET_BITS[: degree + 1]] for less in range(SECRET_BITS[0])
+    )
+    return next(
+        tuple(bits) for bits in candidates if sum((2 * i + 1) * n for i, n in enumerate(bits)) <= room
+    )
 
 
 @cache
 def _places(degree: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """(coefficient, bit) of the secret's bits, those that matter most first, and of where they lie.
+    """(coefficient, bit) of the secret's bits, the most important first, and of the cover's bits for them.
 
-    There are more of the second kind. Bit 0 is the lowest.
+    The cover has more. Bit 0 is the lowest.
     """
     degrees = [math.isqrt(index) for index in range((degree + 1) ** 2)]
     sizes = graded_bits(degree)
     secret = [(index, bit) for index, each in enumerate(degrees) for bit in range(sizes[each])]
-    # What a bit is worth: high ones of the codes, and of these the ones of low degrees.
+    # The most important bits are the high ones, and among these those of low degrees.
     secret.sort(key=lambda place: (sizes[degrees[place[0]]] - place[1], degrees[place[0]]))
     cover = [(index, bit) for index, each in enumerate(degrees) for bit in range(COVER_BITS[each])]
     cover.sort(key=lambda place: (place[1], -degrees[place[0]]))
@@ -81,7 +82,7 @@ def _places(degree: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
 
 
 def ranges_of(sh: Tensor) -> Tensor:
-    """[degree + 1] within which nearly all coefficients of each degree lie."""
+    """[degree + 1] the largest magnitudes of the coefficients of each degree that are not clipped."""
     found = []
     for degree in range(math.isqrt(sh.shape[1])):
         values = sh[:, degree**2 : (degree + 1) ** 2].abs().flatten().double().numpy()
@@ -90,12 +91,11 @@ def ranges_of(sh: Tensor) -> Tensor:
 
 
 def write_bits(cover: Tensor, secret: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
-    """`cover` [N, K, 3] with `secret` [N, K, 3] in its low bits, all of which get what looks random."""
+    """`cover` [N, K, 3] with `secret` [N, K, 3] in its low bits, which all look random."""
     degree = math.isqrt(cover.shape[1]) - 1
     sizes, (places, homes) = graded_bits(degree), _places(degree)
     words = cover.contiguous().numpy().view(np.uint32).copy()
-    for block, noise in _blocks(len(cover), len(homes), cipher):
-        bits = noise
+    for block, bits in _blocks(len(cover), len(homes), cipher):
         codes = _codes(secret[block], ranges, sizes)
         for row, (index, bit) in enumerate(places):
             bits[:, row] ^= ((codes[:, index] >> np.uint32(bit)) & np.uint32(1)).astype(np.uint8)
@@ -126,34 +126,31 @@ def read_bits(stego: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
 
 
 def _codes(secret: Tensor, ranges: Tensor, sizes: Sequence[int]) -> Words:
-    """[n, K, 3] coefficients as whole numbers of so many bits."""
+    """[n, K, 3] coefficients as codes of `sizes` bits by degree."""
     codes = np.empty(secret.shape, np.uint32)
     for index in range(codes.shape[1]):
-        each = math.isqrt(index)
-        most = 2 ** sizes[each] - 1
-        share = (secret[:, index].double().numpy() / float(ranges[each]) + 1) / 2
-        codes[:, index] = np.rint(share.clip(0, 1) * most)
+        degree = math.isqrt(index)
+        share = (secret[:, index].double().numpy() / float(ranges[degree]) + 1) / 2
+        codes[:, index] = np.rint(share.clip(0, 1) * (2 ** sizes[degree] - 1))
     return codes
 
 
 def _blocks(count: int, places: int, cipher: bytes) -> Iterator[tuple[slice, Bits]]:
-    """Slices of the Gaussians, and random bits [n, places, 3] for each, which follow from `cipher`."""
+    """Slices of the Gaussians, and for each slice its key stream, bits [n, places, 3]."""
     for number, start in enumerate(range(0, count, _BLOCK)):
-        size = min(_BLOCK, count - start)
-        total = size * places * 3
-        data = np.frombuffer(stream(cipher, f"watergs/{number}", -(-total // 8)), np.uint8)
-        bits = np.unpackbits(data)[:total].reshape(size, places, 3)
-        yield slice(start, start + size), bits.copy()
+        shape = (min(_BLOCK, count - start), places, 3)
+        data = np.frombuffer(stream(cipher, f"watergs/{number}", -(-math.prod(shape) // 8)), np.uint8)
+        yield slice(start, start + _BLOCK), np.unpackbits(data)[: math.prod(shape)].reshape(shape)
 
 
 class OpacityMapping(torch.nn.Module):
-    """From the cover's opacity logits [N] to the secret's, by what lies near in the list."""
+    """From the cover's opacity logits [N] to the secret's, by convolution along the list."""
 
     def __init__(self) -> None:
         super().__init__()
-        pairs = pairwise(WIDTHS)
-        layers = [torch.nn.Conv1d(a, b, KERNEL, padding=KERNEL // 2) for a, b in pairs]
-        self.layers = torch.nn.ModuleList(layers)
+        self.layers = torch.nn.ModuleList(
+            torch.nn.Conv1d(a, b, KERNEL, padding=KERNEL // 2) for a, b in pairwise(WIDTHS)
+        )
 
     def forward(self, logits: Tensor) -> Tensor:
         values = logits[None, None]
@@ -163,7 +160,7 @@ class OpacityMapping(torch.nn.Module):
 
 
 class WaterGsTraining(PeerTraining):
-    """Two sets of harmonics and of opacities; the second opacities are mapped in the end."""
+    """The training of two sets of harmonics and of opacities; the second opacities are mapped in the end."""
 
     def prepare(self, start: Gaussians) -> None:
         optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
@@ -174,7 +171,7 @@ class WaterGsTraining(PeerTraining):
 
     @property
     def mapped(self) -> bool:
-        """Whether the autoencoder has taken the place of free opacities."""
+        """True once the autoencoder has replaced free opacities."""
         return self.iteration >= int(self.strategy.refine_stop_iter)
 
     def step(self) -> None:
@@ -210,13 +207,13 @@ class WaterGsTraining(PeerTraining):
                     values.copy_(values[order])
 
     def _fit_mapping(self) -> None:
-        """By cross entropy: squared errors have hardly a gradient where opacities are nearly 0 or 1."""
+        """Fit by cross entropy: squared errors have almost no gradient where opacities are nearly 0 or 1."""
         logits = self.parameters["opacities"].detach()
-        wanted = self.parameters["secret_opacities"].detach().sigmoid()
+        target = self.parameters["secret_opacities"].detach().sigmoid()
         adam = torch.optim.Adam(self.mapping.parameters(), lr=5 * self.options.network_rate)
         for _ in range(_FIT_STEPS):
             adam.zero_grad()
-            F.binary_cross_entropy_with_logits(self.mapping(logits), wanted).backward()
+            F.binary_cross_entropy_with_logits(self.mapping(logits), target).backward()
             adam.step()
         adam.zero_grad()
         here().share(self.mapping.parameters())
@@ -232,7 +229,7 @@ class WaterGsOptions(PeerOptions):
         super().__post_init__()
         if int(self.fit.iterations * self.fit.grow_stop) < 1:
             raise UsageError(
-                "`fit`: expected at least one step before growth stops, when opacities are mapped; got "
+                "`fit`: expected at least one step before growth stops and opacities are mapped; got "
                 f"{self.fit.iterations} steps, and growth in {self.fit.grow_stop:g} of them"
             )
 
@@ -247,7 +244,7 @@ class WaterGsMethod(JointPeer):
     training = WaterGsTraining
 
     def publish(self, run: WaterGsTraining) -> tuple[Gaussians, HandedTensors]:
-        """All Gaussians: the autoencoder depends on their order."""
+        """Publishes all Gaussians, because the autoencoder depends on their order."""
         kept = {name: value.detach().cpu() for name, value in run.parameters.items()}
         ranges, cipher = ranges_of(kept["secret_sh"]), os.urandom(_CIPHER_BYTES)
         sh = write_bits(kept["sh"], kept["secret_sh"], ranges, cipher)

@@ -1,102 +1,116 @@
-"""Models into the low bits of a prepared cover, and opened again as their readers will."""
+"""Models as records or payloads in a prepared cover, opened again as their readers will.
+
+In low bits a Gaussian is a record (see `quantise`); the header tells how records are decoded and how many
+there were. Copies of the most visible Gaussians are embedded a second time as far as there is room. Every
+other channel carries a model as one payload (see `whole`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from keyss.channels import Content, Payload, PreparedCover, Room, open_content
+from keyss.channels import (
+    Content,
+    LowBitsCover,
+    Payload,
+    PreparedCover,
+    RecordRequest,
+    Records,
+    Room,
+    open_content,
+)
 from keyss.core.gaussians import Gaussians
-from keyss.methods.records import precision
-from keyss.methods.records.encoding import METHOD, encode_all, record_requests
-from keyss.methods.records.opening import CarriedSecret, unpack
+from keyss.methods.base import Stego
+from keyss.methods.records.opening import COUNT, unpack
+from keyss.methods.records.precision import fitted, least_bytes, most_visible_rows
+from keyss.methods.records.quantise import Codec
+from keyss.methods.records.table import Table
 from keyss.rendering.difference import Viewpoints
 
-
-@dataclass(frozen=True)
-class Embedded:
-    """What embedding gives."""
-
-    stego: Gaussians
-    opened: tuple[CarriedSecret, ...]
-    details: dict[str, Any]  # numbers for metrics.json
+METHOD = "carry"  # the method that opens what is embedded
 
 
 def embed_models(
-    prepared: PreparedCover,
+    cover: PreparedCover,
     keys: Sequence[str],
     models: Sequence[Gaussians],
     *,
+    viewpoints: Sequence[Viewpoints] | None = None,
     entropy: bytes | None = None,
-) -> Embedded:
-    """All Gaussians of each model, under its key, opened again. Raises UsageError if they do not fit."""
-    records = encode_all(prepared, models)
-    stego = prepared.embed(list(zip(keys, records, strict=True)), entropy=entropy)
-    found = _opened([open_content(stego, key) for key in keys], models)
-    details: dict[str, Any] = {
-        "carriers": prepared.carriers,
-        "capacity": prepared.record_capacity(record_requests(models)),
-        "bits_per_gaussian": [each.bits for each in found],
-    }
-    return Embedded(stego, found, details)
+) -> Stego:
+    """All Gaussians of each model, under its key, opened again.
 
-
-def embed_whole(
-    room: PreparedCover,
-    keys: Sequence[str],
-    models: Sequence[Gaussians],
-    viewpoints: Sequence[Viewpoints],
-    *,
-    prune: bool,
-    entropy: bytes | None = None,
-) -> Embedded:
-    """All of each model, or with `prune` what fits, under its key, opened again; see `shares_of`.
-
-    `viewpoints`: from where each is looked at, which tells how precise it has to be. Raises UsageError if
-    they do not fit.
+    `viewpoints` of each model tell how precise a payload has to be; by default, four views around it. Raises
+    UsageError if the models do not fit.
     """
-    rooms = shares_of(room, models)
-    fitted = [
-        precision.fitted(model, share, prune=prune, short=room.grows, viewpoints=views)
-        for model, share, views in zip(models, rooms, viewpoints, strict=True)
-    ]
-    payloads = [Payload(METHOD, data) for _, data in fitted]
-    stego = room.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
-    opened = _opened([open_content(stego, key) for key in keys], [kept for kept, _ in fitted])
-    details: dict[str, Any] = {
-        "secret_bytes": [len(data) for _, data in fitted],
-        "sh_degrees": [each.gaussians.sh_degree for each in opened],
-        "bits_per_gaussian": [each.bits for each in opened],
-    }
-    if not room.grows:
-        details["capacity_bytes"] = room.capacity
-        details["capacity_bits_per_gaussian"] = round(8 * room.capacity / len(stego), 2)
-    return Embedded(stego, opened, details)
+    contents: Sequence[Content]
+    if isinstance(cover, LowBitsCover):
+        contents = encode_all(cover, models)
+        requests = [record_request(len(model), model.sh_degree) for model in models]
+        details: dict[str, Any] = {"carriers": cover.carriers, "capacity": cover.record_capacity(requests)}
+    else:
+        contents = payloads = _payloads(cover, models, viewpoints or [*map(Viewpoints.around, models)])
+        details = {
+            "secret_bytes": [len(each.data) for each in payloads],
+            "sh_degrees": [each.sh_degree for each in models],
+        }
+        if not cover.grows:
+            details["capacity_bytes"] = cover.capacity
+            details["capacity_bits_per_gaussian"] = round(8 * cover.capacity / len(cover.cover), 2)
+    stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
+    opened = tuple(unpack(open_content(stego, key)) for key in keys)
+    if [len(each.gaussians) for each in opened] != list(map(len, models)):
+        raise RuntimeError("the embedded secrets do not open again as they should")
+    details["bits_per_gaussian"] = [each.bits for each in opened]
+    return Stego(stego, opened, details=details, verified=True)
 
 
-def shares_of(room: Room, models: Sequence[Gaussians]) -> list[int]:
-    """Bytes that the encoding of each model may take."""
-    if len(models) == 1 and room.grows:
-        return [room.capacity - room.overhead]
-    return shares([precision.least_bytes(model) for model in models], room.capacity, room.overhead)
+def encode_all(cover: PreparedCover, models: Sequence[Gaussians]) -> list[Records]:
+    """The records of all models, as precise as they fit into `cover` together. Raises UsageError if not."""
+    plans = cover.plan_records([record_request(len(model), model.sh_degree) for model in models])
+    found = []
+    for model, plan in zip(models, plans, strict=True):
+        table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
+        assert table is not None  # the plan has room for the floor
+        codec = Codec.fit(model, table)
+        header = COUNT.pack(len(model)) + codec.pack()
+        copied = most_visible_rows(model, plan.copies)
+        found.append(Records(METHOD, header, codec.encode(model), plan, copied))
+    return found
 
 
-def shares(needed: Sequence[int], capacity: int, overhead: int) -> list[int]:
-    """Bytes that each secret may take, of which so many are `needed`.
+def record_request(count: int, sh_degree: int) -> RecordRequest:
+    """The request to a channel for a model of `count` Gaussians."""
+    header_bytes = COUNT.size + Codec.packed_size(sh_degree)
+    return RecordRequest(count, Table.floor(sh_degree).record_bytes, header_bytes)
+
+
+def largest_degree(record_bytes: int) -> int | None:
+    """The highest SH degree of Gaussians whose records take at most so many bytes; None if there is none."""
+    return next((each for each in (3, 2, 1, 0) if Table.floor(each).record_bytes <= record_bytes), None)
+
+
+def shares(room: Room, needed: Sequence[int]) -> list[int]:
+    """Bytes that the payload of each secret may take, whose encodings need `needed` bytes.
 
     A quarter of the capacity, half of it or all, whichever is enough: then a secret is as precise as it would
-    be alone, and its key tells nothing of others. Where that is too much for all of them, equal shares.
+    be alone, and its key tells nothing of others. If that is too much for all of them, or the model grows,
+    equal shares.
     """
-    parts = [next((each for each in (4, 2) if size <= capacity // each - overhead), 1) for size in needed]
-    if sum(1 / each for each in parts) > 1:
+    parts = [
+        next((each for each in (4, 2) if size <= room.capacity // each - room.overhead), 1) for size in needed
+    ]
+    if room.grows or sum(1 / each for each in parts) > 1:
         parts = [len(needed)] * len(needed)
-    return [max(0, capacity // each - overhead) for each in parts]
+    return [max(0, room.capacity // each - room.overhead) for each in parts]
 
 
-def _opened(contents: Sequence[Content], models: Sequence[Gaussians]) -> tuple[CarriedSecret, ...]:
-    """The secrets as their readers get them. Raises RuntimeError if these are not all of the `models`."""
-    found = tuple(map(unpack, contents))
-    if [len(each.gaussians) for each in found] != list(map(len, models)):
-        raise RuntimeError("what was written does not open again as it should")
-    return found
+def _payloads(
+    cover: PreparedCover, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]
+) -> list[Payload]:
+    rooms = shares(cover, [least_bytes(model) for model in models])
+    return [
+        Payload(METHOD, fitted(model, room, short=cover.grows, viewpoints=views))
+        for model, room, views in zip(models, rooms, viewpoints, strict=True)
+    ]

@@ -1,9 +1,9 @@
-"""Lines that numbers are coded on, and those that suit given numbers; see `quantise`."""
+"""Lines that map numbers to codes, and the line that suits given numbers; see `quantise`."""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,90 +11,85 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint32]
+Mask = npt.NDArray[np.bool_]
 
-_TAIL = 0.05  # share of the numbers that says nothing of how far the bulk reaches, on each side if both count
-_EVEN_MARGIN = 0.75  # on a line divided evenly the bulk's neighbourhood ends as many of its widths from it
-_FAR = 8.0  # on one by asinh it ends at as many times the bulk's distance from the median
-_FURTHEST = 1e30  # no value that a line may give is larger
+_TAIL = 0.05  # share of the numbers that is ignored on each side when the extent of the bulk is measured
+_EVEN_MARGIN = 0.75  # on an evenly spaced line, widths of the bulk between it and the first outlier
+_FAR = 8.0  # on an asinh line, distances of the bulk from the median up to the first outlier
+_FURTHEST = 1e30  # no line gives a larger number
 _MIN_SPREAD = 1e-9
-_HALF = 1e-3  # half precision rounds by less than this share
-LINE = struct.Struct("<2f2e")  # centre, spread, reach, reach of outliers
+_HALF = 1e-3  # half precision, in which reaches are stored, rounds by less than this share
+_SAMPLE = 20_000  # numbers that the candidates for a line are compared on
+LINE = struct.Struct("<2f2e")  # centre, spread, reach, far reach
 # The line with the least square error makes numbers smaller on average, which costs more against photos than
-# errors that are independent of the numbers: this part of the error counts so much more.
+# errors that are independent of the numbers: this part of the error gets this weight.
 _SHRINKING_WEIGHT = 20.0
 
 
 @dataclass(frozen=True)
 class Line:
-    """Codes 0 .. 2^bits - 1 for real numbers, between centre - reach and centre + reach of the line."""
+    """Codes 0 .. 2^bits - 1 for evenly spaced positions from -reach to reach.
+
+    The position of a number is its distance from the centre, or the asinh of that distance in spreads.
+    """
 
     centre: float
-    spread: float  # 0: the numbers as they are; else asinh of their distance from the centre in spreads
-    reach: float  # of the number, or of its asinh
+    spread: float  # 0: positions are distances
+    reach: float  # the largest position
+    far_reach: float  # the largest position of outliers
 
     def __post_init__(self) -> None:
         """Raise ValueError unless every code stands for a number of bounded size."""
-        if not (abs(self.centre) < _FURTHEST and 0 <= self.spread < _FURTHEST and 0 < self.reach < _FURTHEST):
+        reach, least = max(self.reach, self.far_reach), min(self.reach, self.far_reach)
+        bounded = abs(self.centre) < _FURTHEST and 0 <= self.spread < _FURTHEST
+        if not (bounded and 0 < least <= reach < _FURTHEST):
             raise ValueError(f"no such line: {self}")
-        if self.spread > 0 and (self.reach > 60 or self.spread * np.sinh(self.reach) > _FURTHEST):
+        if self.spread > 0 and (reach > 60 or self.spread * np.sinh(reach) > _FURTHEST):
             raise ValueError(f"no such line: {self}")
 
-    def encode(self, values: Floats, bits: int) -> Codes:
-        """Of each value the nearest code; of those beyond the ends the last one."""
-        return self.codes(self.positions(values), bits)
+    def encode(self, values: Floats, bits: int, outlier: Mask | None = None) -> Codes:
+        """The nearest codes of `values` [N, C], clipped at the ends; `outlier` [N]: use the far reach."""
+        return self.codes(self.positions(values), bits, outlier)
 
     def positions(self, values: Floats) -> Floats:
-        """Where values lie, whatever the reach is."""
+        """The positions of `values`, whatever the reach."""
         offset: Floats = values - self.centre
         return np.arcsinh(offset / self.spread) if self.spread > 0 else offset
 
-    def codes(self, position: Floats, bits: int) -> Codes:
+    def codes(self, positions: Floats, bits: int, outlier: Mask | None = None) -> Codes:
         """`encode` of values at these positions."""
         last = (1 << bits) - 1
-        codes = np.rint((position / self.reach + 1) * (last / 2)).clip(0, last)
+        codes = np.rint((positions / self._reaches(outlier) + 1) * (last / 2)).clip(0, last)
         return codes.astype(np.uint32)
 
-    def decode(self, codes: Codes, bits: int) -> Floats:
-        """The values that codes stand for."""
-        position = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self.reach
-        offset: Floats = np.sinh(position) * self.spread if self.spread > 0 else position
+    def decode(self, codes: Codes, bits: int, outlier: Mask | None = None) -> Floats:
+        """The values that `codes` [N, C] stand for; see `encode`."""
+        positions = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self._reaches(outlier)
+        offset: Floats = np.sinh(positions) * self.spread if self.spread > 0 else positions
         return offset + self.centre
+
+    def _reaches(self, outlier: Mask | None) -> Floats | float:
+        return self.reach if outlier is None else np.where(outlier, self.far_reach, self.reach)[:, None]
 
 
 class Kind(NamedTuple):
-    """What suits the numbers of one kind."""
+    """Which lines suit the numbers of one kind."""
 
-    even: bool = False  # whether their line is divided evenly, else by asinh
-    clips: bool = False  # whether the furthest of the bulk may be clipped
-    centred: bool = False  # whether zero is the centre
+    even: bool = False  # evenly spaced, else by asinh
+    clips: bool = False  # the furthest numbers of the bulk may be clipped
+    centred: bool = False  # the centre is zero, else the median
 
 
 EVEN, POSITION = Kind(even=True), Kind()
 COLOUR, HARMONIC = Kind(clips=True), Kind(clips=True, centred=True)
 
 
-class Extent(NamedTuple):
-    """How far the numbers of a line reach."""
-
-    least: float
-    largest: float
-
-    @staticmethod
-    def of(values: Floats) -> Extent:
-        """Of all values; there may be none."""
-        return Extent(float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)))
-
-    def from_centre(self, centre: float) -> float:
-        """The largest distance of a number from `centre`; 0 where there are none."""
-        return max(self.largest - centre, centre - self.least, 0.0)
-
-
 def neighbourhood(values: Floats, kind: Kind) -> tuple[float, float]:
-    """The ends of what is not far outside of the bulk of `values`.
+    """The least and the largest number that is no outlier of `values`.
 
-    Quantiles tell how far the bulk reaches. Fewer than `_TAIL` of the values, whatever they are, cannot move
-    these beyond the others. So they make a line that is divided evenly at most 2.5 times (the bulk and two
-    margins) as long as the others alone need, and each number as much less precise.
+    Quantiles measure the bulk. Fewer than `_TAIL` of the values, whatever they are, cannot move these beyond
+    the others. So they make an evenly spaced line at most 2.5 times (the bulk and two margins) as long as the
+    others alone need, and each number as much less precise.
     """
     if kind.even:
         low = float(np.quantile(values, _TAIL, method="higher"))
@@ -106,45 +101,44 @@ def neighbourhood(values: Floats, kind: Kind) -> tuple[float, float]:
     return centre - reach, centre + reach
 
 
-def fitted(kind: Kind, bits: int, sample: Floats, extent: Extent, centre: float, spread: float) -> Line:
-    """The line for the numbers of the bulk.
-
-    `sample`: some of them; `extent`: of all; `centre`: their median, or 0 for `kind.centred`; `spread`: their
-    mean distance from it. The last two do not matter on a line divided evenly.
-    """
+def fit_line(kind: Kind, bits: int, values: Floats, outliers: Floats) -> Line:
+    """The line for `values` [N, C] of the bulk, with a far reach for `outliers` [O, C]; there may be none."""
     if kind.even:
-        return _line((extent.least + extent.largest) / 2, 0, (extent.largest - extent.least) / 2)
-    spread = max(spread, _MIN_SPREAD)
+        centre, spread = (float(values.min()) + float(values.max())) / 2, 0.0
+    else:
+        centre = 0.0 if kind.centred else float(np.median(values))
+        spread = max(float(np.abs(values - centre).mean()), _MIN_SPREAD)
+    line = Line(float(np.float32(centre)), float(np.float32(spread)), 1, 1)
+    line = replace(line, reach=_reach_of(line, _furthest(line, values)))
     if kind.clips:
-        return _best_line(sample, bits, extent.from_centre(centre) or 1.0, centre, spread)
-    return reaching(_line(centre, spread, 1), extent)
+        line = _best_line(line, bits, values)
+    return replace(line, far_reach=_reach_of(line, _furthest(line, outliers)))
 
 
-def reaching(line: Line, extent: Extent) -> Line:
-    """`line` with such a reach that all values lie on it."""
-    furthest = extent.from_centre(line.centre)
-    reach = np.arcsinh(furthest / line.spread) if line.spread > 0 else furthest
-    return _line(line.centre, line.spread, float(reach))
-
-
-def _best_line(sample: Floats, bits: int, furthest: float, centre: float, spread: float) -> Line:
-    """Of some lines that reach to the furthest value or less far the one with the least error."""
-    best, least = _line(centre, spread, float(np.arcsinh(furthest / spread))), np.inf
-    every = np.arange(1 << bits, dtype=np.uint32)
+def _best_line(whole: Line, bits: int, values: Floats) -> Line:
+    """The line with the least error among some with other spreads that reach as far as `whole` or less."""
+    sample = values[:: max(1, values.size // _SAMPLE)].ravel()
+    furthest = _furthest(whole, values) or 1.0
+    best, least = whole, np.inf
     for scale in (0.5, 1.0, 2.0, 4.0):
-        positions = _line(centre, scale * spread, 1.0).positions(sample)
-        for reach in np.geomspace(min(0.5 * spread, furthest), furthest, 12):
-            line = _line(centre, scale * spread, float(np.arcsinh(reach / (scale * spread))))
-            codes = line.codes(positions, bits)
-            some = len(every) < len(codes)  # fewer hyperbolic sines
-            error = (line.decode(every, bits)[codes] if some else line.decode(codes, bits)) - sample
-            shrinking = float((error * (sample - centre)).mean()) ** 2 / spread**2
+        line = replace(whole, spread=float(np.float32(scale * whole.spread)))
+        positions = line.positions(sample)
+        for distance in np.geomspace(min(0.5 * whole.spread, furthest), furthest, 12):
+            line = replace(line, reach=_reach_of(line, float(distance)))
+            error = line.decode(line.codes(positions, bits), bits) - sample
+            shrinking = float((error * (sample - line.centre)).mean()) ** 2 / whole.spread**2
             cost = float(np.square(error).mean()) + _SHRINKING_WEIGHT * shrinking
             if cost < least:
                 best, least = line, cost
     return best
 
 
-def _line(centre: float, spread: float, reach: float) -> Line:
-    """A line whose numbers are as precise as they are stored, and that is longer than a point."""
-    return Line(*LINE.unpack(LINE.pack(centre, spread, max(reach * (1 + _HALF), _HALF), 0))[:3])
+def _furthest(line: Line, values: Floats) -> float:
+    """The largest distance from the centre; 0 where there are no values."""
+    return float(np.abs(values - line.centre).max(initial=0.0))
+
+
+def _reach_of(line: Line, distance: float) -> float:
+    """The reach that covers numbers at this distance from the centre, as `LINE` stores it."""
+    position = line.positions(np.array([line.centre + distance]))[0]
+    return float(np.float16(max((1 + _HALF) * position, _HALF)))

@@ -1,4 +1,4 @@
-"""Secrets that were carried, opened: from records or from one string of bytes."""
+"""Carried secrets, opened from records or from a payload."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ COUNT = struct.Struct("<I")  # of Gaussians, before the codec in the header of r
 
 @dataclass(frozen=True)
 class CarriedSecret:
-    """A secret as it comes out; see `keyss.methods.opened.Opened`."""
+    """A carried secret; see `keyss.methods.opened.Opened`."""
 
     gaussians: Gaussians  # those that are left, in the order of their carriers
-    count: int  # how many were embedded
-    bits: int  # of a record
+    count: int  # Gaussians that were embedded
+    bits: int  # of a record, or of a Gaussian in a payload
     frame: None = None
     decode: None = None
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The Gaussians that are left make up for those that were lost with their carriers."""
+        """The Gaussians that are left, which compensate for those that were lost with their carriers."""
         if frame == "cover":
             raise UsageError(
                 'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
@@ -51,7 +51,7 @@ def unpack(content: Content) -> CarriedSecret:
 
 
 def decode(records: Records) -> CarriedSecret:
-    """The secret of records in any order, some of which may be lost. Raises InputError for damage."""
+    """The secret of records in any order; some may be lost. Raises InputError for damage."""
     if len(records.header) < COUNT.size:
         raise InputError("the hidden parameters are damaged: they are too short")
     (count,) = COUNT.unpack_from(records.header)

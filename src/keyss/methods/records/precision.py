@@ -1,34 +1,35 @@
-"""How precisely a model is encoded whole, for the room there is and for what will be seen."""
+"""Which Gaussians of a secret are encoded, and how precisely, so that they fit into the room there is."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.encoding import most_visible
 from keyss.methods.records.table import Table
 from keyss.methods.records.whole import MAX_BITS, USUAL_BITS, Precision, decode, encode
 from keyss.rendering.difference import Viewpoints, psnr_between
 
-_GOOD_ENOUGH = 44.0  # dB of pictures against those of the model: of photos at 30 dB it takes 0.2
-# Of each attribute alone, until they are good enough together; shares of opacities, of which there are fewer
-# than of others, and of harmonics, of which more numbers than three become longer.
+_GOOD_ENOUGH = 44.0  # dB of renders against those of the model: photos at 30 dB lose 0.2
+# PSNR of each attribute alone, until they are good enough together, and what is added to it: more for
+# opacities, which are one number of a Gaussian instead of three, and less for harmonics, which are many.
 _GOALS, _BIT = range(47, 61), 6.02  # dB
 _ATTRIBUTES, _SHARES = ("means", "log_scales", "quats", "opacity_logits"), (0, 0, 0, 4.8, 0, -8)
 _FEWEST, _MAX = (8, 4, 4, 4, 4), 20  # bits
-_COARSEST = 0.1  # step of harmonics: they show from near, and not from around
+_COARSEST = 0.1  # step of harmonics: from afar, where renders are compared, their errors do not show
 
 
 def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:
-    """The coarsest precision of which the pictures are good enough, as far as few tries tell.
+    """The coarsest precision whose renders are good enough, estimated with few renders.
 
-    What an attribute costs alone is measured once, and 6 dB are a bit. The fewest bits in all are those with
-    which the squared error of each is in proportion to the numbers that a bit more is spent on.
+    The cost of each attribute alone is measured once, and one bit is 6 dB. The total is least when the
+    squared error of each attribute is in proportion to its count of numbers.
     """
     table, step = Precision.of_size(Table.short().total)
     rough = decode(encode(model, Precision(table, step)))
@@ -48,24 +49,14 @@ def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Preci
 
 
 def least_bytes(model: Gaussians) -> int:
-    """Of the encoding below which a secret is rather pruned."""
+    """Bytes of the encoding with the usual precision; a secret that needs more than there are is pruned."""
     return len(encode(model))
-
-
-def check_fits(model: Gaussians, room: int) -> None:
-    """Raises UsageError where `model` takes more than `room` bytes."""
-    least = least_bytes(model)
-    if least > room:
-        raise UsageError(
-            f"the secret of {len(model):,} Gaussians takes {least:,} bytes, and there is room for "
-            f"{room:,}: about {max(0, len(model) * room // least):,} of its Gaussians"
-        )
 
 
 def pruned(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) -> Gaussians:
     """All of `model` if it fits into `room` bytes, else its most visible Gaussians.
 
-    These are of the SH degree that renders most like the model. Raises UsageError where nothing fits.
+    These are of the SH degree that renders most like the model. Raises UsageError if nothing fits.
     """
     if least_bytes(model) <= room:
         return model
@@ -77,24 +68,49 @@ def pruned(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) ->
 
 
 def fitted(
-    model: Gaussians, room: int, *, prune: bool, short: bool = False, viewpoints: Viewpoints | None = None
-) -> tuple[Gaussians, bytes]:
-    """What of `model` is encoded, and it in at most `room` bytes, as precise as it fits.
+    model: Gaussians, room: int, *, short: bool = False, viewpoints: Viewpoints | None = None
+) -> bytes:
+    """`model` in at most `room` bytes, as precise as fits.
 
-    `short`: no more precise than is hard to see from the `viewpoints`. Raises UsageError for what does not
-    fit without `prune`, and where nothing fits.
+    `short`: no more precise than is hard to see from the `viewpoints`. Raises UsageError if it does not fit.
     """
     if short and len(data := encode(model, good_enough(model, viewpoints))) <= room:
-        return model, data
-    if prune:
-        model = pruned(model, room, viewpoints)
-    else:
-        check_fits(model, room)
-    return model, _most_precise(model, room)
+        return data
+    usual = encode(model)
+    if len(usual) > room:
+        raise UsageError(
+            f"a secret of {len(model):,} Gaussians takes {len(usual):,} bytes, and there is room for {room:,}"
+        )
+    more = 8 * (room - len(usual)) // len(model)
+    for bits in range(min(MAX_BITS, USUAL_BITS + more), USUAL_BITS, -2):
+        data = encode(model, Precision.of_size(bits))
+        if len(data) <= room:
+            return data
+    return usual
+
+
+def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
+    """The `count` Gaussians of `most_visible_rows`; all of them if there are no more."""
+    if count >= len(gaussians):
+        return gaussians
+    return gaussians[torch.from_numpy(most_visible_rows(gaussians, count))]
+
+
+def most_visible_rows(gaussians: Gaussians, count: int) -> npt.NDArray[np.int64]:
+    """[count] indices of the Gaussians with the largest opacity times size, in ascending order.
+
+    Size is the square root of the cross-section, and no more than that of a typical large Gaussian:
+    otherwise a few huge faint ones would replace all detail.
+    """
+    size = gaussians.log_scales.sort(dim=1).values[:, 1:].mean(1)  # log, of the larger two axes
+    at_most = size.kthvalue(int(0.9 * len(size)) + 1).values
+    visibility = gaussians.opacities * size.clamp_max(at_most).exp()
+    rows: npt.NDArray[np.int64] = visibility.topk(count).indices.sort().values.numpy()
+    return rows
 
 
 def _pruned(model: Gaussians, room: int) -> Gaussians | None:
-    """The most visible Gaussians that fit into `room` bytes; None if not even one does."""
+    """The most visible Gaussians that fit into `room` bytes; None if none fits."""
     count = len(model)
     while count > 0:
         kept = most_visible(model, count)
@@ -103,14 +119,3 @@ def _pruned(model: Gaussians, room: int) -> Gaussians | None:
             return kept
         count = min(count - 1, int(0.995 * count * room / size))
     return None
-
-
-def _most_precise(model: Gaussians, room: int) -> bytes:
-    """The longest encoding that fits, at least that of the usual bits."""
-    usual = encode(model)
-    more = 8 * (room - len(usual)) // len(model)
-    for bits in range(min(MAX_BITS, USUAL_BITS + more), USUAL_BITS, -2):
-        data = encode(model, Precision.of_size(bits))
-        if len(data) <= room:
-            return data
-    return usual

@@ -1,4 +1,4 @@
-"""How many bits which attribute gets, for records of any size."""
+"""Tables of the bits of each attribute, for records of any size."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ MAX_BITS = 24  # of one number: float32 has no more
 CHROMA_FEWER = 2  # bits
 BANDS = (1, 3, 5, 7)  # spherical harmonics of degrees 0 to 3; each of three colours
 
-# Bits with which an attribute alone costs 60 dB against the unquantised model: measured on models of bonsai
-# and fox (200 px, 20,000 Gaussians). One bit more or less is 6 dB. Spherical harmonics are given 0.8 more
-# than that, and never so few that highlights come out too weak, which photos notice.
+# Bits with which quantising an attribute alone leaves 60 dB to the unquantised model, measured on models of
+# bonsai and fox (200 px, 20,000 Gaussians). One bit more or less is 6 dB. Spherical harmonics get 0.8 more,
+# and at least as many as highlights need, which PSNR against photos shows.
 _BITS_FOR_60_DB = (15.5, 8.8, 8.2, 7.2, 8.2, 5.2, 5.4, 5.4)
 _NUMBERS = (3, 3, 3, 1, *(3 * count for count in BANDS))
 _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
@@ -20,8 +20,8 @@ _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
 class Table:
     """Bits of one number of positions, log scales, quaternions and opacity, then of each band of harmonics.
 
-    Of harmonics, the constant ones included, these are the bits of the brightness; the two differences of
-    colours have two fewer, for they are a tenth of the energy. Raises ValueError for what no table is.
+    For harmonics, the constant ones included, these are the bits of the brightness; the two differences of
+    colours, which have a tenth of the energy, get two fewer. Raises ValueError for bits out of range.
     """
 
     bits: tuple[int, ...]
@@ -39,17 +39,17 @@ class Table:
 
     @staticmethod
     def short() -> Table:
-        """A still smaller one of SH degree 0, for places where every byte is dear: about 40 dB."""
+        """A still smaller table of SH degree 0, for payloads: about 40 dB."""
         return Table(tuple(each - 2 for each in _FLOOR[:5]))
 
     @staticmethod
-    def of_size(bits: int, sh_degree: int, least: Table | None = None) -> Table | None:
-        """The table for records of at most `bits` that distorts least; None if not even the floor fits.
+    def of_size(bits: int, sh_degree: int, start: Table | None = None) -> Table | None:
+        """The table for records of at most `bits` with the least error; None if `start` does not fit.
 
-        Bits are given one by one to the attribute for which one more takes away the most error per bit,
-        beginning with those of `least`, by default the floor.
+        `start`: by default the floor. Each further bit goes to the attribute that it takes the most error
+        from.
         """
-        table = least or Table.floor(sh_degree)
+        table = start or Table.floor(sh_degree)
         while (room := bits - table.total) >= 0:
             given = table.bits
             grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= room and each < MAX_BITS]
@@ -65,7 +65,7 @@ class Table:
 
     @property
     def total(self) -> int:
-        """Bits of a record: besides the numbers one for outliers, and two for quaternions."""
+        """Bits of a record: its numbers, one for outliers, and two for the largest part of the quaternion."""
         numbers = sum(each * count for each, count in zip(self.bits, _NUMBERS, strict=False))
         return 3 + numbers - 2 * CHROMA_FEWER * sum(BANDS[: self.sh_degree + 1])
 

@@ -1,6 +1,6 @@
 """A model as one string of bytes, for channels that carry all of it or nothing.
 
-    Gaussians (4 bytes), SH degree (1), step of harmonics (4), codec (see `quantise`),
+    number of Gaussians (4 bytes), SH degree (1), step of harmonics (4), codec (see `quantise`),
     columns of codes, compressed by zstd
 
 Gaussians are sorted along a Z-order curve, which keeps the differences between neighbouring positions small.
@@ -31,8 +31,8 @@ from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import check_count, in_morton_order
-from keyss.methods.records.packing import Bytes, Codes, codes_of_records, records_of_codes
-from keyss.methods.records.quantise import Codec
+from keyss.methods.records.lines import Codes
+from keyss.methods.records.quantise import Bytes, Codec
 from keyss.methods.records.table import Table
 
 MAX_GAUSSIANS = 1 << 22
@@ -41,7 +41,7 @@ _HEAD = struct.Struct("<IBf")
 _STEP, _HALVED = 0.06, 20  # of harmonics at the usual bits; with so many more bits it is half as large
 _LARGEST = 127  # code of a harmonic
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
-_FINER = 6  # half octaves by which a step is finer or coarser, at most
+_FINER = 6  # half octaves by which a step may be finer or coarser
 _WINDOW_LOG = 22
 _OWN_BLOCK = 256  # bytes of a plane that begins a block of its own
 # The header of every frame, which is not stored: no size, no checksum, and this window.
@@ -50,14 +50,14 @@ _POSITIONS = range(3, 6)  # among the columns of a layout
 
 
 class Precision(NamedTuple):
-    """How finely a model is coded."""
+    """The table and the step that a model is encoded with."""
 
     table: Table  # of SH degree 0
     step: float  # of harmonics, below 1
 
     @staticmethod
     def of_size(bits: int) -> Precision:
-        """With at most USUAL_BITS to MAX_BITS for all of a Gaussian but harmonics, before packing."""
+        """At most `bits` per Gaussian, harmonics and compression not counted; USUAL_BITS to MAX_BITS."""
         table = Table.of_size(bits, 0, Table.short())
         if table is None:
             raise ValueError(f"expected at least {Table.short().total} bits, got {bits}")
@@ -65,16 +65,17 @@ class Precision(NamedTuple):
 
 
 def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
-    """`model` with the usual precision, or another."""
+    """`model` as bytes, by default with the usual precision."""
     table, step = precision or Precision.of_size(USUAL_BITS)
     step = float(np.float32(step))
     model = in_morton_order(model)
     plain = model.with_sh_degree(0)
     codec = Codec.fit(plain, table)
-    records = codec.encode(plain)
-    columns = codes_of_records(records, table.layout)
-    planes = [plane for i, each in enumerate(columns) for plane in _planes(each, table.layout[i][1], i)]
-    planes += _harmonics(model, codec.decode(records), step)
+    columns = codec.codes(plain)
+    planes: list[bytes] = []
+    for index, (codes, (_, bits)) in enumerate(zip(columns, table.layout, strict=True)):
+        planes += _planes(codes, bits, index)
+    planes += _harmonics(model, codec.gaussians(columns), step)
     return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + _compress(planes)
 
 
@@ -101,14 +102,14 @@ def decode(data: bytes) -> Gaussians:
         part = np.frombuffer(planes, np.uint8, width, at)
         found.append(_from_planes(part.reshape(columns, -1, count), bits, index))
         at += width
-    plain = codec.decode(records_of_codes(found, layout))
+    plain = codec.gaussians(found)
     codes = np.frombuffer(planes, np.int8, offset=own).reshape(harmonics // 3, 3, count)
     numbers = _from_harmonics(codes, plain, step)
     return replace(plain, sh=torch.cat([plain.sh, numbers], 1))
 
 
 def _compress(planes: Sequence[bytes]) -> bytes:
-    """The blocks of a zstd frame; planes have different statistics, so large ones get blocks of their own."""
+    """The blocks of a zstd frame. Statistics of planes differ: large ones get blocks of their own."""
     parameters = zstandard.ZstdCompressionParameters.from_level(
         19, window_log=_WINDOW_LOG, min_match=6, write_content_size=False
     )
@@ -140,7 +141,7 @@ def _decompress(blocks: bytes, size: int) -> bytes:
 def _harmonics(model: Gaussians, plain: Gaussians, step: float) -> list[bytes]:
     """Codes of brightness and two differences for each coefficient above degree 0, a byte per Gaussian.
 
-    `plain`: `model` as it will be decoded, but for these.
+    `plain`: the decoded model of degree 0.
     """
     numbers = model.sh[:, 1:].detach().cpu().numpy().astype(np.float64) @ OPPONENT.T
     finer = _finer(plain)
@@ -165,7 +166,7 @@ def _from_harmonics(codes: npt.NDArray[np.int8], plain: Gaussians, step: float) 
 
 
 def _finer(plain: Gaussians) -> npt.NDArray[np.int64]:
-    """[N] half octaves by which each Gaussian's steps are finer than those of the middle one."""
+    """[N] half octaves by which each Gaussian's steps are finer than those of the median one."""
     scales = np.sort(plain.log_scales.numpy().astype(np.float64), axis=1)
     logits = plain.opacity_logits.numpy().astype(np.float64)
     seen = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)  # nearly the logarithm of the opacity
@@ -183,7 +184,7 @@ def _steps(step: float, finer: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]
 
 
 def _planes(codes: Codes, bits: int, index: int) -> Sequence[bytes]:
-    """Of each column of codes [N, C] the lowest bytes, then the higher ones; positions as differences."""
+    """The lowest bytes of each column of codes [N, C], then the higher ones; differences of positions."""
     if index in _POSITIONS:
         codes = codes.copy()
         codes[1:] -= codes[:-1].copy()
@@ -193,7 +194,7 @@ def _planes(codes: Codes, bits: int, index: int) -> Sequence[bytes]:
 
 
 def _from_planes(planes: Bytes, bits: int, index: int) -> Codes:
-    """[N, C] codes of the planes [C, bytes, N]; the inverse of `_planes`."""
+    """[N, C] codes from planes [C, bytes, N]; the inverse of `_planes`."""
     codes = np.zeros((planes.shape[2], planes.shape[0]), np.uint32)
     for plane in range(planes.shape[1]):
         codes |= planes[:, plane].T.astype(np.uint32) << np.uint32(8 * plane)
