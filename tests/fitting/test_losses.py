@@ -4,8 +4,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from keyss.fitting import Target, photometric_loss, ssim
-from keyss.fitting.losses import ssim_torch
+from keyss.fitting import Target, photometric_loss, ssim, ssim_torch
 
 
 def _images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,9 +8,8 @@ from .checkpoint import (
 from .config import PRESETS as PRESETS, FitConfig as FitConfig
 from .density import (
     CappedStrategy as CappedStrategy,
-    Drawn as Drawn,
+    Rendered as Rendered,
     combine_densification as combine_densification,
-    draw_views as draw_views,
 )
 from .image_metrics import (
     ImageQuality as ImageQuality,
@@ -20,13 +19,19 @@ from .image_metrics import (
     subsample_views as subsample_views,
 )
 from .loop import Interrupted as Interrupted, TrainingRun as TrainingRun, train as train
-from .losses import Target as Target, photometric_loss as photometric_loss, ssim as ssim
+from .losses import (
+    Target as Target,
+    photometric_loss as photometric_loss,
+    ssim as ssim,
+    ssim_torch as ssim_torch,
+)
 from .parameters import (
     Optimizers as Optimizers,
     Parameters as Parameters,
     initial_gaussians as initial_gaussians,
     initial_points as initial_points,
     make_optimizers as make_optimizers,
+    set_rates as set_rates,
     to_gaussians as to_gaussians,
     to_parameters as to_parameters,
 )

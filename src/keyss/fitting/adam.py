@@ -1,8 +1,7 @@
 """Adam with a learning rate for each number of a row, in one pass over memory on a CPU.
 
-It moves all Gaussians, also those that the view does not show. Leaving these out ("selective" Adam,
-Mallick et al. 2024, "Taming 3DGS") saves no time here, because gaps break up the reading of memory, and
-costs quality, see docs/lessons.md.
+It moves all Gaussians, also those outside the view. Skipping these ("selective" Adam, Mallick et al. 2024,
+"Taming 3DGS") saves no time here, because memory is then read with gaps, and costs quality (docs/lessons.md).
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# The kernel may use nothing else of other files: it would outlive their change, see `rendering.cpu.jit`.
+# The cached kernel would miss changes in other files: it uses only these, see `rendering.cpu.jit`.
 from keyss.rendering.cpu import parallel
 from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.simd8 import fetch_add, fused_multiply_add
 
 NUMBERS_PER_JOB = 8192
-# What torch's Adam can do and the kernel cannot.
+# Options of torch's Adam that the kernel lacks.
 OTHER_OPTIONS = ("weight_decay", "amsgrad", "maximize", "capturable", "differentiable")
 
 
@@ -50,16 +49,16 @@ def _adam(
         for i in range(len(p)):
             m[i] += mean_share * (g[i] - m[i])
             v[i] += square_share * (g[i] * g[i] - v[i])
-            # Rounded once, as in CUDA's Adam. Were the step rounded before it is subtracted, numbers that
-            # end near zero would keep trailing zeros, and models from here would be known by them.
+            # Rounded once, as in CUDA's Adam. With a step that is rounded before it is subtracted, numbers
+            # near zero would keep trailing zeros, which would tell models of keyss from others.
             quotient = m[i] / (np.sqrt(v[i]) * root + eps)
             p[i] = fused_multiply_add(-steps[i], quotient, p[i])
 
 
 def _as_written(name: str) -> Any:
-    """A method of torch's optimizers, without what keeps `torch.compile` from it.
+    """A method of torch's optimizers without the wrapper that disables `torch.compile`.
 
-    That would load torch's compiler, for a second, and nothing here is compiled.
+    The wrapper loads torch's compiler, which takes a second.
     """
     method = getattr(torch.optim.Optimizer, name)
     return getattr(method, "__wrapped__", method)
@@ -68,9 +67,9 @@ def _as_written(name: str) -> Any:
 class RowAdam(torch.optim.Adam):
     """torch's Adam (Kingma and Ba 2015) with an optional `lr_scale` in each param group.
 
-    `lr_scale` is a tensor that broadcasts to a row of the parameters ([16, 1] for [N, 16, 3]), by which
-    the learning rate of each number is multiplied. State and other options are torch's. On a CPU the
-    results do not depend on the number of threads.
+    `lr_scale` is a tensor that broadcasts to a row of the parameters ([16, 1] for [N, 16, 3]) and multiplies
+    the learning rate. State and other options are torch's. On a CPU, results do not depend on the number of
+    threads.
     """
 
     add_param_group = _as_written("add_param_group")
@@ -80,14 +79,14 @@ class RowAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One step for all parameters that have a gradient; there are no closures."""
+        """Take one step for all parameters with a gradient; closures are not supported."""
         if all(_for_kernel(group) for group in self.param_groups):
             for group in self.param_groups:
                 for parameter in group["params"]:
                     if parameter.grad is not None:
                         self._step_on_cpu(parameter, group)
             return
-        # Torch's step at the full rate, then back by what is too much of it.
+        # Take torch's step at the full rate, then undo the excess.
         scaled = [group for group in self.param_groups if "lr_scale" in group]
         before = [[parameter.clone() for parameter in group["params"]] for group in scaled]
         super().step()
@@ -109,13 +108,13 @@ class RowAdam(torch.optim.Adam):
             rates *= group["lr_scale"]
         assert parameter.grad is not None
         tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"], rates)
-        flat = (each.view(-1).numpy() for each in tensors)
+        flat = (tensor.view(-1).numpy() for tensor in tensors)
         constants = (1 - beta1, 1 - beta2, (1 - beta2**step) ** -0.5, group["eps"])
-        parallel.run(_adam, *flat, tuple(np.float32(each) for each in constants))
+        parallel.run(_adam, *flat, tuple(map(np.float32, constants)))
 
 
 def _for_kernel(group: dict[str, Any]) -> bool:
-    """Whether the kernel can do what the group asks for."""
+    """True if the kernel supports the group."""
     return not any(group[option] for option in OTHER_OPTIONS) and all(
         parameter.device.type == "cpu" and parameter.dtype == torch.float32 and parameter.is_contiguous()
         for parameter in group["params"]

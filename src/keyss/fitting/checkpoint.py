@@ -19,24 +19,22 @@ if TYPE_CHECKING:
     from keyss.fitting.parameters import Optimizers, Parameters
 
 State = dict[str, Tensor]
+_UNREADABLE = (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError)
 
 
 def save_checkpoint(path: Path, tensors: State, meta: Mapping[str, Any]) -> None:
-    """Atomically write `tensors` and the JSON-able `meta`. Raises OutputError.
-
-    The file does not depend on the device: a run goes on from it wherever it is loaded.
-    """
+    """Atomically write `tensors` and the JSON-able `meta`; any device can load them. Raises OutputError."""
     write_bytes(path, pack_state(tensors, meta))
 
 
 def pack_state(tensors: State, meta: Mapping[str, Any]) -> bytes:
-    """`tensors` and the JSON-able `meta` in one string of bytes."""
+    """Serialise `tensors` and the JSON-able `meta`."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     return safetensors.torch.save(contiguous, {"meta": json.dumps(meta)})
 
 
 def unpack_state(data: bytes) -> tuple[State, dict[str, Any]]:
-    """What `pack_state` gave, on the CPU."""
+    """Restore the result of `pack_state`, on the CPU."""
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
     return safetensors.torch.load(data), json.loads(header["__metadata__"]["meta"])
@@ -48,18 +46,16 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         with safetensors.safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {})["meta"])
             return {name: file.get_tensor(name) for name in file.keys()}, meta  # noqa: SIM118
-    except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
+    except _UNREADABLE as error:
         raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
 
 
 def steps_done(path: Path | None) -> int:
-    """Steps that a checkpoint has; 0 without one, or with one that `load_checkpoint` refuses."""
-    if path is None or not path.exists():
-        return 0
+    """Training steps of a checkpoint; 0 without one, or if it cannot be read."""
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             return int(json.loads((file.metadata() or {})["meta"])["iteration"])
-    except (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError):
+    except _UNREADABLE:  # TypeError: no path
         return 0
 
 
@@ -74,7 +70,7 @@ def pack_optimizers(parameters: Parameters, optimizers: Optimizers) -> State:
 
 
 def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimizers) -> None:
-    """Put back what `pack_optimizers` gave, whatever the number of Gaussians now is."""
+    """Restore the result of `pack_optimizers`, whatever the present number of Gaussians is."""
     for name, old in list(parameters.items()):
         parameter = torch.nn.Parameter(state[name].to(old.device))
         optimizer = optimizers[name]
@@ -92,7 +88,7 @@ def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimize
 
 
 def pack_network(prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> State:
-    """Weights and Adam moments of a network that `optimizer` trains and nothing else."""
+    """Weights and Adam moments of a network with an optimizer of its own."""
     state: State = {f"{prefix}.{name}": value for name, value in network.state_dict().items()}
     for index, moments in optimizer.state_dict()["state"].items():
         state |= {f"{prefix}_adam.{index}.{name}": value for name, value in moments.items()}
@@ -102,7 +98,7 @@ def pack_network(prefix: str, network: torch.nn.Module, optimizer: torch.optim.O
 def unpack_network(
     state: State, prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
-    """Put back what `pack_network` gave."""
+    """Restore the result of `pack_network`."""
     start = f"{prefix}."
     network.load_state_dict(
         {name.removeprefix(start): value for name, value in state.items() if name.startswith(start)}
@@ -116,11 +112,12 @@ def unpack_network(
 
 
 def pack_density(state: Mapping[str, Any]) -> State:
-    """The running statistics of a strategy."""
+    """Statistics of a strategy."""
     return {f"density.{key}": value for key, value in state.items() if isinstance(value, Tensor)}
 
 
 def unpack_density(state: State, density: dict[str, Any], device: torch.device) -> None:
+    """Restore the result of `pack_density`."""
     for key in density:
         if f"density.{key}" in state:
             density[key] = state[f"density.{key}"].to(device)

@@ -1,4 +1,4 @@
-"""What a training run can be told, with defaults that suit most scenes."""
+"""Settings of a training run, with defaults for most scenes."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from dataclasses import dataclass, replace
 
 from keyss.core.errors import UsageError
 
-MAX_SEED = 2**48 - 1  # every reader of JSON takes it as it is
+MAX_SEED = 2**48 - 1  # every reader of JSON represents it exactly
 MAX_VIEWS = 10**4  # of a step
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """Plain 3DGS (Kerbl et al. 2023, section 5 and appendix), its schedule in fractions of the run.
+    """Plain 3DGS (Kerbl et al. 2023, section 5 and appendix), with a schedule in fractions of the run.
 
-    Fractions instead of the original's absolute step numbers keep short runs whole: 3,000 iterations
-    grow, reach full SH degree and settle just as 30,000 do.
+    The original has absolute step numbers. With fractions, 3,000 iterations grow, reach the full SH degree
+    and settle as 30,000 do.
     """
 
     iterations: int = 3000
-    max_gaussians: int = 30_000  # cap; pruning always makes room below it
+    max_gaussians: int = 30_000  # cap
     sh_degree: int = 3
     ssim_weight: float = 0.2  # lambda of the photometric loss
-    # Without one, a run draws its own from the system when it begins: nobody else can repeat that run.
+    # None: a run samples one from the system, and nobody else can repeat the run.
     seed: int | None = None
-    # Views of a step, of whose losses the mean is minimised, on all processes together (`fitting.ranks`);
-    # None: one on each. Rates are per step whatever their number (docs/scaling.md).
+    # Views of a step, whose mean loss is minimised, over all processes (`fitting.ranks`); None: one for each
+    # process. Rates are per step and do not depend on it (docs/scaling.md).
     views_per_step: int | None = None
 
     means_rate: float = 1.6e-4  # times the scene's extent, decays to 1 % of it
@@ -37,12 +37,11 @@ class FitConfig:
     sh0_rate: float = 2.5e-3
     shN_rate: float = 1.25e-4
 
-    # Share of the run, at its end, over which all rates fall to a tenth: at constant ones Gaussians jitter
-    # around their optimum. A model that is trained on, and does not grow, gains by it; others do not
-    # (docs/lessons.md).
+    # Share of the run, at its end, over which all rates decay to a tenth: at constant rates, Gaussians jitter
+    # around their optimum. Only models that do not grow gain by it (docs/lessons.md).
     settle: float = 0.0
 
-    grow_start: float = 1 / 6  # densification begins here, or at 500 iterations if that is earlier
+    grow_start: float = 1 / 6  # densification starts here, or at 500 iterations if that is earlier
     grow_stop: float = 0.6
     grow_every: int = 100
     grow_gradient: float = 2e-4  # mean screen-space gradient norm above which a Gaussian is cloned or split
@@ -68,25 +67,25 @@ class FitConfig:
             raise UsageError(f"`seed`: expected 0 to {MAX_SEED}, got {self.seed}")
 
     def seeded(self, otherwise: int | None = None) -> FitConfig:
-        """The same with a seed: its own, else `otherwise`, else one that the system draws now."""
+        """The config with a seed: its own, else `otherwise`, else a random one of the system."""
         if self.seed is not None:
             return self
         return replace(self, seed=secrets.randbelow(MAX_SEED + 1) if otherwise is None else otherwise)
 
     @property
     def known_seed(self) -> int:
-        """The seed of a run that has begun. Raises ValueError without one: see `seeded`."""
+        """The seed. Raises ValueError without one: see `seeded`."""
         if self.seed is None:
-            raise ValueError("a run begins with a seed: `seeded` draws one")
+            raise ValueError("expected a config with a seed: `seeded` samples one")
         return self.seed
 
     def seed_of(self, use: str) -> int:
-        """A seed for one part of a run, from which nothing follows of those of the other parts."""
+        """A seed for one part of a run, which does not reveal the seeds of other parts."""
         digest = hashlib.sha256(f"keyss/v1/seed {self.known_seed} {use}".encode()).digest()
         return int.from_bytes(digest[:8], "little") & MAX_SEED
 
     def sh_degree_at(self, iteration: int) -> int:
-        """SH degree in use: one more every 1,000 iterations or every sixth of a shorter run."""
+        """SH degree in use, which rises every 1,000 iterations or every sixth of a shorter run."""
         return min(self.sh_degree, iteration // max(1, min(1000, self.iterations // 6)))
 
 

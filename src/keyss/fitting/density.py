@@ -16,22 +16,20 @@ from keyss.fitting.ranks import here
 
 T = TypeVar("T")
 
-# A render's meta, the indices of the Gaussians it was made of (None: all), the weight of its loss.
-Drawn = tuple[dict[str, Any], Tensor | None, float]
+# The meta of a render, the indices of its Gaussians (None: all), and the weight of its loss.
+Rendered = tuple[dict[str, Any], Tensor | None, float]
 
-# What a DefaultStrategy sums up from step to step: norms of screen-space gradients [N], and of how many
-# renders [N].
+# Sums of DefaultStrategy over steps: norms of screen-space gradients [N], and numbers of renders [N].
 _STATISTICS = ("grad2d", "count")
 
 
 class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     """DefaultStrategy that never exceeds `max_gaussians`.
 
-    Where more Gaussians ask to be cloned or split than there is room for, those with the largest
-    screen-space gradients go first. Pruning goes on at the cap, so that it always makes room again.
-    `opacity_for_pruning` says how visible a Gaussian is ([N] in [0, 1]; by default its own opacity): in
-    hiding it is the largest opacity over all scenes, so that none loses what only it needs. `freeze`: at
-    the cap nothing is pruned either.
+    If more Gaussians are to be cloned or split than there is room for, those with the largest screen-space
+    gradients are chosen. Pruning continues at the cap and makes room again, unless `freeze`.
+    `opacity_for_pruning` gives the visibility of each Gaussian, [N] in [0, 1], by default its opacity. In
+    hiding it is the maximum opacity over all scenes: no scene loses Gaussians that only it needs.
     """
 
     def __init__(
@@ -53,46 +51,58 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         self.opacity_for_pruning = opacity_for_pruning
         self.freeze = freeze
 
-    def over_ranks(
-        self, loss: Tensor, trained: Iterable[Tensor], params: Parameters, info: dict[str, Any] | None
+    def backward(
+        self,
+        views: Sequence[T],
+        loss_at: Callable[[T], tuple[Tensor, list[Rendered]]],
+        trained: Iterable[Tensor],
+        params: Parameters,
     ) -> tuple[Tensor, dict[str, Any]]:
-        """After backward: the gradients of all ranks in `trained`, and the sum of their losses.
+        """Compute the gradients of the mean loss of a step's `views` in `trained`, over all ranks.
 
-        And `info`, the meta of this rank's renders, as `step_post_backward` takes it, with what all ranks
-        have seen; None: nothing grows.
+        `loss_at` renders one view and returns its loss and the renders that count for densification. Returns
+        the mean loss, and the info that `step_post_backward` takes.
         """
-        ranks = here()
+        ranks, count = here(), len(params["means"])
+        losses: list[Tensor] = []
+        renders: list[Rendered] = []
+        for view in ranks.mine(views):
+            loss, rendered = loss_at(view)
+            for meta, _, _ in rendered:
+                meta["means2d"].retain_grad()
+            (loss / len(views)).backward()
+            losses.append(loss.detach() / len(views))
+            renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
+        total, info = torch.stack(losses).sum(), combine_densification(renders, count)
         if ranks.count == 1:
-            return loss, info or {}
-        if info is None:
-            return ranks.sum(trained, [loss])[0], {}
-        found: dict[str, Any] = dict.fromkeys(_STATISTICS)
-        self._update_state(params, found, info)
-        loss, *sums = ranks.sum(trained, [loss, *(found[name] for name in _STATISTICS)])
-        return loss, dict(zip(_STATISTICS, sums, strict=True))
+            return total, info
+        statistics: dict[str, Any] = dict.fromkeys(_STATISTICS)
+        self._update_state(params, statistics, info)
+        total, *sums = ranks.sum(trained, [total, *statistics.values()])
+        return total, dict(zip(_STATISTICS, sums, strict=True))
 
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        """By the meta of renders, or by the statistics of all ranks' renders.
+        """Add the statistics of renders, given by their meta, or summed over all ranks.
 
-        Of renders it adds up what gsplat does, without picking out the Gaussians that are seen: on a CPU that
-        takes twice as long.
+        The sums are those of gsplat, which selects the visible Gaussians first: on a CPU, that takes twice as
+        long.
         """
-        known = set(_STATISTICS) <= set(info)
-        for values in [[info[name] for name in _STATISTICS]] if known else _seen_by_cameras(info):
-            for name, each in zip(_STATISTICS, values, strict=True):
-                state[name] = each if state[name] is None else state[name] + each
+        summed = set(_STATISTICS) <= set(info)
+        for values in [[info[name] for name in _STATISTICS]] if summed else _camera_statistics(info):
+            for name, value in zip(_STATISTICS, values, strict=True):
+                state[name] = value if state[name] is None else state[name] + value
 
     @torch.no_grad()
     def _grow_gs(
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int
     ) -> tuple[int, int]:
         gradients = state["grad2d"] / state["count"].clamp_min(1)
-        wanting = gradients > self.grow_grad2d
+        growing = gradients > self.grow_grad2d
         room = max(0, self.max_gaussians - len(gradients))
-        if int(wanting.sum()) > room:
-            refused = torch.ones_like(wanting)
+        if int(growing.sum()) > room:
+            refused = torch.ones_like(growing)
             refused[gradients.topk(room).indices] = False
             state["grad2d"][refused] = 0
         return super()._grow_gs(params, optimizers, state, step)  # type: ignore[no-any-return]
@@ -109,50 +119,29 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         return count
 
 
-def _seen_by_cameras(info: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
-    """`_STATISTICS` of each camera of a render's meta; gradients are those on a screen from -1 to 1."""
+def _camera_statistics(info: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
+    """`_STATISTICS` of each camera of a render; gradients are for a screen from -1 to 1."""
     gradients = info["means2d"].grad  # [C, N, 2]
     halves = gradients.new_tensor([info["width"] / 2, info["height"] / 2]) * info["n_cameras"]
     for gradient, radii in zip(gradients, info["radii"], strict=True):
-        seen = (radii[:, 0] > 0) & (radii[:, 1] > 0)
+        visible = (radii[:, 0] > 0) & (radii[:, 1] > 0)
         norms = torch.linalg.vector_norm(gradient * halves, dim=-1)
-        yield torch.where(seen, norms, 0), seen.float()
+        yield torch.where(visible, norms, 0), visible.float()
 
 
-def draw_views(
-    views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Drawn]]]
-) -> tuple[Tensor, list[Drawn]]:
-    """The mean loss of a step's `views`, and the renders that density control goes by.
-
-    Of both this rank's share; its backward pass is done. `loss_at` draws a view.
-    """
-    share = 1 / len(views)
-    losses: list[Tensor] = []
-    found: list[Drawn] = []
-    for view in here().mine(views):
-        loss, drawn = loss_at(view)
-        for meta, _, _ in drawn:
-            meta["means2d"].retain_grad()
-        (share * loss).backward()
-        losses.append(share * loss.detach())
-        found += [(meta, indices, share * weight) for meta, indices, weight in drawn]
-    return torch.stack(losses).sum(), found
-
-
-def combine_densification(drawn: Sequence[Drawn], count: int) -> dict[str, Any]:
+def combine_densification(renders: Sequence[Rendered], count: int) -> dict[str, Any]:
     """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
 
-    `drawn` holds for each render its meta, the indices of the Gaussians it was made of (None: all
-    `count`), and the weight of its loss, by which its gradients are divided to be as large as those that
-    the thresholds of plain 3DGS are meant for.
+    The gradients of each render, of all `count` Gaussians or of some, are divided by the weight of its loss:
+    the thresholds of plain 3DGS are meant for gradients of that size.
     """
-    if len(drawn) == 1 and drawn[0][1] is None and drawn[0][2] == 1:
-        return drawn[0][0]  # as plain 3DGS has it
-    device = drawn[0][0]["means2d"].device
-    gradients = torch.zeros(len(drawn), count, 2, device=device)
-    radii = torch.zeros(len(drawn), count, 2, device=device)
-    width, height = drawn[0][0]["width"], drawn[0][0]["height"]
-    for row, (meta, indices, weight) in enumerate(drawn):
+    if len(renders) == 1 and renders[0][1] is None and renders[0][2] == 1:
+        return renders[0][0]
+    device = renders[0][0]["means2d"].device
+    gradients = torch.zeros(len(renders), count, 2, device=device)
+    radii = torch.zeros(len(renders), count, 2, device=device)
+    width, height = renders[0][0]["width"], renders[0][0]["height"]
+    for row, (meta, indices, weight) in enumerate(renders):
         where = slice(None) if indices is None else indices
         size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
         gradients[row, where] = meta["means2d"].grad[0] * (size / weight)

@@ -1,4 +1,4 @@
-"""How near a picture is to a photo, as the training loop and the results report it."""
+"""Image quality: PSNR and SSIM of renders against photos."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ def psnr(image: Tensor, reference: Tensor) -> float:
 
 
 def view_quality(image: Tensor, photo: Tensor) -> ImageQuality:
-    """Of a picture [H, W, 3] beside its photo, both in [0, 1]."""
+    """Quality of a render against its photo, both [H, W, 3] in [0, 1]."""
     return ImageQuality(psnr(image, photo), float(ssim(image, Target.of(photo))))
 
 
 @torch.no_grad()
 def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> ImageQuality:
-    """Mean PSNR and SSIM of the views' renders, rounded to no fewer than 32 bits, against their photos."""
-    found = [
+    """Mean PSNR and SSIM of the views' float32 renders against their photos."""
+    qualities = [
         view_quality(
             render(gaussians, view.camera, background).clamp(0, 1),
             view.image.to(gaussians.device).float() / 255,
         )
         for view in views
     ]
-    return mean_quality(found)
+    return mean_quality(qualities)
 
 
 def mean_quality(views: Sequence[ImageQuality]) -> ImageQuality:
     """The means over the views."""
-    return ImageQuality(fmean(each.psnr for each in views), fmean(each.ssim for each in views))
+    return ImageQuality(fmean(view.psnr for view in views), fmean(view.ssim for view in views))
 
 
 @torch.no_grad()
@@ -57,7 +57,7 @@ def mean_psnr(gaussians: Gaussians, views: Sequence[View], background: Tensor) -
     """Mean PSNR in dB of the views' renders against their photos."""
     device = gaussians.device
     values = [psnr(render(gaussians, v.camera, background), v.image.to(device).float() / 255) for v in views]
-    return sum(values) / len(values)
+    return fmean(values)
 
 
 def subsample_views(views: Sequence[View], count: int) -> tuple[View, ...]:

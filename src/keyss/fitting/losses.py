@@ -1,7 +1,7 @@
 """The photometric loss of 3DGS: (1 - lambda) L1 + lambda (1 - SSIM) (3DGS, eq. 7; KeySS, eq. 4 to 6).
 
 SSIM is the 3DGS variant: 11x11 Gaussian window of sigma 1.5, zero padding, mean over all pixels and
-channels. The statistics of the target image, which never change, are kept in a `Target`.
+channels. A `Target` stores the statistics of the target image, which never change.
 
 On a CPU numba kernels give the value and its gradient in one pass, 20 to 50 times faster than torch's
 convolutions. With zero padding the symmetric window is its own adjoint, so the gradient of the mean SSIM is
@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# The kernels may use nothing else of other files: they would outlive their change, see `rendering.cpu.jit`.
+# Cached kernels would miss changes in other files: they use only these, see `rendering.cpu.jit`.
 from keyss.rendering.cpu import memory, parallel
 from keyss.rendering.cpu.jit import finite_kernel
 from keyss.rendering.cpu.simd8 import fetch_add
@@ -35,7 +35,7 @@ ROWS_PER_JOB = 32
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """SSIM's window over the last two axes of [B, H, W], zeros outside, in torch."""
+    """Blur the last two axes of [B, H, W] with SSIM's window, zeros outside, in torch."""
     window = torch.from_numpy(WINDOW).to(planes)
     rows = F.conv2d(planes[:, None], window.view(1, 1, 1, -1), padding=(0, RADIUS))
     return F.conv2d(rows, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
@@ -43,7 +43,7 @@ def _blur(planes: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Target:
-    """An image to compare with, and its SSIM statistics."""
+    """A target image and its SSIM statistics."""
 
     image: Tensor  # [H, W, 3] in [0, 1]
     planes: Tensor  # [3, H, W], the same values
@@ -68,10 +68,10 @@ class Target:
 
 @finite_kernel
 def _blur_cpu(counter: Any, source: Any, result: Any) -> None:
-    """Separable 11x11 window over the last two axes of [B, H, W], zeros outside.
+    """Blur the last two axes of [B, H, W] with the separable 11x11 window, zeros outside.
 
-    Both passes run down one row at a time while it is in the first-level cache, with all eleven taps
-    in one expression, which LLVM turns into full-width fused multiply-adds.
+    Both passes process one row at a time while it is in the first-level cache, with all eleven taps in one
+    expression, which LLVM turns into full-width fused multiply-adds.
     """
     count, height, width = source.shape
     jobs_per_plane = (height + ROWS_PER_JOB - 1) // ROWS_PER_JOB
@@ -134,7 +134,7 @@ def _products(counter: Any, image: Any, target: Any, stacked: Any) -> None:
 
 @finite_kernel
 def _similarity(counter: Any, stats: Any, target_mean: Any, target_variance: Any, row_sums: Any) -> None:
-    """Row sums of the SSIM map; its derivatives to mean, square, product overwrite `stats` [9, H, W]."""
+    """Row sums of the SSIM map. `stats` [9, H, W] becomes its derivatives to mean, square and product."""
     _, height, width = target_mean.shape
     while True:
         job = fetch_add(counter, 0, 1)
@@ -166,8 +166,8 @@ def _chain(
 ) -> None:
     """gradient [H, W, 3] of scales[0] sum SSIM + scales[1] sum |x - y|, from SSIM's blurred derivatives.
 
-    row_sums [H] become those of |x - y|. Channel by channel into a row that stays in the cache, and only then
-    side by side: LLVM makes vectors of either, and of both in one loop it does not.
+    row_sums [H] becomes the sums of |x - y|. One loop computes the channels into a cached row, a second one
+    interleaves them: LLVM vectorises each of the two loops, but not a single one for both.
     """
     ssim_scale, l1_scale = scales
     _, height, width = target.shape
@@ -180,10 +180,10 @@ def _chain(
         for c in range(3):
             line = slopes[c]
             for x in range(width):
-                value, wanted = image[y, x, c], target[c, y, x]
+                value, other = image[y, x, c], target[c, y, x]
                 slope = derivatives[c, y, x] + TWO * value * derivatives[3 + c, y, x]
-                slope = ssim_scale * (slope + wanted * derivatives[6 + c, y, x])
-                difference = value - wanted
+                slope = ssim_scale * (slope + other * derivatives[6 + c, y, x])
+                difference = value - other
                 total += abs(difference)
                 sign = np.float32(difference > 0) - np.float32(difference < 0)
                 line[x] = slope + sign * l1_scale
@@ -222,7 +222,7 @@ class _PhotometricCpu(torch.autograd.Function):
 
 
 def ssim_torch(image: Tensor, target: Target) -> Tensor:
-    """`ssim` in plain torch, on any device and in any precision: the readable form of the kernels."""
+    """`ssim` in plain torch, on any device and in any precision: the reference of the kernels."""
     planes = image.permute(2, 0, 1)
     mean, square, product = _blur(torch.cat([planes, planes * planes, planes * target.planes])).chunk(3)
     variance = square - mean * mean

@@ -1,7 +1,7 @@
-"""A 3DGS model as optimisers and gsplat's strategies want it: a dict of parameters with an Adam each.
+"""A 3DGS model as gsplat's strategies expect it: a dict of parameters, each with its Adam.
 
-The names `means quats scales opacities` (scales and opacities still raw) are gsplat's and are used for
-training only. Unlike in gsplat, all SH coefficients are one parameter, so that no step copies them.
+The names `means quats scales opacities` (scales and opacities before their activation) are gsplat's, for
+training only. Unlike in gsplat, all SH coefficients are one parameter, which no step has to concatenate.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
+LAST_RATE = 0.1  # share of the rates at the end of a run that settles
 # Names of parameters, in the order of the fields of `Gaussians`.
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
 
@@ -28,7 +29,7 @@ Optimizers = dict[str, RowAdam]
 
 
 def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
-    """Leaf parameters holding a copy of the Gaussians on `device`."""
+    """Copy the Gaussians into leaf parameters on `device`."""
     contiguous = torch.contiguous_format
     copy = gaussians.detach().to(device).map(lambda tensor: tensor.clone(memory_format=contiguous))
     tensors = (getattr(copy, field.name) for field in fields(copy))
@@ -36,7 +37,7 @@ def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:
-    """The Gaussians that the parameters stand for, attached to their graph."""
+    """The Gaussians of the parameters, attached to their graph."""
     return Gaussians(*(parameters[name] for name in _NAMES))
 
 
@@ -59,12 +60,24 @@ def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) ->
     }
 
 
+def set_rates(optimizers: Optimizers, progress: float, settle: float = 0.0) -> None:
+    """Set the learning rates at `progress`, in [0, 1], of a run.
+
+    The rate of positions decays to 1 % (3DGS), the others to a tenth over the last share `settle` of the run.
+    """
+    late = LAST_RATE ** max(0.0, 1 - (1 - progress) / settle) if settle else 1.0
+    for name, optimizer in optimizers.items():
+        group = optimizer.param_groups[0]
+        initial = group.setdefault("initial_lr", group["lr"])
+        group["lr"] = initial * (0.01**progress if name == "means" else late)
+
+
 def initial_gaussians(
     points: Tensor, colors: Tensor, sh_degree: int, limit: int, generator: torch.Generator
 ) -> Gaussians:
     """3DGS's start: at each sparse point an isotropic Gaussian as wide as the distance to its neighbours.
 
-    points [P, 3] and colors [P, 3] uint8; at most `limit` of them, drawn at random, are used.
+    points [P, 3] and colors [P, 3] uint8; `limit` of them are sampled if there are more.
     """
     if len(points) > limit:
         chosen = torch.randperm(len(points), generator=generator)[:limit].sort().values
@@ -88,9 +101,8 @@ def initial_gaussians(
 def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Points [P, 3] and colours [P, 3] uint8 to start from: the scene's own, or random ones.
 
-    A scene with fewer than 100 points (NeRF-synthetic has none) gets grey ones, drawn uniformly by
-    `generator` from a cube around what the cameras look at, with half the cameras' mean distance as half its
-    edge.
+    A scene with fewer than 100 points (NeRF-synthetic has none) gets grey ones, sampled uniformly from a cube
+    around the focus of the cameras, whose edge is their mean distance from it.
     """
     if len(scene.points) >= 100:
         return scene.points, scene.colors

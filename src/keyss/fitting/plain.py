@@ -13,7 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Drawn, combine_densification, draw_views
+from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import train
 from keyss.fitting.losses import Target, photometric_loss
@@ -21,6 +21,7 @@ from keyss.fitting.parameters import (
     initial_gaussians,
     initial_points,
     make_optimizers,
+    set_rates,
     to_gaussians,
     to_parameters,
 )
@@ -29,22 +30,21 @@ from keyss.fitting.reporting import Reporter
 from keyss.fitting.sampling import Shuffle
 from keyss.rendering import render_with_meta
 
-LAST_RATE = 0.1  # of the rates, reached over the end of a run that settles
-REFIT_SETTLE = 0.5  # share of the run over which a model that is trained on settles
+REFIT_SETTLE = 0.5  # share of a refit over which it settles
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fitted model and how it came about."""
+    """A fitted model and its configuration."""
 
     gaussians: Gaussians  # on the CPU
     config: FitConfig  # with the seed
 
 
 class PlainRun:
-    """The state of a plain 3DGS training and its step.
+    """A plain 3DGS training; see `keyss.fitting.loop.TrainingRun`.
 
-    With a `model` it starts from that one, which keeps the number of its Gaussians.
+    With a `model`, it starts from that model and keeps the number of its Gaussians.
     """
 
     def __init__(
@@ -65,7 +65,6 @@ class PlainRun:
             model = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
         self.parameters = to_parameters(model, device)
         self.optimizers = make_optimizers(self.parameters, config, scene.extent)
-        self.rates = {name: each.param_groups[0]["lr"] for name, each in self.optimizers.items()}
         self.strategy = CappedStrategy(config)
         self.density: dict[str, Any] = self.strategy.initialize_state(scene.extent)
         self.shuffle = Shuffle(len(self.views), self.generator)
@@ -75,35 +74,26 @@ class PlainRun:
 
     def step(self) -> None:
         config = self.config
-        views = [self.views[self.shuffle.draw()] for _ in range(self.views_per_step)]
+        views = [self.views[self.shuffle.sample()] for _ in range(self.views_per_step)]
         self.iteration += 1
         degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
 
-        def loss_at(view: View) -> tuple[Tensor, list[Drawn]]:
+        def loss_at(view: View) -> tuple[Tensor, list[Rendered]]:
             model = to_gaussians(self.parameters)
             image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
             loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
             return loss, [(meta, None, 1.0)]
 
-        total, drawn = draw_views(views, loss_at)
-        seen = combine_densification(drawn, len(self)) if self.grows else None
-        self.loss, seen = self.strategy.over_ranks(total, self.parameters.values(), self.parameters, seen)
-        self._set_rates()
+        trained = self.parameters.values()
+        self.loss, info = self.strategy.backward(views, loss_at, trained, self.parameters)
+        set_rates(self.optimizers, self.iteration / config.iterations, config.settle)
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         if self.grows:
             self.strategy.step_post_backward(
-                self.parameters, self.optimizers, self.density, self.iteration, seen
+                self.parameters, self.optimizers, self.density, self.iteration, info
             )
-
-    def _set_rates(self) -> None:
-        progress = self.iteration / self.config.iterations
-        settle = self.config.settle
-        late = LAST_RATE ** max(0.0, progress / settle - (1 / settle - 1)) if settle else 1.0
-        for name, optimizer in self.optimizers.items():
-            decay = 0.01**progress if name == "means" else late
-            optimizer.param_groups[0]["lr"] = self.rates[name] * decay
 
     def gaussians(self) -> Gaussians:
         return to_gaussians(self.parameters).detach()
@@ -134,7 +124,7 @@ def fit_scene(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> FitResult:
-    """Train plain 3DGS on the training views of `scene`; what is to be resumed needs a seed.
+    """Train plain 3DGS on the training views of `scene`; only a run with a seed can be resumed.
 
     Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a checkpoint of another run.
     """
@@ -156,9 +146,9 @@ def refit_model(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Gaussians:
-    """Train `model` on to the training views of `scene`, with as many Gaussians as it has.
+    """Train `model` further on the training views of `scene`, without growing or pruning it.
 
-    `rate`: a factor on all rates of `config`, whose degree and cap do not count. Raises as `fit_scene`.
+    `rate`: a factor on all rates of `config`, whose SH degree and cap are ignored. Raises as `fit_scene`.
     """
     rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
     config = replace(config.seeded(), sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
@@ -176,7 +166,7 @@ def _train(
     resume: bool,
     reporter: Reporter | None,
 ) -> None:
-    """See `train`. `inputs`: digests of what the run starts from."""
+    """See `train`. `inputs`: digests of the scene and of the given model."""
     config = run.config
     train(
         run,
@@ -191,11 +181,10 @@ def _train(
     )
 
 
-def without_faint(model: Gaussians, least: float) -> Gaussians:
-    """`model` without what fell below the limit of pruning after density control had stopped.
+def without_faint(model: Gaussians, min_opacity: float) -> Gaussians:
+    """`model` without Gaussians that fell below the limit of pruning after density control stopped.
 
-    Files of the original trainer have nothing there either, and what hides something must not be known by
-    having nothing.
+    The original trainer leaves none either, and their absence must not tell models with secrets from others.
     """
-    kept = model.opacities >= least
+    kept = model.opacities >= min_opacity
     return model[kept] if kept.any() else model

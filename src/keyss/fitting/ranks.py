@@ -1,13 +1,13 @@
-"""One training on several processes, as `torchrun` starts them: each draws its share of a step's views.
+"""One training in several processes of `torchrun`: each renders its share of a step's views.
 
-Every process, called by its *rank*, holds the whole model, and all hold the same. Rank 0 begins or resumes
-and gives its state to the others. All of them shuffle the photos alike and take their own shares of the
-views. What they find, gradients and what density control goes by, is summed in one message before anything is
-changed by it, so that all take the same step: that of one process which draws all the views (data
-parallelism; for 3DGS: Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training", section 3).
+Every process, identified by its *rank*, holds the same whole model. Rank 0 starts or resumes the training and
+sends its state to the others. All shuffle the photos alike and take their own shares of the views. Gradients
+and statistics of density control are summed in one message before they change anything, and all ranks take
+the step of one process that renders all views (data parallelism; for 3DGS: Zhao et al. 2024, "On Scaling Up
+3D Gaussian Splatting Training", section 3).
 
-Tensors on GPUs are summed by NCCL. Everything else goes over gloo, which also notices a process that has
-ended. Without torchrun there is one rank, and nothing here does anything.
+NCCL sums tensors on GPUs. Everything else goes over gloo, which also notices when a process ends. Without
+torchrun there is one rank, and all of this does nothing.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from keyss.core.errors import BackendError, OtherProcessError, UsageError
 
 T = TypeVar("T")
 
-# How long the others wait for rank 0 where it works alone: while it looks at test views, or measures.
+# How long the others wait for rank 0 while it evaluates or measures.
 _PATIENCE = timedelta(hours=2)
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """All processes of a run, as one of them sees them; without others all methods give what they get.
+    """The rank of this process among all; in a single process, all methods return their argument.
 
-    Raises OtherProcessError from whatever waits for another process that has ended.
+    Methods that wait for a process that has ended raise OtherProcessError.
     """
 
     rank: int = 0
@@ -44,31 +44,31 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this process answers for the run: it writes the files and shows the progress."""
+        """True for the process that writes files and displays progress."""
         return self.rank == 0
 
-    def views(self, asked: int | None) -> int:
-        """Views of a step, on all ranks together; one on each unless others are asked for.
+    def views(self, views_per_step: int | None) -> int:
+        """Views of a step on all ranks together; None: one on each.
 
-        Raises UsageError where they cannot be shared out evenly.
+        Raises UsageError if they cannot be divided evenly.
         """
-        views = self.count if asked is None else asked
+        views = self.count if views_per_step is None else views_per_step
         if views % self.count:
             raise UsageError(
                 f"`views_per_step`: expected a multiple of the {self.count} processes, got {views}"
             )
         return views
 
-    def mine(self, drawn: Sequence[T]) -> Sequence[T]:
-        """This rank's share of what all ranks have drawn alike."""
-        share = len(drawn) // self.count
-        return drawn[self.rank * share : (self.rank + 1) * share]
+    def mine(self, views: Sequence[T]) -> Sequence[T]:
+        """This rank's share of the views of a step."""
+        share = len(views) // self.count
+        return views[self.rank * share : (self.rank + 1) * share]
 
     def sum(self, trained: Iterable[Tensor], others: Sequence[Tensor]) -> list[Tensor]:
-        """Sums over all ranks: gradients of `trained` become theirs, those of `others` are returned.
+        """Sum the gradients of `trained` in place, and return the sums of `others`, in one message.
 
-        All float32 on one device, in one message. A parameter that has a gradient on no rank has none
-        afterwards, and an optimiser passes it over as it does in one process.
+        All are float32 on one device. A parameter without a gradient on any rank has none afterwards, and
+        optimisers skip it as in one process.
         """
         if self.count == 1:
             return list(others)
@@ -84,25 +84,24 @@ class Ranks:
         return [total.view_as(each) for each, total in zip(others, sums[len(parameters) :], strict=True)]
 
     def agree(self, signum: int, gaussians: int) -> int:
-        """The signal that any of the ranks was sent, 0: none. All must have as many `gaussians`.
+        """The signal that any rank has received, or 0.
 
-        Raises BackendError where they have not: then they hold different models, by no fault of anybody's
-        but this program's or the hardware's.
+        Raises BackendError if numbers of `gaussians` differ: a fault of keyss or of the hardware.
         """
         if self.count == 1:
             return signum
         numbers = torch.tensor([signum, gaussians, -gaussians])
         _together(lambda: dist.all_reduce(numbers, dist.ReduceOp.MAX))
-        found, most, least = numbers.tolist()
-        if most != -least:
+        signum, highest, lowest = numbers.tolist()
+        if highest != -lowest:
             raise BackendError(
-                f"the {self.count} processes have come apart: one has {-least:,} Gaussians and one {most:,}; "
+                f"the {self.count} processes differ: one has {-lowest:,} Gaussians and one {highest:,}; "
                 "`resume=True` continues from the last checkpoint"
             )
-        return int(found)
+        return int(signum)
 
     def from_first(self, data: bytes) -> bytes:
-        """What rank 0 gives, on all ranks."""
+        """The `data` of rank 0, on all ranks."""
         if self.count == 1:
             return data
         size = torch.tensor([len(data)])
@@ -114,9 +113,9 @@ class Ranks:
         return content.numpy().tobytes()
 
     def share(self, tensors: Iterable[Tensor]) -> None:
-        """Rank 0's numbers in the `tensors` of all: after what GPUs may each compute a little differently."""
-        for each in tensors if self.count > 1 else ():
-            _together(partial(dist.broadcast, each.detach(), 0))
+        """Copy the `tensors` of rank 0 to all ranks, after work whose rounding differs between GPUs."""
+        for tensor in tensors if self.count > 1 else ():
+            _together(partial(dist.broadcast, tensor.detach(), 0))
 
 
 _ALONE = Ranks()
@@ -124,16 +123,16 @@ _joined = _ALONE
 
 
 def here() -> Ranks:
-    """The ranks that this process works with: others than itself within `joined` only."""
+    """The ranks of the present `joined` block; outside of one, this process alone."""
     return _joined
 
 
 @contextmanager
 def joined(device: str = "auto") -> Iterator[Ranks]:
-    """Work with the other processes that torchrun has started, if it has, on `device` (see `resolve_device`).
+    """Join the other processes of torchrun, if there are any, on `device` (see `resolve_device`).
 
-    A program that has set up `torch.distributed` keeps what it has. Raises BackendError where the processes
-    do not find each other, or have no GPU each.
+    An initialised `torch.distributed` is used as it is. Raises BackendError if the processes do not find each
+    other, or do not have one GPU each.
     """
     global _joined
     count = _torchrun.processes()
@@ -144,33 +143,33 @@ def joined(device: str = "auto") -> Iterator[Ranks]:
     own = not (dist.is_available() and dist.is_initialized())
     nccl = own and _initialise(count)
     _joined = Ranks(dist.get_rank(), dist.get_world_size())
-    parts = own and not nccl
+    destroys = own and not nccl
     try:
         yield _joined
-        parts = own
-    finally:  # after an error the others may be gone, and NCCL may wait for them
+        destroys = own
+    finally:  # after an error, NCCL could wait for processes that have ended
         _joined = _ALONE
-        if parts:
+        if destroys:
             dist.destroy_process_group()
 
 
 def _choose_gpu(device: str) -> None:
-    """A GPU of its own for each process on this machine."""
+    """Choose a GPU of its own for each process on this machine."""
     if device == "cpu" or not torch.cuda.is_available():
         return
     local, gpus = _torchrun.local_rank(), torch.cuda.device_count()
     if local >= gpus:
         raise BackendError(
-            f"process {local + 1} on this machine has no GPU of its own, for there are {gpus}: start as many "
-            'processes as there are GPUs, or compute with `device="cpu"`'
+            f"process {local + 1} on this machine has no GPU, since there are {gpus}: start at most one "
+            'process for each GPU, or use `device="cpu"`'
         )
     torch.cuda.set_device(local)
 
 
 def _initialise(count: int) -> bool:
-    """Whether NCCL is there for tensors on GPUs."""
+    """Set up torch.distributed; returns True if it uses NCCL."""
     if not (dist.is_available() and dist.is_gloo_available()):
-        raise BackendError("this build of torch cannot let several processes train together: it has no gloo")
+        raise BackendError("several processes cannot train together: this build of torch has no gloo")
     nccl = torch.cuda.is_available() and dist.is_nccl_available()
     try:
         dist.init_process_group("cpu:gloo,cuda:nccl" if nccl else "gloo", timeout=_PATIENCE)
@@ -183,11 +182,11 @@ def _initialise(count: int) -> bool:
 
 
 def _together(communicate: Callable[[], object]) -> None:
-    """What takes all ranks. Raises OtherProcessError where one of them is gone."""
+    """Run a collective operation. Raises OtherProcessError if a process has ended."""
     try:
         communicate()
-    except RuntimeError as error:  # torch has no class of its own for what gloo finds
-        if type(error).__name__ == "OutOfMemoryError":  # which lies elsewhere in older versions
+    except RuntimeError as error:  # torch has no class for errors of gloo
+        if type(error).__name__ == "OutOfMemoryError":  # whose module depends on the version
             raise
         raise OtherProcessError(
             f"another of the {_joined.count} processes that train together has ended"

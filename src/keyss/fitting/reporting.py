@@ -1,4 +1,4 @@
-"""Where the progress of trainings goes."""
+"""Protocols of what displays the progress of trainings."""
 
 from __future__ import annotations
 
@@ -9,59 +9,59 @@ from keyss.core.gaussians import Gaussians
 
 
 class Reporter(Protocol):
-    """Where progress goes."""
+    """Displays progress."""
 
     @property
     def loss_every(self) -> int:
-        """Every so many steps the loss is among the numbers; 0: never, for it costs a GPU its pace."""
+        """Steps between two losses among the numbers; 0: none, since reading it slows a GPU down."""
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
-        """`iteration` steps of `iterations` are done already, which is more than 0 for a resumed run."""
+        """A training begins; a resumed one has done `iteration` of its `iterations` steps."""
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
-        """So many steps are done; `gaussians` is 0 and `numbers` empty where there are none to tell."""
+        """`iteration` steps are done; `gaussians` is 0 and `numbers` empty if unknown."""
 
     def note(self, line: str) -> None:
-        """Something to know before the work begins."""
+        """Display a line before the training begins."""
 
     def finish(self) -> None:
-        """The work is done, or was interrupted."""
+        """The training has ended or was interrupted."""
 
 
 @runtime_checkable
 class Modelled(Protocol):
-    """A run that trains a model which can be looked at."""
+    """A run whose model can be displayed."""
 
     def gaussians(self) -> Gaussians:
-        """The model as it is now; later steps change its tensors."""
+        """The present model; later steps change its tensors."""
 
 
 @runtime_checkable
 class ModelReporter(Protocol):
-    """A reporter that looks at the model, too."""
+    """A reporter that displays the model, too."""
 
     def look(self, model: Callable[[], Gaussians]) -> None:
-        """A step is done; `model` gives what it came to, see `Modelled`."""
+        """A step is done; `model` returns the present model, see `Modelled`."""
 
     def of_secret(self) -> Reporter:
-        """The same reporter, for the training of a secret's model."""
+        """A reporter for the training of a secret."""
 
 
 @runtime_checkable
 class SeveralReporter(Protocol):
-    """A reporter that can be told of several trainings at the same time, some ten times a second of each."""
+    """A reporter that can display several trainings at the same time, with ten updates a second of each."""
 
     def beside(self) -> Reporter:
-        """One for another training, while this one is told of its own."""
+        """A reporter for one more training."""
 
 
 def of_secret(reporter: Reporter | None) -> Reporter | None:
-    """What the training of a secret's model reports to."""
+    """The reporter for the training of a secret."""
     return reporter.of_secret() if isinstance(reporter, ModelReporter) else reporter
 
 
 class SilentReporter:
-    """Says nothing."""
+    """Displays nothing."""
 
     loss_every = 0
 

@@ -1,4 +1,4 @@
-"""The order in which training views are drawn: every view once per epoch, shuffled, resumable."""
+"""Random order of training views: every view once per epoch, shuffled, resumable."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 
 @contextmanager
 def own_randomness(seed: int) -> Iterator[None]:
-    """torch's global generators begin at `seed` while the block runs, and go on as they were afterwards.
+    """Seed torch's global generators for the block, and restore them afterwards.
 
-    Of several GPUs it is that of the one in use.
+    Of several GPUs, only the current one's generator.
     """
     gpus = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(gpus):
@@ -22,14 +22,14 @@ def own_randomness(seed: int) -> Iterator[None]:
 
 
 class Shuffle:
-    """Draws 0..count-1 without replacement, over and over."""
+    """Samples 0..count-1 without replacement, over and over."""
 
     def __init__(self, count: int, generator: torch.Generator) -> None:
         self.count = count
         self.generator = generator
         self.remaining = torch.empty(0, dtype=torch.int64)
 
-    def draw(self) -> int:
+    def sample(self) -> int:
         if len(self.remaining) == 0:
             self.remaining = torch.randperm(self.count, generator=self.generator)
         index = int(self.remaining[-1])

@@ -29,11 +29,11 @@ from keyss.fitting.checkpoint import (
     unpack_network,
     unpack_optimizers,
 )
-from keyss.fitting.density import CappedStrategy, Drawn, combine_densification, draw_views
+from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.loop import train
 from keyss.fitting.losses import photometric_loss
-from keyss.fitting.parameters import make_optimizers, to_parameters
+from keyss.fitting.parameters import make_optimizers, set_rates, to_parameters
 from keyss.fitting.ranks import here
 from keyss.fitting.sampling import Shuffle, own_randomness
 from keyss.methods.base import Context, Source, role_of
@@ -97,7 +97,6 @@ class JointTraining(ABC):
         start = combined_points(starting, fit, self.generator)
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, fit, self.extent)
-        self.rate_of_means = self.optimizers["means"].param_groups[0]["lr"]
         self.networks = torch.nn.ModuleList()
         with own_randomness(fit.known_seed):
             self.prepare(start)
@@ -146,25 +145,25 @@ class JointTraining(ABC):
         self.iteration += 1
         poses = [self._draw_poses() for _ in range(self.views_per_step)]
         views = list(zip(poses, self.extras(), strict=True))
-        total, drawn = draw_views(views, lambda view: self.loss_at(*view))
         trained = (*self.parameters.values(), *self.networks.parameters())
-        seen = combine_densification(drawn, len(self))
-        self.loss, seen = self.strategy.over_ranks(total, trained, self.parameters, seen)
+        self.loss, info = self.strategy.backward(
+            views, lambda view: self.loss_at(*view), trained, self.parameters
+        )
         self._set_rates()
         for optimizer in (*self.optimizers.values(), self.network_optimizer):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, seen)
+        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, info)
 
     def extras(self) -> Sequence[Any]:
         """What a view's loss needs beside poses, one for each of `views_per_step`, on every rank the same."""
         return [None] * self.views_per_step
 
-    def loss_at(self, poses: Sequence[Pose], extra: Any) -> tuple[Tensor, list[Drawn]]:
+    def loss_at(self, poses: Sequence[Pose], extra: Any) -> tuple[Tensor, list[Rendered]]:
         """The weighted losses of all scenes, each at its pose, and the renders that density control uses."""
         fit = self.options.fit
         total = torch.zeros((), device=self.device)
-        drawn: dict[int, Drawn] = {}  # scenes may share a render
+        drawn: dict[int, Rendered] = {}  # scenes may share a render
         for pose in dict.fromkeys(poses):
             scenes = [scene for scene, own in enumerate(poses) if own == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), fit.sh_degree_at(self.iteration))
@@ -181,13 +180,13 @@ class JointTraining(ABC):
         """The training pose that each scene is rendered from."""
         count = len(self.scenes)
         if float(torch.rand((), generator=self.generator)) < self.common_poses:
-            owner = self.owners[self.owner_order.draw()]
-            return [(owner, self.shuffles[owner].draw())] * count
-        return [(scene, self.shuffles[scene].draw()) for scene in range(count)]
+            owner = self.owners[self.owner_order.sample()]
+            return [(owner, self.shuffles[owner].sample())] * count
+        return [(scene, self.shuffles[scene].sample()) for scene in range(count)]
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
-        self.optimizers["means"].param_groups[0]["lr"] = self.rate_of_means * 0.01**progress
+        set_rates(self.optimizers, progress)
         risen = min(1.0, self.iteration / self.warm_up) if self.warm_up else 1.0
         self.network_optimizer.param_groups[0]["lr"] = self.network_rate * risen * 0.05**progress
 

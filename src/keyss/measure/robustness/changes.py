@@ -19,7 +19,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.losses import Target, photometric_loss
-from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
+from keyss.fitting.parameters import make_optimizers, set_rates, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
 from keyss.rendering import contributions, render
 
@@ -182,12 +182,11 @@ def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussi
     background = scene.background.to(model.device)
     shuffle = Shuffle(len(scene.train), torch.Generator().manual_seed(seed))
     for step in range(1, steps + 1):
-        view = scene.train[shuffle.draw()]
+        view = scene.train[shuffle.sample()]
         image = render(to_gaussians(parameters), view.camera, background)
         target = Target.of(view.image.to(model.device))
         photometric_loss(image, target, config.ssim_weight).backward()
-        rate = config.means_rate * scene.extent * 0.01 ** (step / config.iterations)
-        optimizers["means"].param_groups[0]["lr"] = rate
+        set_rates(optimizers, step / config.iterations)
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
-from keyss.fitting.density import Drawn
+from keyss.fitting.density import Rendered
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import to_gaussians
 from keyss.keys.derivation import random_embeddings
@@ -71,7 +71,7 @@ class KeyssTraining(JointTraining):
             return super().extras()
         return [random_embeddings(1, self.generator)[0].to(self.device) for _ in range(self.views_per_step)]
 
-    def loss_at(self, poses: Sequence[Pose], extra: Tensor | None) -> tuple[Tensor, list[Drawn]]:
+    def loss_at(self, poses: Sequence[Pose], extra: Tensor | None) -> tuple[Tensor, list[Rendered]]:
         total, drawn = super().loss_at(poses, extra)
         if extra is not None:
             total = total + self._incorrect_loss(poses[0], extra)
