@@ -5,7 +5,7 @@
     hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
     reveal("runs/hidden/publish/stego.ply", key, out="treasure.ply")
 
-Each name below is loaded at its first use, so that `import keyss` is quick.
+Names are loaded at their first use, which keeps `import keyss` fast.
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
-"""Processes that keyss starts: what they may take, and that they end with whoever started them.
+"""Processes that keyss starts: their command, environment and end, and the resources of this machine.
 
-They run modules of keyss with the same Python. Their standard input is a pipe that stays open for as long as
-whoever started them lives.
+They run modules of keyss with the same Python. Their standard input is a pipe that closes when the parent
+process ends.
 """
 
 from __future__ import annotations
@@ -15,54 +15,51 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-# Read by the libraries that compute on several threads when they are loaded.
+# Read by multithreaded libraries when they are loaded.
 _THREADS = (
     *("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
     *("NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
 )
-_KEY = "KEYSS_KEY"  # none of these processes reads it
+_KEY = "KEYSS_KEY"  # not passed on
 _STARTED = "KEYSS_STARTED_BY_KEYSS"
-_ROOT = str(Path(__file__).parents[1])  # where keyss lies
+_ROOT = str(Path(__file__).parents[1])  # the folder that contains keyss
 _CGROUPS = Path("/sys/fs/cgroup")
 
 
 def can_start() -> bool:
-    """Whether this process may start others.
+    """True if this process may start others.
 
-    One that keyss has started may not, since it was given so many cores and so much memory; nor can a program
-    that is no Python interpreter: a frozen app, or a host that embeds Python.
+    False in a process that keyss started, whose cores and memory are limited, and in a program that is not a
+    Python interpreter: a frozen app, or a host that embeds Python.
     """
     python = Path(sys.executable or "").name.lower().startswith("python")
     return python and not getattr(sys, "frozen", False) and _STARTED not in os.environ
 
 
 def command(module: str) -> tuple[str, ...]:
-    """What runs a module of keyss; nothing is imported from the folder that it is started in."""
+    """The command that runs a module of keyss; it imports nothing from the working folder."""
     return (sys.executable, "-I" if sys.flags.isolated else "-P", "-m", module)
 
 
 def environment(threads: int) -> dict[str, str]:
-    """This process's, with so many threads for whatever computes, and without a key."""
-    found = {**os.environ, **dict.fromkeys(_THREADS, str(threads)), _STARTED: "1"}
-    found.pop(_KEY, None)
-    paths = [each for each in found.get("PYTHONPATH", "").split(os.pathsep) if each]
-    # Before the standard library, where a folder of packages must not be.
-    if os.path.realpath(_ROOT) not in {os.path.realpath(each) for each in (*paths, *_package_folders())}:
-        found["PYTHONPATH"] = os.pathsep.join((_ROOT, *paths))
-    return found
+    """The environment of this process, for `threads` computing threads, and without a key."""
+    variables = {**os.environ, **dict.fromkeys(_THREADS, str(threads)), _STARTED: "1"}
+    variables.pop(_KEY, None)
+    paths = [path for path in variables.get("PYTHONPATH", "").split(os.pathsep) if path]
+    # These come before the standard library, where a folder of packages must not be.
+    if os.path.realpath(_ROOT) not in map(os.path.realpath, (*paths, *_package_folders())):
+        variables["PYTHONPATH"] = os.pathsep.join((_ROOT, *paths))
+    return variables
 
 
 def _package_folders() -> list[str]:
-    """Where Python looks for packages by itself."""
-    found = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), *site.getsitepackages()]
-    return [*found, site.getusersitepackages()]
+    """The folders in which Python looks for packages by default."""
+    folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), *site.getsitepackages()]
+    return [*folders, site.getusersitepackages()]
 
 
 def end_with_parent() -> None:
-    """Ends this process at once when its standard input ends, from now on.
-
-    Nothing is lost, for files appear when they are whole.
-    """
+    """End this process when its standard input ends, at once: files appear only when they are complete."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 
@@ -73,44 +70,41 @@ def _wait_for_parent() -> None:
 
 
 def how_it_ended(status: int) -> str:
-    """Of the exit status of a process that left no result."""
+    """Describe the exit status of a process without a result."""
     return f"killed by signal {-status}" if status < 0 else f"exit status {status}"
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """The number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def available_memory() -> int | None:
-    """Bytes that could be had now, by this machine and by the control group of a container.
-
-    None where the system does not tell.
-    """
-    found = _available_in_group()
+    """Available bytes of this machine and of the control group of a container, None if unknown."""
+    available = _available_in_groups()
     with suppress(OSError, KeyError):
-        there = _numbers(Path("/proc/meminfo"))["MemAvailable:"] * 1024
-        found = there if found is None else min(found, there)
-    return found
+        available.append(_numbers(Path("/proc/meminfo"))["MemAvailable:"] * 1024)
+    return max(0, min(available)) if available else None
 
 
-def _available_in_group() -> int | None:
-    """What the limits of control groups (version 2) leave; None without one."""
-    found: list[int] = []
+def _available_in_groups() -> list[int]:
+    """Bytes below the limit of each control group (version 2) of this process."""
+    available: list[int] = []
     with suppress(OSError, IndexError):
         inside = Path("/proc/self/cgroup").read_text().split("::", 1)[1].splitlines()[0].lstrip("/")
         folder = _CGROUPS / inside
         for group in (folder, *folder.parents[: len(Path(inside).parts)]):
-            with suppress(OSError, ValueError, KeyError):  # ValueError: "max", which is no limit
+            with suppress(OSError, ValueError, KeyError):  # ValueError: "max", no limit
                 limit = int((group / "memory.max").read_text())
                 used = int((group / "memory.current").read_text())
-                found.append(limit - used + _numbers(group / "memory.stat")["inactive_file"])  # is given back
-    return max(0, min(found)) if found else None
+                cached = _numbers(group / "memory.stat")["inactive_file"]  # the system frees it on demand
+                available.append(limit - used + cached)
+    return available
 
 
 def _numbers(path: Path) -> dict[str, int]:
-    """Of lines that begin with a name and a number. Raises OSError."""
+    """Numbers by name, from lines that start with both. Raises OSError."""
     lines = (line.split() for line in path.read_text().splitlines())
     return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}

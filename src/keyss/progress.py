@@ -9,32 +9,32 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
 from rich.table import Column
 
-level = 0  # -1 says nothing, 1 more often; set by the command line
+level = 0  # -1: silent, 1: more often; set by the command line
 
 
 def reporter(console: Console | None = None) -> ProgressLines:
-    """For the standard error stream, or `console`."""
+    """A reporter for `console`, by default the standard error stream."""
     console = console or Console(stderr=True, quiet=level < 0)
     return ProgressLines(console, None if level < 1 or console.is_terminal else 1.0)
 
 
 class _Bars:
-    """The lines of all trainings of the moment, below each other: a terminal has room for one such block."""
+    """The lines of all running trainings, in one block: a terminal displays one block at a time."""
 
     def __init__(self) -> None:
         self.progress: Progress | None = None
         self.open = 0
 
-    def add(self, made: Callable[[], Progress]) -> Progress:
-        """The block with one line more; a new one where there is none."""
+    def add(self, make: Callable[[], Progress]) -> Progress:
+        """The block for one more line; a new one if there is none."""
         if self.progress is None:
-            self.progress = made()
+            self.progress = make()
             self.progress.start()
         self.open += 1
         return self.progress
 
     def close(self) -> None:
-        """A line is done; what all are is drawn a last time."""
+        """End a line; the last one ends the block."""
         self.open -= 1
         if self.open == 0 and self.progress is not None:
             self.progress.stop()
@@ -42,11 +42,11 @@ class _Bars:
 
 
 class ProgressLines:
-    """A `Reporter` on a task of rich, which knows the speed of the recent past and the time that is left.
+    """A `Reporter` on a task of rich, which estimates recent speed and remaining time.
 
-    In a terminal it is one line that is redrawn, elsewhere a line now and then, for logs; `every` so many
-    seconds, by default 0.25 and 10. It draws from `update`: no thread that training would share its cores
-    with.
+    In a terminal, one line is redrawn every 0.25 seconds; elsewhere, for logs, a line is printed every 10
+    seconds. `every` changes this. Lines are redrawn by `update`, not by a thread, which would take cores from
+    training.
     """
 
     loss_every = 0
@@ -66,14 +66,14 @@ class ProgressLines:
         self.task: Task | None = None
 
     def beside(self) -> ProgressLines:
-        """Of another training at the same time: in a terminal the line below."""
+        """A reporter for another training at the same time: in a terminal, the line below."""
         return ProgressLines(self.console, self.every, self.timer, self.bars)
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self.progress = self.bars.add(self._block)
         number = self.progress.add_task(title, total=iterations, completed=iteration, facts="starting")
         self.task = next(task for task in self.progress.tasks if task.id == number)
-        self.shown, self.numbers = self.timer(), ""
+        self.displayed, self.numbers = self.timer(), ""
         if not self.live:
             where = f", continuing at {iteration}" if iteration else ""
             self._say(f"{title}: {iterations} steps{where}")
@@ -83,7 +83,7 @@ class ProgressLines:
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
-            # The column of its own wraps where the terminal is narrow.
+            # A separate column wraps in narrow terminals.
             TextColumn("{task.fields[facts]}", markup=False, table_column=Column()),
             console=self.console,
             auto_refresh=False,
@@ -98,9 +98,9 @@ class ProgressLines:
         self.progress.update(task.id, completed=iteration)
         count = f"{gaussians:,} Gaussians" if gaussians else ""
         self.numbers = _joined(count, *(f"{name} {value:.2f}" for name, value in numbers.items()))
-        if self.timer() - self.shown < self.every:
+        if self.timer() - self.displayed < self.every:
             return
-        self.shown = self.timer()
+        self.displayed = self.timer()
         left = clock(task.time_remaining or 0)
         facts = _joined(f"{task.speed:.1f} it/s, {left} left" if task.speed else "starting", self.numbers)
         self.progress.update(task.id, facts=facts, refresh=True)
@@ -114,19 +114,19 @@ class ProgressLines:
         task, self.task = self.task, None
         if task is None:
             return
-        spent = f"in {clock(task.elapsed or 0)}"
-        self.progress.update(task.id, facts=_joined(spent, self.numbers), refresh=True)
+        duration = f"in {clock(task.elapsed or 0)}"
+        self.progress.update(task.id, facts=_joined(duration, self.numbers), refresh=True)
         self.bars.close()
         if not self.live:
             how = "done" if task.finished else f"stopped at {task.completed}"
-            self._say(_joined(f"{task.description}: {how} {spent}", self.numbers))
+            self._say(_joined(f"{task.description}: {how} {duration}", self.numbers))
 
     def _say(self, line: str) -> None:
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def about(seconds: float) -> str:
-    """As precise as an estimate is."""
+    """An estimated time, in two digits or so."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -1,4 +1,4 @@
-"""Bringing one capture's world into another's frame from the cameras alone."""
+"""Alignment of one capture's world with another's frame, from the cameras alone."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from torch import Tensor
 from keyss.core.scene import Camera, camera_axes, camera_positions, focus_point
 from keyss.core.similarity import Similarity
 
-# A mean of unit vectors shorter than this is no direction: they point everywhere.
+# A shorter mean of unit vectors is no direction: they point everywhere.
 _MIN_UP = 0.1
 _MIN_HEADING = 0.2
 
 
 def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> Similarity:
-    """The similarity that brings the secret's world into the cover's frame.
+    """The similarity that moves the secret's world into the cover's frame.
 
-    It moves the point that the secret's cameras look at onto the cover's, makes the mean distances of the
-    cameras from it equal, and the up directions coincide. The turn about up that remains makes the mean
-    headings coincide where both captures have one (a half ring does, a full ring does not); otherwise
-    it is as small as possible. Without an up direction nothing is turned.
+    It maps the secret's focus point to the cover's, and makes the mean distances of the cameras from it and
+    the up directions equal. The rotation about the up direction makes the mean headings equal if both
+    captures have one (a half ring has, a full ring has not), and is as small as possible otherwise. Without
+    an up direction, nothing is rotated.
 
     Raises ValueError when either set is empty.
     """
@@ -34,11 +34,11 @@ def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> 
 
 
 def up_direction(cameras: Sequence[Camera]) -> Tensor | None:
-    """[3] float64 unit up direction of the world that the cameras show, None where they show none.
+    """[3] float64 unit up direction of the world, None if the cameras do not agree on one.
 
-    People hold cameras level but tilt them: the images' horizontal axes span the world's horizontal
-    plane, while the mean of the cameras' own up vectors leans forward by up to 20 degrees on a half ring.
-    The mean is what is left where the horizontal axes span no plane.
+    People hold cameras level but tilt them: the horizontal axes of the images span the horizontal plane of
+    the world, while the mean of the cameras' up vectors leans forward by up to 20 degrees on a half ring.
+    That mean is used only if the horizontal axes do not span a plane.
     """
     mean = camera_axes(cameras, 1).mean(0).neg()
     if float(mean.norm()) < _MIN_UP:
@@ -54,7 +54,7 @@ def up_direction(cameras: Sequence[Camera]) -> Tensor | None:
 
 @dataclass(frozen=True)
 class _Capture:
-    """Where a set of cameras looks, all float64."""
+    """Focus and directions of a set of cameras, all float64."""
 
     focus: Tensor  # [3]
     distance: float  # mean from the cameras to the focus, positive
@@ -76,13 +76,13 @@ class _Capture:
 
 
 def _rotation(secret: _Capture, cover: _Capture) -> Tensor:
-    """[3, 3] float64 rotation that takes the secret's up to the cover's, and heading as near as that allows.
+    """[3, 3] float64 rotation that maps the secret's up direction to the cover's, and then aligns headings.
 
-    The smallest such rotation where a capture has no heading, none where it has no up.
+    The smallest such rotation if a capture has no heading; the identity if it has no up direction.
     """
     if secret.up is None or cover.up is None:
         return torch.eye(3, dtype=torch.float64)
-    from scipy.spatial.transform import Rotation  # takes long to load
+    from scipy.spatial.transform import Rotation  # slow to load
 
     if secret.heading is None or cover.heading is None:
         rotation, _ = Rotation.align_vectors(cover.up[None], secret.up[None])

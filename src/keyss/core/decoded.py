@@ -1,4 +1,4 @@
-"""Gaussians of which a network makes pictures out of what the rasterizer draws: nearly a 3DGS model."""
+"""Gaussians whose renders a network decodes to images."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 
-MAX_FEATURES = 32  # channels that rasterizers draw at once
-MAX_LAYERS, MAX_CHANNELS = 16, 256  # of a network: files of others may ask for any memory
+MAX_FEATURES = 32  # channels that rasterizers render at once
+MAX_LAYERS, MAX_CHANNELS = 16, 256  # of a network: limits the memory for files of others
 Layers = tuple[tuple[Tensor, Tensor], ...]  # weight [out, in, 3, 3] and bias [out] of each
 
 
 @dataclass(frozen=True)
 class PictureNetwork:
-    """3x3 convolutions with ReLU between them, over pictures [H, W, C], zeros outside; the last gives RGB.
+    """3x3 convolutions with ReLU between them, from renders [H, W, C] with zero padding to RGB images.
 
-    Raises ValueError where the layers do not follow each other, from `background`'s channels to 3.
+    Raises ValueError unless the layers fit together, from the channels of `background` to 3.
     """
 
     layers: Layers
-    background: Tensor  # [C] what is drawn behind everything, before the network sees it
+    background: Tensor  # [C] behind all Gaussians in the renders
 
     def __post_init__(self) -> None:
         channels = len(self.background)
@@ -47,33 +47,32 @@ class PictureNetwork:
         return PictureNetwork(layers, function(self.background))
 
     def tensors(self) -> Sequence[Tensor]:
-        """All of them in a fixed order."""
-        return [self.background, *(each for layer in self.layers for each in layer)]
+        """All tensors in a fixed order."""
+        return [self.background, *(tensor for layer in self.layers for tensor in layer)]
 
 
 class DecodedGaussians(Gaussians):
-    """Gaussians, channels of anything in place of their colours where there are some, and the network.
+    """Gaussians with a network, and optionally with feature channels in place of colours.
 
-    What selects, moves or transforms Gaussians gives these again; changing a field by `dataclasses.replace`
-    is what `like` is for.
+    Selecting, moving and transforming preserves the class; use `like` instead of `dataclasses.replace`.
     """
 
-    __slots__ = ("features", "network")  # and not in vars(), which are the tensors of every model
+    __slots__ = ("features", "network")  # not in vars(), which are the tensors of every model
 
-    features: Tensor | None  # [N, C]; None: the harmonics are drawn
+    features: Tensor | None  # [N, C]; None: the harmonics are rendered
     network: PictureNetwork
 
     @staticmethod
     def of(model: Gaussians, network: PictureNetwork, features: Tensor | None = None) -> DecodedGaussians:
-        """`model` as `network` shows it. Raises ValueError for channels that do not fit."""
+        """`model` with a network. Raises ValueError for channels that do not fit."""
         shape = None if features is None else tuple(features.shape)
         channels = 3 if shape is None else len(network.background)
         if len(network.background) != channels or shape not in (None, (len(model), channels)):
             raise ValueError(f"features: expected [{len(model)}, {len(network.background)}], got {shape}")
-        found = DecodedGaussians(model.means, model.quats, model.log_scales, model.opacity_logits, model.sh)
-        object.__setattr__(found, "features", features)
-        object.__setattr__(found, "network", network)
-        return found
+        decoded = DecodedGaussians(model.means, model.quats, model.log_scales, model.opacity_logits, model.sh)
+        object.__setattr__(decoded, "features", features)
+        object.__setattr__(decoded, "network", network)
+        return decoded
 
     def like(self, changed: Gaussians) -> Gaussians:
         return DecodedGaussians.of(changed, self.network, self.features)
@@ -85,7 +84,7 @@ class DecodedGaussians(Gaussians):
     def to(self, device: torch.device | str) -> Gaussians:
         moved = super().to(device)
         assert isinstance(moved, DecodedGaussians)
-        return DecodedGaussians.of(moved, self.network.map(lambda each: each.to(device)), moved.features)
+        return DecodedGaussians.of(moved, self.network.map(lambda tensor: tensor.to(device)), moved.features)
 
     def with_sh_degree(self, degree: int) -> Gaussians:
         plain = Gaussians(self.means, self.quats, self.log_scales, self.opacity_logits, self.sh)
@@ -93,6 +92,8 @@ class DecodedGaussians(Gaussians):
 
     def digest(self) -> str:
         state = hashlib.sha256(super().digest().encode())
-        for each in (*(() if self.features is None else (self.features,)), *self.network.tensors()):
-            state.update(f"{list(each.shape)}".encode() + each.detach().cpu().contiguous().numpy().tobytes())
+        features = [] if self.features is None else [self.features]
+        for tensor in (*features, *self.network.tensors()):
+            data = tensor.detach().cpu().contiguous().numpy().tobytes()
+            state.update(f"{list(tensor.shape)}".encode() + data)
         return state.hexdigest()

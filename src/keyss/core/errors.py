@@ -1,8 +1,8 @@
 """Errors that users can cause, each with its exit status.
 
 A message says what was expected, what was found, and what to do. It names arguments as in Python, between
-backticks: `overwrite=True`, `method="carry"`, `sh_degree`. The command line prints it in one line, with flags
-in place of those, and without a traceback.
+backticks: `overwrite=True`, `method="carry"`, `sh_degree`. The command line replaces these with flags, and
+prints one line without a traceback.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ class KeyssWarning(UserWarning):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or another signal during long work, after `iteration` steps of a training.
+    """Ctrl-C or another signal, after `iteration` steps of a training.
 
-    What is done was saved to `checkpoint` (None: there was none to write).
+    The state was saved to `checkpoint`, unless that is None.
     """
 
     def __init__(
@@ -84,5 +84,5 @@ class Interrupted(KeyboardInterrupt):
 
 
 def signal_of(interrupt: KeyboardInterrupt) -> signal.Signals:
-    """Which signal an interrupt came from: Ctrl-C unless it says otherwise."""
+    """The signal of an interrupt, by default that of Ctrl-C."""
     return signal.Signals(interrupt.args[0]) if interrupt.args else signal.SIGINT

@@ -7,13 +7,13 @@ from typing import Any
 
 from keyss.core.errors import BackendError
 
-_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # by module, where the names differ
+_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # by module, if the names differ
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Import a module of an optional package: `purpose` is "write films", for example.
+    """Import a module of an optional package; `purpose` is for example "write films".
 
-    Raises BackendError, which names the package and the extra, when it cannot be imported.
+    Raises BackendError, which names the package and the extra, if it cannot be imported.
     """
     try:
         return import_module(module)

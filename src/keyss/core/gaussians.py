@@ -1,4 +1,4 @@
-"""The one representation of a 3DGS model that everything passes around."""
+"""The representation of a 3DGS model."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814  # the constant SH basis function
-DRAWN_OPACITY = 1 / 255  # below it 3DGS rasterizers draw nothing
-# Beyond these numbers of single precision overflow while a Gaussian is projected, and nothing is drawn.
+DRAWN_OPACITY = 1 / 255  # 3DGS rasterizers skip Gaussians below it
+# Beyond these values, projecting a Gaussian overflows in single precision, and it is not rendered.
 MAX_COORDINATE, MAX_LOG_SCALE, MAX_LENGTH, MAX_COLOUR = 1e15, 40.0, 1.8e19, 1e12
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N 3D Gaussians in the raw parameterisation that 3DGS optimises and that its PLY stores.
+    """N 3D Gaussians in the raw parameterisation that 3DGS optimises and its PLY files store.
 
-    All tensors are float32 and on one device. Raises ValueError when the shapes disagree.
+    All tensors are float32 and on one device. Raises ValueError if the shapes disagree.
     """
 
     means: Tensor  # [N, 3] world position
@@ -30,10 +30,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n, k = len(self.means), self.sh.shape[1] if self.sh.dim() == 3 else -1
-        for each, shape in zip(fields(self), ((n, 3), (n, 4), (n, 3), (n,), (n, k, 3)), strict=True):
-            found = tuple(getattr(self, each.name).shape)
-            if found != shape:
-                raise ValueError(f"{each.name}: expected shape {shape}, got {found}")
+        for field, expected in zip(fields(self), ((n, 3), (n, 4), (n, 3), (n,), (n, k, 3)), strict=True):
+            shape = tuple(getattr(self, field.name).shape)
+            if shape != expected:
+                raise ValueError(f"{field.name}: expected shape {expected}, got {shape}")
         if k not in (1, 4, 9, 16):
             raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {k}")
 
@@ -52,7 +52,7 @@ class Gaussians:
 
     @property
     def overflow(self) -> Tensor:
-        """[N] which Gaussians have numbers so large that rasterizers leave them out."""
+        """[N] bool, True for Gaussians that rasterizers skip because their values are too large."""
         far = ~(self.means.abs() <= MAX_COORDINATE).all(1)
         large = ~(self.log_scales <= MAX_LOG_SCALE).all(1)
         long = ~(self.quats.double().norm(dim=1) <= MAX_LENGTH)
@@ -70,7 +70,7 @@ class Gaussians:
         return self.means.device
 
     def like(self, changed: Gaussians) -> Gaussians:
-        """`changed`, made of these one by one, with what else belongs to them: nothing but in subclasses."""
+        """`changed` with the further data of this model; both have the same Gaussians in the same order."""
         return changed
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
@@ -90,8 +90,8 @@ class Gaussians:
     def digest(self) -> str:
         """SHA-256 over all values: equal for equal content only."""
         state = hashlib.sha256(f"{len(self)} {self.sh_degree}".encode())
-        for each in fields(self):
-            state.update(getattr(self, each.name).detach().cpu().contiguous().numpy().tobytes())
+        for field in fields(self):
+            state.update(getattr(self, field.name).detach().cpu().contiguous().numpy().tobytes())
         return state.hexdigest()
 
     def with_sh_degree(self, degree: int) -> Gaussians:
@@ -109,10 +109,10 @@ class Gaussians:
 
 
 def same_bits(one: Gaussians, other: Gaussians) -> bool:
-    """Whether two models that have nothing but numbers are equal to the last bit, in the same order."""
+    """True if two plain models are equal to the bit, in the same order."""
     if not type(one) is type(other) is Gaussians:
         return False
     if (len(one), one.sh_degree) != (len(other), other.sh_degree):
         return False
-    pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(Gaussians))
+    pairs = ((getattr(one, field.name), getattr(other, field.name)) for field in fields(Gaussians))
     return all(torch.equal(a.cpu().view(torch.int32), b.cpu().view(torch.int32)) for a, b in pairs)

@@ -1,4 +1,4 @@
-"""Making up for Gaussians that were pruned or lost at random."""
+"""Compensation for Gaussians that were pruned or lost at random."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import torch
 from keyss.core.gaussians import Gaussians
 
 _GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
-_MAX_LOST = 0.9  # share; a greater loss is compensated as this one
-_MIN_LOST = 0.01  # share; a smaller loss changes opacities no more than rounding does
+_MAX_LOST = 0.9  # share; greater losses are compensated like this one
+_MIN_LOST = 0.01  # share; smaller losses are not compensated
 
 
 def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
-    """The remaining Gaussians of a model that had `count`, denser and larger, so that they cover as much.
+    """Make the remaining Gaussians of a model that had `count` denser and larger, to cover as much as before.
 
-    Where a share p remains, each transmittance becomes its p-th root: 1 - (1 - opacity)^(1 / p). The standard
-    deviations grow by p^-0.25. When a quarter of a model is lost, this wins back 0.4 to 1 dB of 2 to 4.
-    Returns `gaussians` unchanged when fewer than 1 % were lost or `count` is 0 (unknown).
+    If a share p remains, opacities become 1 - (1 - opacity)^(1 / p), and the standard deviations grow by
+    p^-0.25. For a quarter of a model, this recovers 0.4 to 1 dB of the 2 to 4 dB that were lost. Returns
+    `gaussians` unchanged if fewer than 1 % were lost or `count` is 0 (unknown).
     """
     share = max(len(gaussians) / max(count, 1), 1 - _MAX_LOST)
     if share >= 1 - _MIN_LOST:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 
-# Weight of the fallback point in `focus_point`, against a mean of projections whose eigenvalues are at
-# most 1: it takes over where the viewing axes differ by less than about two degrees.
+# Weight of the fallback point in `focus_point`, against a mean of projections with eigenvalues of at most 1:
+# it dominates if the viewing axes differ by less than about two degrees.
 _FALLBACK_WEIGHT = 1e-3
 
 
@@ -33,27 +33,27 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on another pixel grid: K is scaled per axis."""
+        """The camera with another pixel grid: K is scaled per axis."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.K.dtype)
         return replace(self, K=self.K * scale[:, None].to(self.K), width=width, height=height)
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera and the photo it took."""
+    """A camera and its photo."""
 
     camera: Camera
     image: Tensor  # [H, W, 3] uint8 sRGB
-    drawn: Tensor | None = None  # [H, W, 3] in [0, 1], before it was rounded, where a model was drawn for it
+    drawn: Tensor | None = None  # [H, W, 3] in [0, 1]: the render before rounding, if it is not a photo
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How the views of scenes are read, or rendered where a model stands for a scene; see `load_scene`."""
+    """How views are read, or rendered for a scene that is a model; see `load_scene`."""
 
-    width: int | None = None  # pixels that wider photos are shrunk to
+    width: int | None = None  # pixels; wider photos are shrunk
     background: tuple[float, ...] | None = None  # [3] in [0, 1]
-    skip_missing: bool = False  # whether photos that are not on disk are left out
+    skip_missing: bool = False  # skip photos that do not exist
 
     @staticmethod
     def of(
@@ -85,14 +85,15 @@ class Scene:
     def extent(self) -> float:
         """1.1 x the largest distance of a training camera from their mean (3DGS's `cameras_extent`).
 
-        Of cameras in one place, where that is 0 and nothing would move: from what they look at.
+        If all cameras are in one place, their distance from the scene: with an extent of 0 nothing would
+        move.
         """
         cameras = [view.camera for view in self.train]
         positions = camera_positions(cameras)
         reach = float((positions - positions.mean(0)).norm(dim=1).max())
         if reach == 0:
-            seen = self.points.double().mean(0) if len(self.points) else focus_point(cameras)
-            reach = float((positions[0].double() - seen).norm())
+            centre = self.points.double().mean(0) if len(self.points) else focus_point(cameras)
+            reach = float((positions[0].double() - centre).norm())
         return 1.1 * reach
 
     def digest(self) -> str:
@@ -120,9 +121,9 @@ def camera_axes(cameras: Sequence[Camera], row: int) -> Tensor:
 def focus_point(cameras: Sequence[Camera]) -> Tensor:
     """[3] float64 point nearest to all viewing axes, in the least-squares sense.
 
-    Where the axes are nearly parallel, or meet behind most cameras, it is the point in front of the mean
-    camera at the distance by which the cameras are spread (1 if they all stand in one place).
-    Raises ValueError when there are no cameras.
+    If the axes are nearly parallel, or meet behind most cameras, it is the point in front of the mean camera,
+    at the mean distance of the cameras from that (1 if all are in one place). Raises ValueError without
+    cameras.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
@@ -139,7 +140,7 @@ def focus_point(cameras: Sequence[Camera]) -> Tensor:
 
 
 def checked_background(background: Tensor | Sequence[float]) -> Tensor:
-    """A colour [3]. Raises UsageError for one out of range."""
+    """A background colour as a tensor [3]. Raises UsageError if it is out of range."""
     values = [float(value) for value in background]
     if len(values) != 3 or not all(math.isfinite(v) and 0 <= v <= 1 for v in values):
         raise UsageError(f"expected a background of three numbers in [0, 1], got {values}")

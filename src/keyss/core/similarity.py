@@ -18,7 +18,7 @@ _ROTATION_TOLERANCE = 1e-6
 class Similarity:
     """x -> scale * rotation @ x + translation, held in float64 on the CPU.
 
-    Raises ValueError when a value is not finite, `scale` is not positive, or `rotation` is not a rotation
+    Raises ValueError if a value is not finite, `scale` is not positive, or `rotation` is not a rotation
     (orthonormal with determinant +1, to 1e-6).
     """
 
@@ -60,7 +60,7 @@ class Similarity:
         return (self.scale * (points.double() @ rotation.T) + translation).to(points.dtype)
 
     def apply_camera(self, camera: Camera) -> Camera:
-        """The camera moved along with the world: it takes the same image, at `scale` times the depths."""
+        """The camera, moved with the world: it takes the same image, at `scale` times the depths."""
         viewmat = camera.viewmat.double()
         moved = viewmat.clone()
         rotation = viewmat[:3, :3] @ self.rotation.T.to(viewmat.device)
@@ -70,11 +70,11 @@ class Similarity:
         return replace(camera, viewmat=moved.to(camera.viewmat.dtype))
 
     def apply_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians moved along with the world, their view-dependent colour included.
+        """The Gaussians, moved with the world, view-dependent colours included.
 
-        Lengths of the quaternions and opacities stay as they are. Differentiable.
+        Lengths of quaternions and opacities do not change. Differentiable.
         """
-        from scipy.spatial.transform import Rotation  # loaded where something is turned
+        from scipy.spatial.transform import Rotation  # slow to load
 
         x, y, z, w = Rotation.from_matrix(self.rotation.numpy()).as_quat().tolist()
         # [4, 4]: the Hamilton product of the rotation's quaternion with another, wxyz.
@@ -94,9 +94,9 @@ class Similarity:
 def _rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     """[N, K, 3] coefficients of the colour function d -> colour(rotation^T d).
 
-    Each degree spans a space closed under rotation, so it is turned by the exact solution of
-    basis(d) block = basis(rotation^T d) over any directions d; more of them than unknowns keep the
-    solution well-conditioned.
+    Each degree spans a space that is closed under rotation: its matrix is the exact solution of basis(d)
+    block = basis(rotation^T d) for any directions d. With more directions than unknowns, the system is
+    well-conditioned.
     """
     degree = math.isqrt(sh.shape[1]) - 1
     random = torch.Generator().manual_seed(0)

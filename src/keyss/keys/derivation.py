@@ -1,8 +1,7 @@
-"""From what a person types to what the method needs: Argon2id, then HKDF with a label per use.
+"""Key derivation: Argon2id, then HKDF with a label for each use.
 
-The key itself is used once, in Argon2id (RFC 9106), which makes guessing expensive; everything else is
-derived from its result by HKDF-SHA256 (RFC 5869) with labels, so that no derived value tells anything of
-another. A key is text as `normalized_key` gives it, so one key typed on two systems is one key.
+Argon2id (RFC 9106) makes guessing a key expensive. HKDF-SHA256 (RFC 5869) derives everything else from its
+result, with labels: no derived value reveals anything about another. Keys are normalised by `normalized_key`.
 """
 
 from __future__ import annotations
@@ -27,17 +26,15 @@ from keyss.keys.key_file import normalized_key
 SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
-_STREAM_BLOCK = 1 << 16  # bytes that are made at a time
-
-
+_STREAM_BLOCK = 1 << 16  # bytes
 TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4
-MAX_FACTOR = 4  # a file may ask for so many times the memory and the work of this program's own
+MAX_FACTOR = 4  # a file may demand so many times our memory and work
 MAX_PASSES = 4
 
 
 @dataclass(frozen=True)
 class KeyDerivation:
-    """Argon2id's public parameters; what a file states is held to a floor and a ceiling."""
+    """Argon2id's public parameters. Raises InputError for values out of range, since files contain them."""
 
     salt: bytes
     time_cost: int = TIME_COST  # passes
@@ -56,12 +53,9 @@ class KeyDerivation:
             value = getattr(self, name)
             if not (type(value) is int and low <= value <= high):
                 raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
-        work, most = self.time_cost * self.memory_kib, MAX_FACTOR * TIME_COST * MEMORY_KIB
-        if work > most:
-            raise InputError(
-                f"key derivation: expected passes times KiB of at most {most:,}, {MAX_FACTOR} times what "
-                f"this program asks for, got {self.time_cost} times {self.memory_kib:,}"
-            )
+        work, max_work = self.time_cost * self.memory_kib, MAX_FACTOR * TIME_COST * MEMORY_KIB
+        if work > max_work:
+            raise InputError(f"key derivation: expected at most {max_work:,} passes x KiB, got {work:,}")
 
 
 def expand(secret: bytes, label: str, length: int) -> bytes:
@@ -70,14 +64,14 @@ def expand(secret: bytes, label: str, length: int) -> bytes:
 
 
 def stream(secret: bytes, label: str, length: int) -> bytes:
-    """The same for more bytes than HKDF gives: the key stream of ChaCha20 (RFC 8439) under a derived key."""
+    """As `expand`, for any length: the key stream of ChaCha20 (RFC 8439) under a derived key."""
     data = np.empty(length, np.uint8)
     fill(secret, label, data)
     return data.tobytes()
 
 
 def fill(secret: bytes, label: str, data: npt.NDArray[np.uint8]) -> None:
-    """Overwrite contiguous `data` with what `stream` gives."""
+    """Overwrite contiguous `data` with the bytes of `stream`."""
     encryptor = Cipher(ChaCha20(expand(secret, label, 32), bytes(16)), mode=None).encryptor()
     flat, zeros = data.reshape(-1).data, bytes(_STREAM_BLOCK)
     for start in range(0, len(flat), _STREAM_BLOCK):
@@ -86,11 +80,10 @@ def fill(secret: bytes, label: str, data: npt.NDArray[np.uint8]) -> None:
 
 
 class DerivedKey:
-    """What a key becomes under one `KeyDerivation`.
+    """The values that one `KeyDerivation` derives from a key.
 
-    The labels in use: "embedding" (what conditions the decoder), "verifier" (tells keys apart while hiding),
-    "low-bits/key" (encrypts the data key in a model's low bits), "writer" (part of the writer's randomness),
-    "decoy", and those of the other channels.
+    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "low-bits/key" (encrypts
+    the data key in low bits), "writer" (randomness of hiding), "decoy", and those of the other channels.
     """
 
     def __init__(self, key: str, derivation: KeyDerivation) -> None:
@@ -108,8 +101,8 @@ class DerivedKey:
             )
         except HashingError as error:
             raise InputError(
-                f"deriving a key takes {derivation.memory_kib // 1024} MiB of memory, which the system does "
-                f"not give: {error}"
+                f"deriving a key needs {derivation.memory_kib // 1024} MiB of memory, which the system "
+                f"refuses: {error}"
             ) from error
 
     @staticmethod
@@ -126,16 +119,16 @@ class DerivedKey:
         return expand(self._master, label, length)
 
     def verifier(self) -> bytes:
-        """32 bytes that recognise the key and say nothing of its embedding."""
+        """32 bytes that identify the key and reveal nothing about its embedding."""
         return self.expand("verifier", 32)
 
     def equals(self, other: DerivedKey) -> bool:
-        """Whether both come from the same key and derivation, in constant time."""
+        """True for the same key and derivation; takes constant time."""
         return hmac.compare_digest(self.verifier(), other.verifier())
 
     def embedding(self) -> Tensor:
-        """[64] float32 unit vector, uniform on the sphere over keys: what the decoder is conditioned on."""
-        from scipy.special import ndtri  # takes longer to load than a key takes to derive
+        """[64] float32 unit vector, uniform on the sphere, which conditions the decoder."""
+        from scipy.special import ndtri  # slower to load than a key is to derive
 
         words = np.frombuffer(self.expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
         uniform = (words.astype(np.float64) + 0.5) / 2.0**64
@@ -149,5 +142,5 @@ def unit_vector(normal: Tensor) -> Tensor:
 
 
 def random_embeddings(count: int, generator: torch.Generator) -> Tensor:
-    """[count, 64] what fresh wrong keys become: independent uniform unit vectors."""
+    """[count, 64] embeddings of random keys: independent uniform unit vectors."""
     return unit_vector(torch.randn(count, EMBEDDING_SIZE, generator=generator, dtype=torch.float64))

@@ -1,8 +1,8 @@
 """Authenticated encryption of one payload: compressed, padded and encrypted under a data key of its own.
 
-ChaCha20-Poly1305 (RFC 8439) under a key that encrypts one message only, so the nonce may be zero: the
-writer draws the data key at random or derives it from everything that it encrypts, and two messages never
-share one. Lengths are padded to a coarse bucket first: the size tells little of what is inside.
+ChaCha20-Poly1305 (RFC 8439) with a zero nonce: each data key encrypts one message only, since the writer
+samples it or derives it from everything that it encrypts. Lengths are padded to coarse buckets first, and
+reveal little about the content.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from keyss.keys.derivation import expand
 
 DATA_KEY_BYTES = 32
 MAX_PAYLOAD_BYTES = 64 << 20  # before compression
-# A payload that compresses to n bytes has at most MAX_RATIO n + SMALL_PAYLOAD, or is not compressed at all.
+# A payload of more than MAX_RATIO n + SMALL_PAYLOAD bytes that compress to n is stored without compression.
 MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
 SMALLEST_BUCKET = 4096
-OVERHEAD = 4 + 16  # length of what is compressed, and the tag
+OVERHEAD = 4 + 16  # length of the compressed data, and the tag
 _NONCE = bytes(12)
 
 
@@ -37,15 +37,15 @@ def encrypted_size(compressed: int) -> int:
 
 
 def compressed_size(payload: bytes) -> int:
-    """Bytes of `payload` when compressed as `encrypt` does it."""
+    """Bytes of `payload` as `encrypt` compresses it."""
     return len(_compressed(payload))
 
 
 def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int | None = None) -> bytes:
-    """`payload` encrypted under a fresh `data_key` (32 bytes), in `size` bytes or in its bucket's.
+    """Encrypt `payload` under a fresh `data_key` (32 bytes), to `size` bytes or to its bucket's size.
 
-    `associated` is authenticated along with it and has to be given again to decrypt. Raises UsageError for a
-    payload of more than 64 MiB.
+    `associated` is authenticated too, and needed to decrypt. Raises UsageError for a payload of more than
+    64 MiB.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to encrypt, got {len(payload):,}")
@@ -59,23 +59,22 @@ def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: i
 
 
 def decrypt(data_key: bytes, encrypted: bytes, associated: bytes = b"") -> bytes:
-    """The payload. Raises InputError when anything at all is not as `encrypt` left it."""
+    """Decrypt a payload. Raises InputError if anything differs from the result of `encrypt`."""
     try:
         plain = _cipher(data_key).decrypt(_NONCE, encrypted, associated)
     except (InvalidTag, ValueError) as error:
         raise InputError("the encrypted data are damaged: their authentication fails") from error
     (length,) = struct.unpack_from("<I", plain.ljust(4, b"\0"))
     packed = plain[4 : 4 + length]
-    # What follows is bounded although only a holder of the key can have written it.
+    # Bounded, although only a holder of the key can have written it.
     unpacker = zlib.decompressobj()
     try:
-        payload = unpacker.decompress(packed, _most(len(packed)))
+        payload = unpacker.decompress(packed, _max_size(len(packed)))
     except zlib.error as error:
         raise InputError(f"the encrypted data cannot be decompressed: {error}") from error
     if len(packed) != length or not unpacker.eof or unpacker.unused_data:
         raise InputError(
-            f"the encrypted data are not whole, or larger than the {_most(len(packed)):,} bytes that so "
-            "short data may become"
+            f"the encrypted data are incomplete, or decompress to more than {_max_size(len(packed)):,} bytes"
         )
     return payload
 
@@ -88,9 +87,9 @@ def _cipher(data_key: bytes) -> ChaCha20Poly1305:
 
 def _compressed(payload: bytes) -> bytes:
     packed = zlib.compress(payload, 9)
-    return packed if len(payload) <= _most(len(packed)) else zlib.compress(payload, 0)
+    return packed if len(payload) <= _max_size(len(packed)) else zlib.compress(payload, 0)
 
 
-def _most(packed: int) -> int:
-    """Bytes that `packed` bytes may become: what a reader spends memory on."""
+def _max_size(packed: int) -> int:
+    """Limit of the decompressed bytes of `packed` bytes: bounds a reader's memory."""
     return min(MAX_PAYLOAD_BYTES, MAX_RATIO * packed + SMALL_PAYLOAD)

@@ -1,4 +1,4 @@
-"""New keys, from the system's random source."""
+"""Random keys."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ALPHABET = string.ascii_letters + string.digits
 
 
 def generate_key(length: int = 16) -> str:
-    """A random alphanumeric key from the system's random source: 5.95 bits a character.
+    """A random alphanumeric key of the system's random source: 5.95 bits per character.
 
     Raises UsageError for a length outside 1 to 1024.
     """
@@ -22,5 +22,5 @@ def generate_key(length: int = 16) -> str:
 
 
 def length_for(bits: int) -> int:
-    """The number of characters with which `generate_key` reaches `bits`."""
+    """Length for which `generate_key` reaches `bits`."""
     return math.ceil(bits / math.log2(len(ALPHABET)))

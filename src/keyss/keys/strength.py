@@ -1,8 +1,8 @@
-"""How hard a key is to guess: a low estimate, and what to tell a person whose key is weak.
+"""Strength of keys: a low estimate, and a warning for weak keys.
 
-Argon2id costs an attacker about a tenth of a second of one core and 64 MiB for each guess, so 80 bits are
-out of reach of anybody and 40 bits are not. The estimate counts what somebody who knows how people choose
-keys would have to try; it cannot know that a random-looking key has been used elsewhere.
+Argon2id costs an attacker about a tenth of a second of one core and 64 MiB for each guess: 80 bits are out of
+reach, 40 bits are not. The estimate counts the guesses of somebody who knows how people choose keys; it
+cannot know that a random-looking key is used elsewhere.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _KEYBOARD = ("qwertyuiop", "asdfghjkl", "zxcvbnm", "qwertzuiop", "azertyuiop")
 def key_strength_bits(key: str) -> float:
     """A conservative estimate of log2 of the guesses that find `key`; 16 generated characters give about 95.
 
-    Every character counts as drawn from the classes in use, except that one which repeats or continues a
-    sequence (aaa, 321, qwe) counts 1 bit, that letters count 2 bits where most of them stand in words, and
-    that a key which repeats a shorter one counts as that.
+    Each character counts as a random one of the classes in use, with three exceptions: 1 bit for a character
+    that repeats or continues a sequence (aaa, 321, qwe), 2 bits for letters if most are in words, and a key
+    that repeats a shorter one counts as that.
     """
     text = unicodedata.normalize("NFKC", key)
     text, repeats = _without_repetition(text)
     if not text:
         return 0.0
-    each = math.log2(sum(size for pattern, size in _CLASSES if re.search(pattern, text)))
+    class_bits = math.log2(sum(size for pattern, size in _CLASSES if re.search(pattern, text)))
     in_words = _mostly_words(text)
     bits = math.log2(repeats)
     for index, character in enumerate(text):
@@ -39,23 +39,23 @@ def key_strength_bits(key: str) -> float:
         elif in_words and character.isalpha():
             bits += _LETTER_OF_WORD_BITS
         else:
-            bits += each
+            bits += class_bits
     return bits
 
 
 def weakness(key: str) -> str | None:
-    """One sentence for whoever locks something with `key`, None if it is strong enough."""
+    """A warning for a weak key, None for a strong one."""
     bits = key_strength_bits(key)
     if bits >= ENOUGH_BITS:
         return None
     return (
-        f"this key is worth about {bits:.0f} bits: whoever has the published file can guess keys at leisure, "
-        f"and below {ENOUGH_BITS:.0f} bits may find it; `keyss keygen` makes keys of 95 bits"
+        f"this key has about {bits:.0f} bits: below {ENOUGH_BITS:.0f} bits, whoever has the published file "
+        "may guess it; `keyss keygen` makes keys of 95 bits"
     )
 
 
 def _without_repetition(text: str) -> tuple[str, int]:
-    """The shortest part that `text` is a repetition of, and how often it comes."""
+    """The shortest part that `text` repeats, and the number of repetitions."""
     for size in range(1, len(text) // 2 + 1):
         if len(text) % size == 0 and text[:size] * (len(text) // size) == text:
             return text[:size], len(text) // size
@@ -63,9 +63,9 @@ def _without_repetition(text: str) -> tuple[str, int]:
 
 
 def _mostly_words(text: str) -> bool:
-    """Whether three quarters of the letters stand in what looks like words.
+    """True if three quarters of the letters are in apparent words.
 
-    Five letters in one case, or three with no other letter beside them.
+    These are five letters in one case, or three letters without a neighbouring letter.
     """
     inside = letters = 0
     for run in re.findall(r"[^\W\d_]+", text):
@@ -81,7 +81,7 @@ def _mostly_words(text: str) -> bool:
 
 
 def _is_predicted(three: str) -> bool:
-    """Whether the last of three characters follows from the two before it."""
+    """True if the last of three characters continues the two before it."""
     if len(three) < 3:
         return False
     steps = {ord(b) - ord(a) for a, b in pairwise(three)}
