@@ -35,7 +35,7 @@ def test_derivation_is_argon2id_then_hkdf_with_labels() -> None:
 
 
 def test_embeddings_are_unit_vectors_and_unrelated_even_for_near_keys() -> None:
-    vectors = torch.stack([DerivedKey(k, CHEAP).embedding() for k in ("key", "kez", "Key", "key ")])
+    vectors = torch.stack([DerivedKey(k, CHEAP).embedding() for k in ("key", "kez", "Key", "keyy")])
     products = vectors @ vectors.T
     torch.testing.assert_close(products.diagonal(), torch.ones(4))
     assert (products - torch.eye(4)).abs().max() < 0.6  # 64 dimensions: a standard deviation of 0.125
