@@ -19,8 +19,7 @@ from keyss.audits.record import LeaksResult
 from keyss.audits.subject import AuditSubject
 from keyss.cli import main
 from keyss.cli.measuring import PartName
-from keyss.core import InputError, OutputError, UsageError, WrongKeyError
-from keyss.fitting import Interrupted
+from keyss.core import InputError, Interrupted, OutputError, UsageError, WrongKeyError
 from keyss.measure import FileSize, SpeedResult
 from test_api import ANY, write_nerfstudio
 from tiny_scenes import tiny_scene

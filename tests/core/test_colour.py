@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.core.colour import OPPONENT
+from keyss.core import OPPONENT
 
 
 def test_it_is_orthonormal_and_greys_have_no_differences() -> None:

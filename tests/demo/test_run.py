@@ -11,9 +11,9 @@ from PIL import Image
 
 import keyss
 from keyss import CarryOptions, demo
-from keyss.core import OutputError
+from keyss.core import Interrupted, OutputError
 from keyss.files import load_scene
-from keyss.fitting import FitConfig, Interrupted
+from keyss.fitting import FitConfig
 from keyss.runs import HideMetrics, read_record
 
 SMALL: dict[str, Any] = {

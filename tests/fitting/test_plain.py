@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from keyss.core import Gaussians, InputError, UsageError
+from keyss.core import Gaussians, InputError, Interrupted, UsageError
 from keyss.fitting import (
     FitConfig,
-    Interrupted,
     PlainRun,
     SilentReporter,
     fit_scene,

@@ -14,8 +14,7 @@ import keyss  # noqa: F401  before anything imports torch
 from keyss.core import Similarity
 from keyss.fitting import FitConfig, PlainRun, TrainingRun, here, joined, save_checkpoint, train
 from keyss.keys import random_embeddings
-from keyss.methods import KeyssOptions, KeyssTraining, PlacedScene
-from keyss.methods.peers.watergs import WaterGsOptions, WaterGsTraining
+from keyss.methods import JointTraining, KeyssOptions, KeyssTraining, PlacedScene, registry
 from tiny_scenes import random_gaussians, tiny_scene
 
 SEED = 3
@@ -44,9 +43,11 @@ def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
     )
 
 
-def watergs(fit: FitConfig, device: torch.device) -> WaterGsTraining:
+def watergs(fit: FitConfig, device: torch.device) -> JointTraining:
     """A peer with a network, and with parameters that have no gradients at the end."""
-    return WaterGsTraining(_placed(), WaterGsOptions(fit=fit, common_poses=0.5), device)
+    method: Any = registry.get("watergs")
+    options = method.options(fit=fit, common_poses=0.5)
+    return method.training(_placed(), options, device)  # type: ignore[no-any-return]
 
 
 RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {

@@ -10,8 +10,7 @@ import pytest
 from argon2.low_level import Type, hash_secret_raw
 
 from keyss.core import UsageError
-from keyss.keys.generation import ALPHABET
-from keyss.keys.master import MasterKey
+from keyss.keys import ALPHABET, MasterKey
 
 
 @pytest.mark.argon2

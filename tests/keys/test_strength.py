@@ -6,8 +6,7 @@ import statistics
 
 import pytest
 
-from keyss.keys import generate_key, key_strength_bits, length_for, weakness
-from keyss.keys.strength import ENOUGH_BITS
+from keyss.keys import ENOUGH_BITS, generate_key, key_strength_bits, length_for, weakness
 
 
 def test_generated_keys_are_worth_what_they_are() -> None:

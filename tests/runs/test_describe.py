@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from keyss import info
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
-from keyss.runs.describe import ModelInfo, info
+from keyss.runs import ModelInfo
 from tiny_scenes import random_gaussians
 
 

@@ -13,8 +13,7 @@ import pytest
 
 from keyss.core import OutputError, UsageError
 from keyss.files import lock, write_bytes
-from keyss.runs import MANIFEST, Manifest, RunFolder, read_manifest
-from keyss.runs.folder import clear, write_again
+from keyss.runs import MANIFEST, Manifest, RunFolder, clear, read_manifest, write_again
 
 
 def tree(folder: Path) -> dict[str, bytes]:

@@ -18,7 +18,7 @@ from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, KeyssOptions, Secret
 from keyss.core import Interrupted
 from keyss.methods import CarriedSecret, MethodOptions
-from keyss.runs.config import secret_ids
+from keyss.runs import secret_ids
 
 KEY = "a key of many characters: 93hXmQ2"
 FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)

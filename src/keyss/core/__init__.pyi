@@ -1,4 +1,5 @@
 from .alignment import align as align, up_direction as up_direction
+from .colour import OPPONENT as OPPONENT
 from .decoded import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .errors import (
     BackendError as BackendError,

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 import keyss
-from keyss.core import Gaussians, Scene, WrongKeyError
+from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
 from keyss.files import load_scene
-from keyss.fitting import FitConfig, Interrupted, Reporter, mean_psnr
+from keyss.fitting import FitConfig, Reporter, mean_psnr
 from keyss.methods import CarryOptions
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import STEGO, plain_names, writers

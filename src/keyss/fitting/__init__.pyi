@@ -18,7 +18,7 @@ from .image_metrics import (
     quality as quality,
     subsample_views as subsample_views,
 )
-from .loop import Interrupted as Interrupted, TrainingRun as TrainingRun, train as train
+from .loop import TrainingRun as TrainingRun, train as train
 from .losses import (
     Target as Target,
     photometric_loss as photometric_loss,

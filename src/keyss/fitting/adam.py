@@ -18,8 +18,6 @@ from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.simd8 import fetch_add, fused_multiply_add
 
 NUMBERS_PER_JOB = 8192
-# Options of torch's Adam that the kernel lacks.
-OTHER_OPTIONS = ("weight_decay", "amsgrad", "maximize", "capturable", "differentiable")
 
 
 @kernel
@@ -68,8 +66,8 @@ class RowAdam(torch.optim.Adam):
     """torch's Adam (Kingma and Ba 2015) with an optional `lr_scale` in each param group.
 
     `lr_scale` is a tensor that broadcasts to a row of the parameters ([16, 1] for [N, 16, 3]) and multiplies
-    the learning rate. State and other options are torch's. On a CPU, results do not depend on the number of
-    threads.
+    the learning rate. State and the options `betas`, `eps` and `fused` are torch's. On a CPU, results do not
+    depend on the number of threads.
     """
 
     add_param_group = _as_written("add_param_group")
@@ -80,11 +78,10 @@ class RowAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Take one step for all parameters with a gradient; closures are not supported."""
-        if all(_for_kernel(group) for group in self.param_groups):
-            for group in self.param_groups:
-                for parameter in group["params"]:
-                    if parameter.grad is not None:
-                        self._step_on_cpu(parameter, group)
+        pairs = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        if all(p.device.type == "cpu" and p.dtype == torch.float32 for p, _ in pairs):
+            for parameter, group in pairs:
+                self._step_on_cpu(parameter, group)
             return
         # Take torch's step at the full rate, then undo the excess.
         scaled = [group for group in self.param_groups if "lr_scale" in group]
@@ -111,11 +108,3 @@ class RowAdam(torch.optim.Adam):
         flat = (tensor.view(-1).numpy() for tensor in tensors)
         constants = (1 - beta1, 1 - beta2, (1 - beta2**step) ** -0.5, group["eps"])
         parallel.run(_adam, *flat, tuple(map(np.float32, constants)))
-
-
-def _for_kernel(group: dict[str, Any]) -> bool:
-    """True if the kernel supports the group."""
-    return not any(group[option] for option in OTHER_OPTIONS) and all(
-        parameter.device.type == "cpu" and parameter.dtype == torch.float32 and parameter.is_contiguous()
-        for parameter in group["params"]
-    )

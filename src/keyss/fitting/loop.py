@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from keyss import _threads
-from keyss.core.errors import InputError, Interrupted as Interrupted, KeyssWarning, OtherProcessError
+from keyss.core.errors import InputError, Interrupted, KeyssWarning, OtherProcessError
 from keyss.fitting.checkpoint import State, load_checkpoint, pack_state, save_checkpoint, unpack_state
 from keyss.fitting.ranks import here
 from keyss.fitting.reporting import Modelled, ModelReporter, Reporter, SilentReporter

@@ -3,7 +3,11 @@ from .derivation import (
     KeyDerivation as KeyDerivation,
     random_embeddings as random_embeddings,
 )
-from .generation import generate_key as generate_key, length_for as length_for
+from .generation import ALPHABET as ALPHABET, generate_key as generate_key, length_for as length_for
 from .key_file import normalized_key as normalized_key, read_key_file as read_key_file
 from .master import MasterKey as MasterKey
-from .strength import key_strength_bits as key_strength_bits, weakness as weakness
+from .strength import (
+    ENOUGH_BITS as ENOUGH_BITS,
+    key_strength_bits as key_strength_bits,
+    weakness as weakness,
+)

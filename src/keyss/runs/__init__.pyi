@@ -1,4 +1,10 @@
-from .config import FitRunConfig as FitRunConfig, RunConfig as RunConfig, read_config as read_config
+from .config import (
+    FitRunConfig as FitRunConfig,
+    RunConfig as RunConfig,
+    read_config as read_config,
+    secret_ids as secret_ids,
+)
+from .describe import ModelInfo as ModelInfo
 from .files import (
     CONFIG as CONFIG,
     METRICS as METRICS,
@@ -12,7 +18,9 @@ from .folder import (
     PRIVATE as PRIVATE,
     Manifest as Manifest,
     RunFolder as RunFolder,
+    clear as clear,
     read_manifest as read_manifest,
+    write_again as write_again,
 )
 from .metrics import FitMetrics as FitMetrics, HideMetrics as HideMetrics
 from .opening import HidingRun as HidingRun, open_run as open_run
