@@ -31,7 +31,7 @@ from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
-from keyss.measure.images import psnr
+from keyss.fitting import psnr
 from keyss.methods import fitted, most_visible, pruned
 from keyss.methods.records import whole
 from keyss.rendering import render

@@ -15,11 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from keyss import measure
 from keyss.channels import Colours, ColoursCover
 from keyss.core.errors import BackendError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
-from keyss.measure.robustness import changes
 from keyss.rendering.difference import psnr_between
 
 import numpy as np
@@ -61,7 +61,7 @@ def run_payloads(
             except BackendError:
                 continue
             opened[what] = opens(changed, number, data)
-            removed = changes.random_pruning(REMOVED, number)(changed)
+            removed = measure.random_pruning(REMOVED, number)(changed)
             opened[f"{what}, {REMOVED:.0%} removed"] = opens(removed, number, data)
         record = {
             "number": number,

@@ -20,7 +20,7 @@ from pathlib import Path
 from keyss.core import BackendError, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
-from keyss.measure.robustness.conversions import find_package, transform
+from keyss.measure import transform
 from keyss.rendering.difference import psnr_between
 
 import numpy as np
@@ -59,7 +59,8 @@ def writers() -> list[tuple[str, str, Writer]]:
         write_model(target, read_model(source))
 
     def gsply_spz(source: Path, target: Path) -> None:
-        gsply = find_package("gsply")
+        import gsply
+
         # It does not turn models into the frame of an .spz.
         turn = Similarity(rotation=torch.diag(torch.tensor([1.0, -1.0, -1.0])))
         model, turned = turn.apply_gaussians(read_model(source)), target.with_suffix(".turned.ply")
@@ -68,7 +69,8 @@ def writers() -> list[tuple[str, str, Writer]]:
         gsply.write_spz(target, gsply.plyread(turned), version=3)
 
     def gsply_compressed(source: Path, target: Path) -> None:
-        gsply = find_package("gsply")
+        import gsply
+
         gsply.plywrite(target, gsply.plyread(source), compressed=True)
 
     kept = [

@@ -12,7 +12,6 @@ import torch
 
 from keyss.core import Gaussians, InputError
 from keyss.many import measures
-from keyss.measure import Reopened
 from measure.stealth.careless import normalised, overwritten, plain
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -65,7 +64,7 @@ def losses(stego: Gaussians, scenes: list[Any], opens: Any, standard: bool = Tru
     """What `survival` gives of a run of which a secret opens so."""
     run = SimpleNamespace(
         stego=stego,
-        reopeners=[lambda stego: Reopened(opens(stego))],
+        openers=[lambda stego: SimpleNamespace(frame=None, reveal=lambda stego, force=False: opens(stego))],
         scenes=lambda train_pictures: scenes,
         config=SimpleNamespace(method="carry" if standard else "gs-hider"),
     )

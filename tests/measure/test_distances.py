@@ -12,8 +12,7 @@ import torch
 from scipy.stats import wasserstein_distance
 
 from keyss.core import Gaussians, UsageError
-from keyss.measure import against_controls, attribute_distances, distances
-from keyss.measure.distances import features
+from keyss.measure import against_controls, attribute_distances, distances, features
 from measure.lifelike import (
     CHANGES,
     doubled_scales,
@@ -56,18 +55,19 @@ def test_known_amounts() -> None:
 
 @pytest.mark.parametrize("count", [3000, 1700])
 @pytest.mark.parametrize("name", ["position", "opacity", "rotation"])
-def test_along_axes_they_are_scipys(count: int, name: str) -> None:
+def test_along_axes_they_are_scipys(count: int, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distances, "SLICES", 0)
     other = lifelike(count, seed=1)
     columns = zip(features(MODEL)[name].T, features(other)[name].T, strict=True)
     expected = [
         wasserstein_distance(a, b) / np.subtract(*np.quantile(a, [0.95, 0.05], method="nearest"))
         for a, b in columns
     ]
-    found = attribute_distances(MODEL, other, slices=0)[name]
+    found = attribute_distances(MODEL, other)[name]
     assert found == pytest.approx(np.mean(expected), rel=1e-4)
 
 
-def test_slices_see_what_axes_do_not() -> None:
+def test_slices_see_what_axes_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """Correlated colours and the same colours, each channel shuffled."""
     generator = torch.Generator().manual_seed(0)
     grey = torch.randn(3000, 1, 1, generator=generator).expand(-1, 16, 3).clone()
@@ -75,8 +75,9 @@ def test_slices_see_what_axes_do_not() -> None:
     for channel in range(3):
         mixed[:, 0, channel] = grey[torch.randperm(3000, generator=generator), 0, channel]
     one, two = replace(MODEL, sh=grey), replace(MODEL, sh=mixed)
-    assert attribute_distances(one, two, slices=0)["colour"] < 1e-6
     assert attribute_distances(one, two)["colour"] > 0.05
+    monkeypatch.setattr(distances, "SLICES", 0)
+    assert attribute_distances(one, two)["colour"] < 1e-6
 
 
 def test_another_way_to_write_the_same_gaussians_is_no_distance() -> None:

@@ -14,9 +14,15 @@ from torch import Tensor
 import keyss
 from keyss.core import Gaussians, Similarity, UsageError
 from keyss.keys import random_embeddings
-from keyss.measure import AttackResult, decoder_attack, file_attacks, look_for_secret
-from keyss.measure.leaks.attacks import THRESHOLDS, Attack, with_the_key
-from keyss.measure.leaks.scores import scores
+from keyss.measure import (
+    Attack,
+    AttackResult,
+    decoder_attack,
+    file_attacks,
+    leak_scores,
+    look_for_secret,
+    with_the_key,
+)
 from keyss.methods import Decoder, DecoderShape, HiddenSecret
 from keyss.methods.keyss.decoder import RESIDUAL_UNITS
 from keyss.rendering import render
@@ -27,6 +33,9 @@ Rows = dict[str, AttackResult]
 COVER, SECRET = tiny_scene(0), tiny_scene(1)
 TURN = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
 FRAME = Similarity(0.8, TURN * TURN.det().sign(), torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64))
+SECRET_IN_COVER = replace(
+    SECRET, test=tuple(replace(view, camera=FRAME.apply_camera(view.camera)) for view in SECRET.test)
+)
 HIDDEN = FRAME.apply_gaussians(random_gaussians(seed=1))  # the secret where it lies in the cover's frame
 
 
@@ -46,7 +55,7 @@ PLAINS = [_plain(seed) for seed in range(2)]
 
 def _look(stego: Gaussians, more: Sequence[Attack] = ()) -> Rows:
     attacks = [*file_attacks(COVER, cover_views=4), *more]
-    rows, _ = look_for_secret(stego, PLAINS, SECRET, FRAME, attacks)
+    rows, _ = look_for_secret(stego, PLAINS, SECRET_IN_COVER, attacks)
     return {row.attack: row for row in rows}
 
 
@@ -76,7 +85,6 @@ def test_transparent_hidden_gaussians_are_found_by_their_opacity() -> None:
     for name in ("restored opacities", "rescaled opacities", "matched opacities", "inverted opacities"):
         assert rows[name].leak.gradient > 0.3, name
         assert rows[name].leak.psnr_fitted > 3, name
-        assert rows[name].scores.gradient > rows[name].control_max.gradient + 0.3, name
     assert rows["restored opacities"].best != "all"
 
 
@@ -97,12 +105,12 @@ def test_a_group_of_its_own_is_found_by_what_sets_it_apart(attribute: str) -> No
 
 def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
     cover = _plain(0)
-    for threshold in THRESHOLDS:  # keep off what a low bit could decide
+    for threshold in (0.01, 0.05, 0.2):  # keep off what a low bit could decide
         close = (cover.opacities - threshold).abs() < 0.01 * threshold
         cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
     carried = keyss.hide(cover, [secret], method="carry", width=40).stego
-    rows, pictures = look_for_secret(carried, [cover], SECRET, FRAME, file_attacks(COVER, cover_views=4))
+    rows, pictures = look_for_secret(carried, [cover], SECRET_IN_COVER, file_attacks(COVER, cover_views=4))
     for row in rows:
         if not row.attack.endswith("opacities"):
             assert row.leak.gradient < 0.15, row.attack  # of these a low bit may decide some
@@ -112,21 +120,26 @@ def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
         assert (picture[:, :40] - picture[:, 44:84]).abs().max() <= 2, row.attack
 
 
-def test_more_views_are_no_more_leak() -> None:
-    """Who tries something twice tries it twice on plain models too: rows depend on what is shown only."""
-    attacks = file_attacks(COVER, cover_views=2)[:1]
-    twice = [replace(each, show=lambda model, show=each.show: [*show(model)] * 2) for each in attacks]
-    once_rows, _ = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
-    twice_rows, _ = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, twice)
-    assert twice_rows == [replace(row, views=2 * row.views) for row in once_rows]
+def test_more_variants_are_no_more_leak() -> None:
+    """An attack that tries something twice tries it twice on plain models too."""
+    (attack,) = file_attacks(COVER, cover_views=2)[:1]
+
+    def twice(model: Gaussians) -> Iterator[tuple[str, Gaussians]]:
+        for label, variant in attack.show(model):
+            yield label, variant
+            yield f"{label}, again", variant
+
+    attacks = [attack, replace(attack, show=twice)]
+    one, two = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET_IN_COVER, attacks)[0]
+    assert one == two
 
 
 def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_photo() -> None:
     attacks = [
         each for each in file_attacks(COVER, cover_views=2) if each.name in ("clusters", "least contribution")
     ]
-    rows, pictures = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
-    again, same = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET, FRAME, attacks)
+    rows, pictures = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET_IN_COVER, attacks)
+    again, same = look_for_secret(_with_hidden(-5.0), PLAINS, SECRET_IN_COVER, attacks)
     assert rows == again
     assert list(pictures) == [row.attack for row in rows]
     for name, picture in pictures.items():
@@ -138,22 +151,22 @@ def test_rows_are_the_same_again_and_pictures_show_what_was_seen_beside_the_phot
 
 def test_the_picture_shows_the_variant_that_is_judged() -> None:
     """Of two, the one with the secret's shapes, and not the haze, whichever comes first."""
-    camera = FRAME.apply_camera(SECRET.test[0].camera)
-    image = render(HIDDEN, camera, SECRET.background).clamp(0, 1)
+    image = render(HIDDEN, SECRET_IN_COVER.test[0].camera, SECRET.background).clamp(0, 1)
     planted = {"shapes": HIDDEN, "haze": random_gaussians(1500, seed=7)}
     for order in (["shapes", "haze"], ["haze", "shapes"]):
 
         def show(model: Gaussians, order: list[str] = order) -> Iterator[tuple[str, Gaussians]]:
             return ((name, model if model is PLAINS[0] else planted[name]) for name in order)
 
-        attack = Attack("planted", "", {}, show)
-        (row,), pictures = look_for_secret(_plain(5), PLAINS[:1], SECRET, FRAME, [attack])
+        attack = Attack("planted", "", show)
+        (row,), pictures = look_for_secret(_plain(5), PLAINS[:1], SECRET_IN_COVER, [attack])
         assert row.best == "shapes"
         picture = pictures["planted"][:, :40].float() / 255
         assert float((picture - image).abs().max()) < 0.01
         assert 1 < row.best_leak.evidence() <= row.leak.evidence()
-        views = [replace(view, camera=FRAME.apply_camera(view.camera)) for view in SECRET.test]
-        assert row.best_leak == scores(HIDDEN, views, SECRET.background) - row.control
+        control = row.scores - row.leak
+        expected = leak_scores(HIDDEN, SECRET_IN_COVER.test, SECRET.background) - control
+        assert asdict(row.best_leak) == pytest.approx(asdict(expected))
 
 
 def _decoder(conditioning: Literal["gate", "bias"]) -> HiddenSecret:
@@ -169,9 +182,9 @@ def test_a_decoder_with_a_bias_is_searched() -> None:
     decode = _decoder("bias").decode
     assert decode is not None
     search = decoder_attack(decode, restarts=2, steps=3)
-    as_it_is = Attack("as it is", "", {}, lambda model: iter([("as it is", model)]))
-    searched, shown = look_for_secret(PLAINS[0], PLAINS, SECRET, FRAME, [search, as_it_is])[0]
-    assert searched.views == 6
+    assert len(list(search.show(PLAINS[0]))) == 6
+    as_it_is = Attack("as it is", "", lambda model: iter([("as it is", model)]))
+    searched, shown = look_for_secret(PLAINS[0], PLAINS, SECRET_IN_COVER, [search, as_it_is])[0]
     assert asdict(searched.scores) == pytest.approx(asdict(shown.scores))
 
 
@@ -183,14 +196,13 @@ def test_a_gate_shows_the_cover_without_its_key_and_the_secret_with_it() -> None
     key = with_the_key(lambda model: opened.reveal(model, frame="cover", force=True))
     rows = _look(stego, [decoder_attack(opened.decode), key])
     assert [row.attack for row in rows.values() if row.with_key] == ["with the key"]
-    assert rows["with the key"].scores.psnr > 30
+    assert rows["with the key"].scores.psnr_fitted > 30
     assert rows["with the key"].leak.gradient > 0.8
-    assert rows["decoder without its key"].views == 6
     assert abs(rows["decoder without its key"].leak.gradient) < 0.06
 
 
 def test_nothing_to_compare_with_is_refused() -> None:
     with pytest.raises(UsageError, match="plain model"):
-        look_for_secret(PLAINS[0], [], SECRET, FRAME, [])
+        look_for_secret(PLAINS[0], [], SECRET_IN_COVER, [])
     with pytest.raises(UsageError, match="no test views"):
-        look_for_secret(PLAINS[0], PLAINS, replace(SECRET, test=()), FRAME, [])
+        look_for_secret(PLAINS[0], PLAINS, replace(SECRET, test=()), [])

@@ -15,19 +15,9 @@ from channels.low_bits.trained_like import trained_like
 from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
 from keyss.files import write_model
-from keyss.measure import (
-    FileSize,
-    ReaderResult,
-    Reopened,
-    Reopener,
-    measure_speed,
-    readers,
-    render_time,
-    speed as module,
-)
-from keyss.measure.speed import reveal_seconds
-from keyss.methods import open_model
-from keyss.methods.base import Opened
+from keyss.measure import ReaderResult, measure_speed, readers, render_time, reveal_seconds, speed as module
+from keyss.methods import Opened, open_model
+from measure.opened import Whole
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -64,11 +54,9 @@ def test_the_ratio_is_that_of_the_times_whatever_else_the_machine_does(
         return torch.zeros(1)
 
     monkeypatch.setattr(module, "render", render)
-    found = render_time("m", random_gaussians(30), random_gaussians(20), tiny_scene(), views=2, rounds=6)
+    found = render_time(random_gaussians(30), random_gaussians(20), tiny_scene(), views=2, rounds=6)
     assert found.ratio == pytest.approx(1.5, rel=1e-6)
-    assert (found.gaussians, found.plain_gaussians) == (30, 20)
     assert len(drawn) == 2 * 2 * 7
-    assert found.seconds == pytest.approx(1.5 * found.plain_seconds)
     assert found.seconds < 30 * 6 / 1000
     # Neither of both always comes first.
     assert {tuple(drawn[i : i + 2]) for i in range(0, len(drawn), 2)} == {(30, 20), (20, 30)}
@@ -78,21 +66,22 @@ def test_a_model_takes_longer_than_a_hundredth_of_it(monkeypatch: pytest.MonkeyP
     """Really drawn, in time of this process, which others do not take."""
     monkeypatch.setattr(time, "perf_counter", time.process_time)
     scene, model = tiny_scene(), random_gaussians(3000)
-    found = render_time("m", model, model[:30], scene)
+    found = render_time(model, model[:30], scene)
     assert found.ratio > 1
-    assert 0 < found.plain_seconds < found.seconds
+    assert found.seconds > 0
 
 
 def test_revealing_is_timed_from_file_to_file(clock: Clock, tmp_path: Path) -> None:
     write_model(tmp_path / "in.ply", random_gaussians(10))
     waits = iter([5.0, 1.0, 2.0])
 
-    def reopen(model: Gaussians) -> Reopened:
+    def opener(model: Gaussians) -> Whole:
         clock.pass_(next(waits))
-        return Reopened(model[:4])
+        return Whole(model[:4])
 
-    assert reveal_seconds(tmp_path / "in.ply", reopen, tmp_path / "out.ply") == pytest.approx(2.0)
-    assert plyfile.PlyData.read(tmp_path / "out.ply")["vertex"].count == 4
+    file, seconds = reveal_seconds(tmp_path / "in.ply", opener, tmp_path / "out")
+    assert (file, seconds) == (tmp_path / "out.ply", pytest.approx(2.0))
+    assert plyfile.PlyData.read(file)["vertex"].count == 4
 
 
 # --- readers ---------------------------------------------------------------------------------------------
@@ -164,29 +153,29 @@ def test_speed_of_a_carried_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     scenes: list[Scene] = [tiny_scene(0, views=8), tiny_scene(1, views=8)]
     cover, secret = trained_like(1000), trained_like(300, seed=1)
     write_model(tmp_path / "stego.ply", embed(cover, [(KEY, secret)]))
-    steps: list[tuple[int, int, str]] = []
+    steps: list[tuple[int, int]] = []
 
-    def slowly(model: Gaussians, key: str) -> Opened:
+    def slowly(model: Gaussians) -> Opened:
         time.sleep(0.05)
-        return open_model(model, key)
+        return open_model(model, KEY)
 
     found = measure_speed(
         tmp_path / "stego.ply",
-        [Reopener(KEY, slowly)],
+        [slowly],
         scenes,
         [cover, secret],
         rounds=2,
         progress=lambda *step: steps.append(step),
     )
     write_model(tmp_path / "secret.ply", secret)  # the same size as the revealed file
-    assert found.files == (
-        FileSize("stego", (tmp_path / "stego.ply").stat().st_size),
-        FileSize("secret 1", (tmp_path / "secret.ply").stat().st_size),
-    )
-    assert [(each.model, each.gaussians) for each in found.render] == [("stego", 1000), ("secret 1", 300)]
+    assert found.bytes == {
+        "stego": (tmp_path / "stego.ply").stat().st_size,
+        "secret 1": (tmp_path / "secret.ply").stat().st_size,
+    }
+    assert list(found.render) == ["stego", "secret 1"]
     assert len(found.reveal_seconds) == 1
     assert 0.05 <= found.reveal_seconds[0] < 60
     assert {(each.file, each.reader) for each in found.readers if each.loads} == {
         (model, reader) for model in ("stego", "secret 1") for reader in ("plyfile", "gsply")
     }
-    assert steps == [(0, 2, "stego"), (1, 2, "secret 1"), (2, 2, "")]
+    assert steps == [(0, 2), (1, 2)]

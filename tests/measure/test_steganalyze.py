@@ -95,15 +95,6 @@ def test_the_threshold_decides(run: Run, folder: Path, tmp_path: Path) -> None:
         steganalyze(folder, threshold=float("nan"))
 
 
-def test_fast_leaves_what_looks_clean(run: Run, folder: Path, tmp_path: Path) -> None:
-    assert run(folder, "--csv", tmp_path / "a.csv", "--fast")[0] == 0
-    _, full, clean = table(tmp_path / "a.csv")
-    assert (full["flagged"], clean["flagged"]) == ("true", "false")
-    assert full["rs"] != "null"
-    assert clean["rs"] == "null"
-    assert clean["fusion"] == clean["primary_sets"]
-
-
 def test_nothing_is_replaced_unasked(run: Run, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "scores.csv"
     out.write_text("mine")
@@ -140,7 +131,7 @@ def test_help_shows_an_example(run: Run) -> None:
     status, said, _ = run("--help")
     assert status == 0
     assert "example: keyss steganalyze images/ --csv scores.csv" in said
-    for option in ("--csv", "--threshold", "--fast", "--overwrite"):
+    for option in ("--csv", "--threshold", "--overwrite"):
         assert option in said
 
 

@@ -16,11 +16,10 @@ from scipy.stats import chi2
 
 from keyss.core import InputError, UsageError
 from keyss.files import images
-from keyss.measure import score_file, score_image
-from keyss.measure.lsb_detectors import _rate
-from keyss.measure.stegexpose import DETECTORS, Scores, read_pixels
+from keyss.measure import Scores, lsb_detectors, read_pixels, score_file, score_image
 from measure import stegexpose_literal as literal
 
+DETECTORS = ("primary_sets", "chi_square", "sample_pairs", "rs")
 Pixels = npt.NDArray[np.uint8]
 
 
@@ -115,7 +114,7 @@ class TestByHand:
 
     def test_rs_at_its_pole(self) -> None:
         """4 x² - 1 = 0: of the roots -1/2 and 1/2 the positive, at which x / (x - 1/2) is taken for 0."""
-        assert _rate(np.array([[1, 0], [2, 0]]), np.array([[1, 0], [0, 2]])) == 0
+        assert lsb_detectors._rate(np.array([[1, 0], [2, 0]]), np.array([[1, 0], [0, 2]])) == 0
 
     def test_nothing_answers(self) -> None:
         scores = score_image(grey([[7]]))
@@ -187,19 +186,6 @@ class TestPayloads:
 
     def test_the_mean_tells_a_full_image_from_an_empty_one(self, found: list[Scores]) -> None:
         assert found[0].fusion < 0.2 < found[-1].fusion
-
-
-class TestStoppingEarly:
-    def test_a_clean_image_is_left_after_the_first_detector(self) -> None:
-        scores = score_image(np.zeros((300, 300, 3), dtype=np.uint8), stop_below=0.2)
-        assert scores == Scores(0.0, None, None, None, 0.0)
-
-    def test_without_an_answer_it_goes_on(self) -> None:
-        """Primary Sets is NaN, Sample Pairs 1, Chi Square None: RS is asked."""
-        assert score_image(grey([[2, 3], [2, 3]]), stop_below=0.2).rs is not None
-
-    def test_nothing_is_below_zero(self) -> None:
-        assert score_image(smooth(), stop_below=0.0) == score_image(smooth())
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ import torch
 from sklearn.metrics import roc_auc_score
 
 from keyss.core import Gaussians, UsageError
-from keyss.measure import Auc, two_sample_against_controls, two_sample_auc
-from keyss.measure.auc import delong
+from keyss.measure import Auc, beside_controls, delong, two_sample_auc
 from measure.lifelike import (
     doubled_scales,
     lifelike,
@@ -85,13 +84,13 @@ def test_delong_is_what_it_is_defined_as() -> None:
 def test_against_plain_models() -> None:
     plain = [lifelike(300, seed).with_sh_degree(0) for seed in (1, 2)]
     model = tripled_positions(lifelike(300).with_sh_degree(0))
-    found = two_sample_against_controls(model, plain, original=plain[0])
+    found = beside_controls(two_sample_auc, model, plain, plain[0])
     assert len(found.stego) == 2
     assert found.stego[1] == two_sample_auc(plain[1], model)
     assert found.control == (two_sample_auc(*plain),)
     assert found.original == (two_sample_auc(plain[0], plain[0]), two_sample_auc(plain[1], plain[0]))
     assert min(each.auc for each in found.stego) > 0.85 > 0.6 > found.control[0].auc
-    assert two_sample_against_controls(model, plain).original == ()
+    assert beside_controls(two_sample_auc, model, plain).original == ()
 
 
 def test_too_little_is_refused() -> None:
@@ -99,5 +98,3 @@ def test_too_little_is_refused() -> None:
         two_sample_auc(MODEL, MODEL[:99])
     with pytest.raises(UsageError, match="too few places"):
         two_sample_auc(MODEL, replace(MODEL, means=0 * MODEL.means + torch.arange(800)[:, None] // 400))
-    with pytest.raises(UsageError, match="two control models"):
-        two_sample_against_controls(MODEL, [MODEL])

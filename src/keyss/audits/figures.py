@@ -46,11 +46,11 @@ def losses(rows: Sequence[ChangeResult]) -> list[Markup]:
     share one grey row.
     """
     count = max((len(row.secrets) for row in rows), default=0)
-    found = []
+    figures = []
     for index in range(min(count, _MAX_PLOTTED)):
         if curves := _curves(rows, index):
-            found.append(_losses(numbered("secret", index, count), curves))
-    return found
+            figures.append(_losses(numbered("secret", index, count), curves))
+    return figures
 
 
 def _curves(rows: Sequence[ChangeResult], index: int) -> dict[str, Curve]:

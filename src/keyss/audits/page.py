@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from itertools import zip_longest
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
@@ -14,12 +14,12 @@ import msgspec
 from markupsafe import Markup, escape
 
 from keyss.audits import numbers
-from keyss.audits.record import Audit, ImagesResult
+from keyss.audits.record import Audit, ModelImages
 from keyss.audits.summary import auc_text, headline, missing_readers, verdicts, worst_leak
 from keyss.audits.untrusted import AuditPictures, check_bounds, clean
 from keyss.core import InputError, import_extra
 from keyss.measure.images import ImageComparison
-from keyss.measure.robustness.survival import mean_over_draws
+from keyss.measure.robustness.survival import breakdown_points
 from keyss.viewer.page import embedding_rules, page_with
 from keyss.viewer.showing import is_readable
 
@@ -86,17 +86,19 @@ def page(audit: Audit, pictures: AuditPictures, published: Published) -> str:
     """A whole HTML document. Raises InputError for pictures and curves that are not as they should be."""
     script = _asset("slider.js")
     lines, notes = verdicts(audit), _not_measured(audit)
-    found = {  # of each section the title, and what it shows
+    models = audit.images.models if audit.images else ()
+    all_photos = all(model.photos for model in models)
+    sections = {  # title and content
         "verdict": ("Verdict", lines),
         "pictures": ("Pictures", audit.images and audit.images.pictures),
         "published": ("The published model", published),
-        "images": (f"Against the test {'photos' if all(audit.run.photos) else 'views'}", audit.images),
+        "images": (f"Against the test {'photos' if all_photos else 'views'}", audit.images),
         "wrong-keys": ("Wrong keys", audit.wrong_key),
         "leaks": ("Leaks without the key", audit.leaks),
         "stealth": ("The file by itself", audit.stealth),
         "statistics": ("The model's statistics", audit.parameters),
         "renders": ("Detectors on renders", audit.stegexpose),
-        "robustness": ("What survives", audit.robustness),
+        "robustness": ("Robustness", audit.robustness),
         "speed": ("Speed, files and readers", audit.speed),
         "not-measured": ("Not measured", notes),
         "configuration": ("Configuration and versions", audit.run.config or audit.run.versions),
@@ -107,16 +109,16 @@ def page(audit: Audit, pictures: AuditPictures, published: Published) -> str:
         .render(
             audit=audit,
             title=_title(audit),
-            sections={name: title for name, (title, content) in found.items() if content},
+            sections={name: title for name, (title, content) in sections.items() if content},
             pictures=pictures,
             published=published,
             lines=lines,
             headline=headline(lines),
             notes=notes,
-            comparisons=_comparisons(audit.images) if audit.images else [],
+            comparisons=_comparisons(models),
             worst_leak=worst_leak,
-            all_photos=all(audit.run.photos),
-            changes=mean_over_draws(audit.robustness.changes) if audit.robustness else [],
+            all_photos=all_photos,
+            breakdown_points=breakdown_points(audit.robustness or ()),
             style=Markup("".join(map(_asset, _STYLES))),
             script=Markup(script),
             policy=_policy(script, viewer=published.page is not None),
@@ -190,18 +192,15 @@ def _title(audit: Audit) -> str:
     return f"{' and '.join(secrets) or 'A secret'}, hidden in {cover}"
 
 
-def _comparisons(images: ImagesResult) -> list[tuple[str, ImageComparison, int | None]]:
+def _comparisons(models: Sequence[ModelImages]) -> list[tuple[str, ImageComparison, int | None]]:
     """Name, comparison and number of Gaussians of each model, each followed by its baseline."""
-    compared = [images.cover, *images.secrets]
-    baselines = [images.cover_baseline, *images.secret_baselines]
-    models = list(zip_longest(compared, images.gaussians, baselines, images.baseline_gaussians))
-    found = []
-    for index, (own, gaussians, baseline, others) in enumerate(models[: len(compared)]):
-        name = numbers.numbered("secret", index - 1, len(images.secrets)) if index else "cover"
-        found.append((f"{name}, {'revealed' if index else 'stego model'}", own, gaussians))
-        if baseline is not None:
-            found.append((f"{name}, plain model (baseline)", baseline, others))
-    return found
+    rows: list[tuple[str, ImageComparison, int | None]] = []
+    for index, model in enumerate(models):
+        kind = "revealed" if index else "stego model"
+        rows.append((f"{model.scene}, {kind}", model.images, model.gaussians))
+        if model.baseline is not None:
+            rows.append((f"{model.scene}, plain model (baseline)", model.baseline, model.baseline_gaussians))
+    return rows
 
 
 def _not_measured(audit: Audit) -> list[str]:

@@ -1,4 +1,4 @@
-"""The finished parts of an audit, stored so that an interrupted one resumes, and its progress."""
+"""Finished parts of an audit, from which an interrupted one resumes, and its progress."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ class FinishedParts:
 
 
 class PartProgress:
-    """Progress of one part: call it with (done, total, current item)."""
+    """Progress of one part: call it with the numbers of items done and of all."""
 
     def __init__(self, reporter: Reporter, title: str) -> None:
         self._reporter, self._title, self._total = reporter, title, 0
 
-    def __call__(self, done: int, total: int, at: str = "") -> None:
+    def __call__(self, done: int, total: int) -> None:
         if not self._total:
             self._reporter.start(self._title, total, 0)
         self._total = total

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import InputError
-from keyss.measure.auc import StegExposeAuc
-from keyss.measure.distances import AttributeDistance
+from keyss.measure.auc import Auc
+from keyss.measure.distances import AttributeDistance, Beside
 from keyss.measure.hiding import WrongKeys
 from keyss.measure.images import ImageComparison
 from keyss.measure.leaks.looking import AttackResult
-from keyss.measure.robustness.survival import BreakdownPoint, ChangeResult
+from keyss.measure.robustness.survival import ChangeResult
 from keyss.measure.sinkhorn import Sinkhorn3D
 from keyss.measure.speed import SpeedResult
 from keyss.measure.stealth.judging import StealthResult
-from keyss.measure.two_sample import TwoSample
+from keyss.measure.stegexpose import StegExposeAuc
 from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
@@ -35,7 +35,6 @@ class AuditedRun:
     secrets: tuple[str, ...]
     width: int | None  # pixels, if photos were shrunk
     gaussians: int  # of the stego model
-    photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     standard: bool = True  # whether a 3DGS model is published
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
@@ -43,64 +42,34 @@ class AuditedRun:
 
 
 @dataclass(frozen=True)
-class Controls:
-    """Plain models of the cover from other seeds."""
+class ModelImages:
+    """The stego model or a revealed secret against the test views of its scene, beside a plain model."""
 
-    models: int
-    seeds: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class WrongKeyResult:
-    """What wrong keys show, from the run's `metrics.json`."""
-
-    shown: WrongKeys
-    chance_level: tuple[float, ...]  # dB, the stego model itself against each secret's test views
-
-
-@dataclass(frozen=True)
-class LabelledPicture:
-    label: str
-    file: str  # in the audit's folder
-
-
-@dataclass(frozen=True)
-class PicturedView:
-    """Pictures of one view by several models."""
-
-    title: str
-    items: tuple[LabelledPicture, ...]
+    scene: str  # "cover", "secret", or "secret N" of several
+    photos: bool  # False: test views are renders of a given model
+    images: ImageComparison
+    gaussians: int
+    baseline: ImageComparison | None  # of the plain model; this and the next are None without one
+    baseline_gaussians: int | None
 
 
 @dataclass(frozen=True)
 class ImagesResult:
-    """Cover and secrets against the test views, with plain models as baselines if there are any."""
+    """Cover and secrets against the test views."""
 
-    cover: ImageComparison
-    cover_baseline: ImageComparison | None
-    secrets: tuple[ImageComparison, ...]
-    secret_baselines: tuple[ImageComparison | None, ...]
-    gaussians: tuple[int, ...]  # of the stego model and of the revealed secrets
-    baseline_gaussians: tuple[int | None, ...]  # of the plain models
-    pictures: tuple[PicturedView, ...]
-
-
-@dataclass(frozen=True)
-class SinkhornResult:
-    """3D-Sinkhorn as published, from the cover's plain model."""
-
-    stego: Sinkhorn3D
-    control: tuple[Sinkhorn3D, ...]
-    score: float  # composite score (KeySS, eq. 10)
+    models: tuple[ModelImages, ...]  # of the cover, then of the secrets
+    pictures: dict[str, dict[str, str]]  # files in the audit's folder by view and by model
 
 
 @dataclass(frozen=True)
 class ParametersResult:
     """Distances of the stego model's parameters from those of plain models."""
 
-    sinkhorn: SinkhornResult
+    sinkhorn: Sinkhorn3D  # as published, from the cover's plain model
+    sinkhorn_controls: tuple[Sinkhorn3D, ...]
+    score: float  # composite score (KeySS, eq. 10)
     distances: dict[str, AttributeDistance]
-    two_sample: TwoSample
+    two_sample: Beside[Auc]
 
 
 @dataclass(frozen=True)
@@ -112,37 +81,23 @@ class RendersResult:
     control: StegExposeAuc  # one control against another
 
 
-@dataclass(frozen=True)
-class LeaksResult:
-    """What attacks without the key show of each secret."""
-
-    secrets: tuple[tuple[AttackResult, ...], ...]
-
-
-@dataclass(frozen=True)
-class RobustnessResult:
-    """What changes of the stego model cost."""
-
-    changes: tuple[ChangeResult, ...]
-    breakdown_points: tuple[BreakdownPoint, ...]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Audit:
     """The result of an audit; parts that did not run are None."""
 
-    version: int = 3
+    version: int = 4
     keyss: str  # version of the program
     seconds: float
     run: AuditedRun
-    controls: Controls
-    wrong_key: WrongKeyResult | None = None
+    controls: tuple[int, ...]  # seeds of the plain models of the cover to compare with
+    wrong_key: WrongKeys | None = None  # from the run's `metrics.json`, like the chance level
+    chance_level: tuple[float, ...] = ()  # dB, the stego model itself against each secret's test views
     images: ImagesResult | None = None
     parameters: ParametersResult | None = None
     stealth: StealthResult | None = None
     stegexpose: RendersResult | None = None
-    leaks: LeaksResult | None = None
-    robustness: RobustnessResult | None = None
+    leaks: tuple[tuple[AttackResult, ...], ...] | None = None  # attacks on each secret
+    robustness: tuple[ChangeResult, ...] | None = None
     speed: SpeedResult | None = None
 
 

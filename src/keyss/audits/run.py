@@ -1,4 +1,4 @@
-"""The audit of a run: all measures in turn, each stored as soon as it is finished."""
+"""The audit of a run: takes all measures in turn and stores each as soon as it is finished."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ from keyss.audits.record import (
     PICTURES,
     Audit,
     AuditedRun,
-    Controls,
-    WrongKeyResult,
     read_audit,
 )
 from keyss.audits.subject import AuditSubject, subject_of
@@ -85,11 +83,11 @@ def audit(
             f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
         )
     target = resolve_device(device)
-    asked = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
+    settings = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
     folder = RunFolder(
         opened.folder,
         "audit",
-        asked | {"seed": seed, "device": target.type, "payloads": opened.config.payloads},
+        settings | {"seed": seed, "device": target.type, "payloads": opened.config.payloads},
         onto=KEPT,
         writes=(f"{AUDIT_FOLDER}/{AUDIT_FILE}", REPORT),
         overwrite=overwrite,
@@ -115,20 +113,19 @@ def audit(
                     progress.finish(finished.has(name))
             sections[name], own = finished.take(name)
             pictures |= own
-        shown = opened.metrics.wrong_key
-        wrong_key = None if shown is None else WrongKeyResult(shown, opened.metrics.chance_level)
-        found = Audit(
+        result = Audit(
             keyss=__version__,
             seconds=round(time.monotonic() - started, 1),
             run=_audited_run(opened),
-            controls=Controls(controls, subject.seeds),
-            wrong_key=wrong_key,
+            controls=subject.seeds,
+            wrong_key=opened.metrics.wrong_key,
+            chance_level=opened.metrics.chance_level,
             **sections,
         )
         files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
-        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": found, **files}))
-        folder.write(writers({REPORT: report_bytes(found, there, stego_in(opened.folder))}))
-    return found
+        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **files}))
+        folder.write(writers({REPORT: report_bytes(result, there, stego_in(opened.folder))}))
+    return result
 
 
 def _report(run: Path) -> Audit:
@@ -137,10 +134,10 @@ def _report(run: Path) -> Audit:
     import_extra("matplotlib", "audit", "write a report")
     from keyss.audits.page import report_bytes
 
-    found = read_audit(run)
-    data = report_bytes(found, run, stego_in(run))
+    result = read_audit(run)
+    data = report_bytes(result, run, stego_in(run))
     write_again(run, "audit", REPORT, partial(write_bytes, data=data))
-    return found
+    return result
 
 
 def _inputs(subject: AuditSubject, seed: int) -> dict[str, object]:
@@ -164,7 +161,6 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         secrets=tuple(secrets),
         width=run.config.views.width,
         gaussians=len(run.stego),
-        photos=run.metrics.photos,
         standard=registry.get(run.config.method).capabilities.standard,
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as reading gives it back
         up=usual_up(cover),

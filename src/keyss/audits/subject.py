@@ -1,4 +1,4 @@
-"""What an audit measures: a run opened with its keys, and plain models to compare it with."""
+"""The input of an audit: a run opened with its keys, and plain models to compare it with."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ import torch
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.reporting import Reporter
-from keyss.measure.hiding import frame_of
-from keyss.measure.robustness.survival import Reopener
+from keyss.measure.hiding import in_cover
 from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun
@@ -32,32 +30,14 @@ class AuditSubject:
 
     run: HidingRun
     scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
+    in_cover: tuple[Scene, ...]  # the secrets with their test cameras in the cover's frame
     stego: Gaussians
     revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
-    frames: tuple[Similarity, ...]  # from those to the cover's
     original: Gaussians  # plain model of the cover
     baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, if there are any
     controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
     seeds: tuple[int, ...]  # of the controls
     device: torch.device
-
-    @property
-    def cover(self) -> Scene:
-        return self.scenes[0]
-
-    @property
-    def models(self) -> tuple[Gaussians, ...]:
-        """The published model, then the revealed secrets."""
-        return (self.stego, *self.revealed)
-
-    @property
-    def reopeners(self) -> list[Reopener]:
-        """Functions that reveal the secrets in a changed model."""
-        return self.run.reopeners
-
-    @property
-    def secrets(self) -> tuple[Scene, ...]:
-        return self.scenes[1:]
 
 
 def subject_of(
@@ -89,16 +69,14 @@ def subject_of(
     return AuditSubject(
         run=run,
         scenes=tuple(scenes),
+        in_cover=tuple(in_cover(*pair, scenes[0]) for pair in zip(run.opened, scenes[1:], strict=True)),
         stego=stego,
         revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
-        frames=tuple(
-            frame_of(secret, scene, scenes[0]) for secret, scene in zip(run.opened, scenes[1:], strict=True)
-        ),
         original=plain.to(device),
         baselines=tuple(None if model is None else model.to(device) for model in baselines),
         controls=tuple(
-            _plain_model(scenes[0], replace(config, seed=each), folder, device, reporter).to(device)
-            for each in seeds
+            _plain_model(scenes[0], replace(config, seed=own), folder, device, reporter).to(device)
+            for own in seeds
         ),
         seeds=seeds,
         device=device,
@@ -108,7 +86,7 @@ def subject_of(
 def _plain_model(
     scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
 ) -> Gaussians:
-    """A plain model of a scene, from the run's folder if it is there under the same name."""
+    """A plain model of a scene, from the run's folder if it was fitted there before."""
     made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
     name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
     model = f"{CONTROLS}/{name}.ply"

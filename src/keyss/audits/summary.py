@@ -14,10 +14,8 @@ from typing import Literal
 from keyss.audits.numbers import decibel, difference, number, numbered, significant, times
 from keyss.audits.record import Audit
 from keyss.measure.auc import Auc
-from keyss.measure.images import ImageComparison
 from keyss.measure.leaks.looking import AttackResult
 from keyss.measure.leaks.scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT
-from keyss.measure.robustness.survival import mean_over_draws
 
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference
@@ -32,9 +30,6 @@ PRUNING, PRUNED = "random pruning", 0.25  # the attack, and its share of the Gau
 PRUNING_LOSS = 1.5  # dB that the secret may lose more than the cover
 
 Word = Literal["fine", "visible", "missed", "not measured"]
-
-
-JUDGED: tuple[Word, ...] = ("fine", "visible", "missed")
 
 
 @dataclass(frozen=True)
@@ -66,15 +61,16 @@ def verdicts(audit: Audit) -> list[Verdict]:
 
 def headline(lines: Sequence[Verdict]) -> str:
     """The summary in one or two sentences."""
-    if all(line.word not in JUDGED for line in lines):
+    judged = [line for line in lines if line.word != "not measured"]
+    if not judged:
         return "Nothing was measured that could be judged."
-    fine, judged = (sum(line.word in words for line in lines) for words in (("fine",), JUDGED))
-    if fine == judged == 1:
+    fine = sum(line.word == "fine" for line in judged)
+    if fine == len(judged) == 1:
         parts = ["The one measure is within its limit."]
-    elif fine == judged:
+    elif fine == len(judged):
         parts = [f"All {fine} measures are within their limits."]
     else:
-        parts = [f"{fine} of {judged} measures are within their limits."]
+        parts = [f"{fine} of {len(judged)} measures are within their limits."]
     for word in ("visible", "missed", "not measured"):
         names = [line.measure for line in lines if line.word == word]
         if names:
@@ -82,41 +78,9 @@ def headline(lines: Sequence[Verdict]) -> str:
     return " ".join(parts)
 
 
-def auc_text(found: Auc | None) -> str:
+def auc_text(auc: Auc) -> str:
     """An AUC with its interval: 0.54 (0.43 to 0.65)."""
-    if found is None:
-        return number(None)
-    return f"{number(found.auc, 2)} ({number(found.low, 2)} to {number(found.high, 2)})"
-
-
-def _qualities(audit: Audit) -> Iterator[Verdict]:
-    if audit.images is None:
-        return
-    images, count = audit.images, len(audit.images.secrets)
-    rows: list[tuple[str, ImageComparison, ImageComparison | None, Word]]
-    rows = [("cover", images.cover, images.cover_baseline, "visible")]
-    for index, pair in enumerate(zip(images.secrets, images.secret_baselines, strict=False)):
-        rows.append((numbered("secret", index, count), *pair, "missed"))
-    for (name, found, baseline, otherwise), photos in zip(rows, _photos(audit), strict=False):
-        if baseline is not None:
-            got, plain = found.mean.psnr, baseline.mean.psnr
-            limit = f"at most {decibel(QUALITY_LOSS, 1)} less"
-            if (least := plain - QUALITY_LOSS) > INVISIBLE:
-                least, limit = INVISIBLE, f"at least {decibel(INVISIBLE, 0)}"
-            word = _word(got >= least, otherwise)
-            beside = "the given model itself" if plain >= IDENTICAL else f"{decibel(plain)}, plain model"
-            yield Verdict(f"{name} on {_views(photos)}", decibel(got), beside, limit, word, "images")
-
-
-def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
-    wrong = audit.wrong_key
-    if wrong is None or not (wrong.shown.vs_secrets and wrong.chance_level):
-        return
-    pairs = zip(wrong.shown.vs_secrets, wrong.chance_level, strict=False)
-    shown, chance = max(((each.max, chance) for each, chance in pairs), key=lambda pair: pair[0] - pair[1])
-    value, beside = f"{decibel(shown)}, best of {wrong.shown.keys:,}", f"{decibel(chance)}, chance level"
-    limit = f"at most {decibel(WRONG_KEY, 1)} more"
-    yield Verdict("wrong keys", value, beside, limit, _word(shown - chance <= WRONG_KEY), "wrong-keys")
+    return f"{number(auc.auc, 2)} ({number(auc.low, 2)} to {number(auc.high, 2)})"
 
 
 def worst_leak(attacks: Iterable[AttackResult]) -> AttackResult | None:
@@ -125,14 +89,54 @@ def worst_leak(attacks: Iterable[AttackResult]) -> AttackResult | None:
     return max(without_key, key=lambda attack: attack.best_leak.evidence(), default=None)
 
 
+def missing_readers(audit: Audit) -> dict[str, str]:
+    """Readers that are not installed, and how to install them."""
+    readers = audit.speed.readers if audit.speed else ()
+    return {each.reader: each.note or "not installed" for each in readers if each.loads is None}
+
+
+def _word(within: bool, otherwise: Word = "visible") -> Word:
+    return "fine" if within else otherwise
+
+
+def _qualities(audit: Audit) -> Iterator[Verdict]:
+    for index, model in enumerate(audit.images.models if audit.images else ()):
+        if model.baseline is None:
+            continue
+        psnr, plain = model.images.mean.psnr, model.baseline.mean.psnr
+        lowest, limit = plain - QUALITY_LOSS, f"at most {decibel(QUALITY_LOSS, 1)} less"
+        if lowest > INVISIBLE:
+            lowest, limit = INVISIBLE, f"at least {decibel(INVISIBLE, 0)}"
+        measure = f"{model.scene} on {'test photos' if model.photos else 'renders of its model'}"
+        beside = "the given model itself" if plain >= IDENTICAL else f"{decibel(plain)}, plain model"
+        word = _word(psnr >= lowest, "missed" if index else "visible")
+        yield Verdict(measure, decibel(psnr), beside, limit, word, "images")
+
+
+def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
+    if audit.wrong_key is None:
+        return
+    pairs = zip(audit.wrong_key.vs_secrets, audit.chance_level, strict=False)
+    best = max(
+        ((psnr.max, chance) for psnr, chance in pairs), key=lambda pair: pair[0] - pair[1], default=None
+    )
+    if best is not None:
+        psnr, chance = best
+        value, beside = (
+            f"{decibel(psnr)}, best of {audit.wrong_key.keys:,}",
+            f"{decibel(chance)}, chance level",
+        )
+        limit = f"at most {decibel(WRONG_KEY, 1)} more"
+        yield Verdict("wrong keys", value, beside, limit, _word(psnr - chance <= WRONG_KEY), "wrong-keys")
+
+
 def _leaks(audit: Audit) -> Iterator[Verdict]:
-    secrets = audit.leaks.secrets if audit.leaks else ()
+    secrets = audit.leaks or ()
     worst = worst_leak(attack for attacks in secrets for attack in attacks)
     if worst is None:
         return
     index = next(index for index, attacks in enumerate(secrets) if worst in attacks)
     of = f"{numbered('secret', index, len(secrets))}, " if len(secrets) > 1 else ""
-    # With colours fitted: haze is closer to most photos than black, but shows nothing of the secret.
     leak = worst.best_leak
     value = f"{difference(leak.psnr_fitted)} dB, {difference(leak.ssim_fitted, 3)} SSIM, "
     value += f"{difference(leak.gradient_coarse)} gradients ({of}{worst.attack}: {worst.best})"
@@ -141,54 +145,49 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
     yield Verdict("leaks without the key", value, beside, limit, _word(leak.evidence() <= 1), "leaks")
 
 
-def _distances(audit: Audit) -> Iterator[Verdict]:
-    attributes = audit.parameters.distances if audit.parameters else {}
-    ratios = {name: each.ratio for name, each in attributes.items() if each.ratio is not None}
-    if not ratios:
+def _stealth(audit: Audit) -> Iterator[Verdict]:
+    """Statistics of the file, and whether a guess of a secret can be confirmed."""
+    result = audit.stealth
+    if result is None or not result.statistics:
         return
-    plain = {name: each.original for name, each in attributes.items() if each.original is not None}
-    worst = max(ratios, key=lambda name: ratios[name] / max(plain.get(name, 0.0), DISTANCE_RATIO))
-    own = f"; the cover's plain model {times(plain[worst])}" if worst in plain else ""
-    value, beside = f"{worst} {times(ratios[worst])}", f"1×, between plain models{own}"
+    limit = f"at least {UNUSUAL}, or as between plain models"
+    beside = f"{significant(result.least_of_controls)}, between plain models"
+    word = _word(result.least >= min(UNUSUAL, result.least_of_controls))
+    value = f"p = {significant(result.least)} ({result.statistics[0].name})"
+    yield Verdict("the file by itself", value, beside, limit, word, "stealth")
+    scores = [score for scores in result.confirmations for score in scores or ()]
+    if scores:
+        likeliest = min(scores, key=lambda score: score.p)
+        p = result.least_confirmation
+        value, beside = f"p = {significant(p)} ({likeliest.name})", "plain models of the cover"
+        limit, word = f"at least {UNUSUAL}", _word(p >= UNUSUAL)
+        yield Verdict("guessing the secret", value, beside, limit, word, "stealth")
+
+
+def _distances(audit: Audit) -> Iterator[Verdict]:
+    distances = audit.parameters.distances if audit.parameters else {}
+    judged = {name: each for name, each in distances.items() if each.ratio is not None}
+    if not judged:
+        return
+    limits = {name: max(DISTANCE_RATIO, 1.01 * (each.original or 0)) for name, each in judged.items()}
+    name, worst = max(judged.items(), key=lambda item: (item[1].ratio or 0) / limits[item[0]])
+    own = "" if worst.original is None else f"; the cover's plain model {times(worst.original)}"
+    value, beside = f"{name} {times(worst.ratio)}", f"1×, between plain models{own}"
     limit = f"at most {DISTANCE_RATIO}×, or as the plain model's"
-    word = _word(ratios[worst] <= max(DISTANCE_RATIO, 1.01 * plain.get(worst, 0.0)))
+    word = _word((worst.ratio or 0) <= limits[name])
     yield Verdict("attributes of the Gaussians", value, beside, limit, word, "statistics")
 
 
-def _stealth(audit: Audit) -> Iterator[Verdict]:
-    """Statistics of the file, and whether a guess of a secret can be confirmed."""
-    found = audit.stealth
-    if found is None or not found.statistics:
-        return
-    worst = found.statistics[0]
-    limit = f"at least {UNUSUAL}, or as between plain models"
-    beside = f"{significant(found.least_of_controls)}, between plain models"
-    word = _word(found.least >= min(UNUSUAL, found.least_of_controls))
-    value = f"p = {significant(found.least)} ({worst.name})"
-    yield Verdict("the file by itself", value, beside, limit, word, "stealth")
-    rows = [row for each in found.confirmations if each is not None for row in each.scores]
-    if rows:
-        likeliest = min(rows, key=lambda row: row.p)
-        value = f"p = {significant(found.least_confirmation)} ({likeliest.name})"
-        word = _word(found.least_confirmation >= UNUSUAL)
-        yield Verdict(
-            "guessing the secret", value, "plain models of the cover", f"at least {UNUSUAL}", word, "stealth"
-        )
-
-
 def _two_sample(audit: Audit) -> Iterator[Verdict]:
-    found = audit.parameters.two_sample if audit.parameters else None
-    if found is None or not found.stego:
+    if audit.parameters is None:
         return
-    stego = max(each.auc for each in found.stego)
-    control = max((each.auc for each in found.control), default=None)
-    own = max((each.auc for each in found.original), default=None)
-    beside = [] if control is None else [f"{number(control, 2)}, between plain models"]
-    beside += [] if own is None else [f"the cover's plain model {number(own, 2)}"]
-    limit = f"at most {TWO_SAMPLE_AUC}" + ("" if own is None else ", or as the plain model's")
-    word = _word(stego <= max(TWO_SAMPLE_AUC, 0.0 if own is None else own + AUC_TOLERANCE))
-    value = f"AUC {number(stego, 2)}"
-    yield Verdict("classifier between models", value, "; ".join(beside), limit, word, "statistics")
+    result = audit.parameters.two_sample
+    stego, control = (max((auc.auc for auc in aucs), default=0.0) for aucs in (result.stego, result.control))
+    own = max((auc.auc for auc in result.original), default=0.0)
+    beside = f"{number(control, 2)}, between plain models; the cover's plain model {number(own, 2)}"
+    limit = f"at most {TWO_SAMPLE_AUC}, or as the plain model's"
+    word = _word(stego <= max(TWO_SAMPLE_AUC, own + AUC_TOLERANCE))
+    yield Verdict("classifier between models", f"AUC {number(stego, 2)}", beside, limit, word, "statistics")
 
 
 def _renders(audit: Audit) -> Iterator[Verdict]:
@@ -203,48 +202,28 @@ def _renders(audit: Audit) -> Iterator[Verdict]:
     yield Verdict("StegExpose on renders", value, beside, limit, word, "renders")
 
 
-def _word(within: bool, otherwise: Word = "visible") -> Word:
-    return "fine" if within else otherwise
-
-
 def _pruning(audit: Audit) -> Iterator[Verdict]:
-    changes = mean_over_draws(audit.robustness.changes) if audit.robustness else []
-    pruned = next((each for each in changes if (each.attack, each.strength) == (PRUNING, PRUNED)), None)
-    if pruned is None or pruned.cover is None or not pruned.secrets:
-        return
-    opens, worst = all(each.opens for each in pruned.secrets), max(each.loss for each in pruned.secrets)
-    word = _word(opens and worst - pruned.cover.loss <= PRUNING_LOSS, "missed")
-    measure = f"loss of a random {PRUNED:.0%} of the Gaussians"
-    value = f"secret {difference(-worst)} dB" if opens else "the secret does not open"
-    beside, limit = f"cover {difference(-pruned.cover.loss)} dB", f"at most {decibel(PRUNING_LOSS, 1)} more"
-    yield Verdict(measure, value, beside, limit, word, "robustness")
-
-
-def missing_readers(audit: Audit) -> dict[str, str]:
-    """Readers that are not installed, and how to install them."""
-    readers = audit.speed.readers if audit.speed else ()
-    return {each.reader: each.note or "not installed" for each in readers if each.loads is None}
+    for change in audit.robustness or ():
+        if (change.attack, change.strength) != (PRUNING, PRUNED) or not (change.cover and change.secrets):
+            continue
+        opens = all(secret.opens for secret in change.secrets)
+        worst = max(secret.loss for secret in change.secrets)
+        word = _word(opens and worst - change.cover.loss <= PRUNING_LOSS, "missed")
+        measure = f"loss of a random {PRUNED:.0%} of the Gaussians"
+        value = f"secret {difference(-worst)} dB" if opens else "the secret does not open"
+        beside = f"cover {difference(-change.cover.loss)} dB"
+        yield Verdict(measure, value, beside, f"at most {decibel(PRUNING_LOSS, 1)} more", word, "robustness")
 
 
 def _readers(audit: Audit) -> Iterator[Verdict]:
-    there = [each for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
-    if there:
-        word = _word(all(each.loads for each in there), "missed")
-        failing = dict.fromkeys(each.reader for each in there if not each.loads)
-        reading = dict.fromkeys(each.reader for each in there if each.reader not in failing)
+    tried = [each for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
+    if tried:
+        failing = dict.fromkeys(each.reader for each in tried if not each.loads)
+        reading = dict.fromkeys(each.reader for each in tried if each.reader not in failing)
         parts = [f"by {', '.join(reading)}"] if reading else []
         parts += [f"not by {', '.join(failing)}"] if failing else []
+        word = _word(not failing, "missed")
         yield Verdict("reading by other programs", "; ".join(parts), "", "by all", word, "speed")
     if missing := missing_readers(audit):
-        name = f"reading by {', '.join(missing)}"
-        yield Verdict(name, "not installed", "", "by all", "not measured", "not-measured")
-
-
-def _photos(audit: Audit) -> list[bool]:
-    """Whether the cover and each secret have photos."""
-    count = 1 + len(audit.images.secrets if audit.images else ())
-    return [*audit.run.photos[:count], *[True] * (count - len(audit.run.photos))]
-
-
-def _views(photos: bool) -> str:
-    return "test photos" if photos else "renders of its model"
+        measure = f"reading by {', '.join(missing)}"
+        yield Verdict(measure, "not installed", "", "by all", "not measured", "not-measured")

@@ -101,9 +101,6 @@ def steganalyze(
     *,
     csv: Annotated[Path, arg(metavar="FILE", help="Table to write, one row per image.")],
     threshold: Annotated[float, arg(metavar="T", help="Flag images with a higher fused score.")] = 0.2,
-    fast: Annotated[
-        bool, switch("Stop at an image once it looks clean; its scores then compare with no others.")
-    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Detect LSB replacement in images, with the scores of StegExpose.
@@ -118,7 +115,7 @@ def steganalyze(
     from keyss.progress import reporter
 
     check_output_file(csv, overwrite)
-    found = analyze(folder, threshold, fast, reporter=reporter())
+    found = analyze(folder, threshold, reporter())
     write_bytes(csv, csv_bytes(found.rows))
     print_steganalysis(found)
     print(f"{csv}: {len(found.rows)} image{'' if len(found.rows) == 1 else 's'}")

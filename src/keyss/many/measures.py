@@ -24,7 +24,6 @@ from keyss.core.extras import import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model
-from keyss.measure.auc import stegexpose_auc
 from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
 from keyss.measure.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.measure.robustness.conversions import converters
@@ -32,6 +31,7 @@ from keyss.measure.robustness.survival import measure_robustness
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import RenderTime, readers, render_time
 from keyss.measure.stealth.judging import judge
+from keyss.measure.stegexpose import stegexpose_auc
 from keyss.measure.two_sample import two_sample_auc
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
@@ -85,7 +85,7 @@ class Subject:
         plains = self.run.plain_models()
         for role, model, plain, scene in zip(_ROLES, models, plains, self.scenes, strict=False):
             beside = model if plain is None else plain.to(model.device)
-            found[role] = render_time(role, model, beside, scene, rounds=_ROUNDS)
+            found[role] = render_time(model, beside, scene, rounds=_ROUNDS)
         return found
 
 
@@ -147,7 +147,7 @@ def survival(subject: Subject) -> Numbers:
         changes = {"pruned": changes["pruned"]}
     cover, *others = subject.scenes
     whole = measure_robustness(
-        subject.stego, subject.run.reopeners, cover, others, changes=list(changes.values())
+        subject.stego, subject.run.openers, cover, others, changes=list(changes.values())
     )
     for name, result in zip(changes, whole[1:], strict=True):
         if result.skipped is not None or result.cover is None:
@@ -173,7 +173,7 @@ def pruning(subject: Subject) -> Numbers:
     cover, *others = subject.scenes
     changes = [sparing(each) for each in named.values()]
     results = measure_robustness(
-        subject.stego, subject.run.reopeners, cover, others, changes=changes, views=_EVERY_VIEW
+        subject.stego, subject.run.openers, cover, others, changes=changes, max_views=_EVERY_VIEW
     )
     found: Numbers = {}
     for name, result in zip(["whole", *named], results, strict=True):

@@ -1,13 +1,11 @@
-from .auc import (
-    Auc as Auc,
-    StegExposeAuc as StegExposeAuc,
-    auc_between as auc_between,
-    stegexpose_auc as stegexpose_auc,
-)
+from .auc import Auc as Auc, auc_between as auc_between, delong as delong
 from .distances import (
     AttributeDistance as AttributeDistance,
+    Beside as Beside,
     against_controls as against_controls,
     attribute_distances as attribute_distances,
+    beside_controls as beside_controls,
+    features as features,
 )
 from .hiding import (
     BaselineQuality as BaselineQuality,
@@ -15,15 +13,25 @@ from .hiding import (
     PsnrRange as PsnrRange,
     RenderFidelity as RenderFidelity,
     WrongKeys as WrongKeys,
+    in_cover as in_cover,
     measure_hiding as measure_hiding,
 )
 from .images import ImageComparison as ImageComparison, compare_images as compare_images
 from .leaks.attacks import (
+    Attack as Attack,
     decoder_attack as decoder_attack,
     file_attacks as file_attacks,
     search_embeddings as search_embeddings,
+    with_the_key as with_the_key,
 )
 from .leaks.looking import AttackResult as AttackResult, look_for_secret as look_for_secret
+from .leaks.scores import (
+    LeakScores as LeakScores,
+    coarse as coarse,
+    fit_colours as fit_colours,
+    gradient_correlation as gradient_correlation,
+    leak_scores as leak_scores,
+)
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,
@@ -35,36 +43,40 @@ from .robustness.changes import (
     purification as purification,
     random_pruning as random_pruning,
 )
-from .robustness.conversions import Converter as Converter, converters as converters
+from .robustness.conversions import (
+    Converter as Converter,
+    converters as converters,
+    find_splat_transform as find_splat_transform,
+    transform as transform,
+)
 from .robustness.survival import (
     BreakdownPoint as BreakdownPoint,
     ChangedQuality as ChangedQuality,
     ChangeResult as ChangeResult,
-    Reopened as Reopened,
-    Reopener as Reopener,
-    StrengthLosses as StrengthLosses,
     breakdown_points as breakdown_points,
-    mean_over_draws as mean_over_draws,
+    default_changes as default_changes,
     measure_robustness as measure_robustness,
+    reveal_changed as reveal_changed,
 )
 from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
 from .speed import (
-    FileSize as FileSize,
     ReaderResult as ReaderResult,
     SpeedResult as SpeedResult,
     measure_speed as measure_speed,
     readers as readers,
     render_time as render_time,
+    reveal_seconds as reveal_seconds,
 )
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
 from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
 from .stegexpose import (
+    Scores as Scores,
+    StegExposeAuc as StegExposeAuc,
     csv_bytes as csv_bytes,
+    read_pixels as read_pixels,
     score_file as score_file,
     score_image as score_image,
     steganalyze as steganalyze,
+    stegexpose_auc as stegexpose_auc,
 )
-from .two_sample import (
-    two_sample_against_controls as two_sample_against_controls,
-    two_sample_auc as two_sample_auc,
-)
+from .two_sample import two_sample_auc as two_sample_auc

@@ -1,21 +1,19 @@
-"""How well a score separates two classes: the area under the ROC curve, and StegExpose's on renders."""
+"""How well a score separates two classes: the area under the ROC curve."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from keyss.core import UsageError
-from keyss.measure.stegexpose import DETECTORS, Scores, score_image
 
 _Z = 1.959963984540054  # standard normal quantile of 0.975
 
 Score = float | None
-Image = NDArray[np.uint8]  # [H, W, 3]
 Doubles = NDArray[np.float64]
 
 
@@ -28,16 +26,6 @@ class Auc:
     high: float
 
 
-@dataclass(frozen=True)
-class StegExposeAuc:
-    """StegExpose on renders of the same views by two models."""
-
-    plain: tuple[Scores, ...]  # of each view
-    stego: tuple[Scores, ...]
-    fused: Auc  # of the mean of the detectors
-    detectors: dict[str, float | None]  # AUC of each detector; None if it accepts none of the images
-
-
 def auc_between(negatives: Sequence[Score], positives: Sequence[Score]) -> Auc:
     """The AUC of scores that should be higher for positives; None and NaN are missing scores.
 
@@ -48,7 +36,7 @@ def auc_between(negatives: Sequence[Score], positives: Sequence[Score]) -> Auc:
     if not negatives or not positives:
         raise UsageError(f"expected scores of both classes, got {len(negatives)} and {len(positives)}")
     plain, stego = (
-        np.array([-math.inf if _is_missing(each) else each for each in scores], dtype=float)
+        np.array([-math.inf if each is None or math.isnan(each) else each for each in scores], dtype=float)
         for scores in (negatives, positives)
     )
     auc, variance = delong(plain, stego)
@@ -70,34 +58,11 @@ def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
     return float(below.mean()), variance
 
 
-def stegexpose_auc(plain_images: Sequence[Image], stego_images: Sequence[Image]) -> StegExposeAuc:
-    """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
-
-    Chi Square needs about 87,700 pixels, Sample Pairs even sizes. On a renderer's output an AUC near 0.5 is
-    expected whatever is hidden, since no pixel's last bit is replaced. Raises UsageError if the views differ
-    in number or size.
-    """
-    sizes = [[image.shape[:2] for image in images] for images in (plain_images, stego_images)]
-    if not sizes[0] or sizes[0] != sizes[1]:
-        raise UsageError(
-            f"expected renders of the same views, got {len(sizes[0])} and {len(sizes[1])} images"
-            + (" of different sizes" if len(sizes[0]) == len(sizes[1]) > 0 else "")
-        )
-    plain, stego = (tuple(map(score_image, images)) for images in (plain_images, stego_images))
-    detectors: dict[str, float | None] = {}
-    for name in DETECTORS:
-        negatives, positives = ([asdict(scores)[name] for scores in each] for each in (plain, stego))
-        silent = all(map(_is_missing, negatives + positives))
-        detectors[name] = None if silent else auc_between(negatives, positives).auc
-    fused = ([scores.fusion for scores in each] for each in (plain, stego))
-    return StegExposeAuc(plain, stego, auc_between(*fused), detectors)
-
-
 def _interval(auc: float, variance: float, pairs: int) -> tuple[float, float]:
     """By DeLong's variance on the logit scale (Pepe 2003).
 
-    There is no variance if a class is a single image or the classes do not overlap. Disjoint pairs, one image
-    of each class, are independent trials then: k of k in order leave 0.025^(1/k) possible.
+    There is no variance if a class is a single image or the classes do not overlap. Then the interval is that
+    of k independent pairs, one image of each class, all in order: 0.025^(1/k) remains possible.
     """
     from scipy.special import expit, logit
 
@@ -106,7 +71,3 @@ def _interval(auc: float, variance: float, pairs: int) -> tuple[float, float]:
         return max(0.0, auc - slack), min(1.0, auc + slack)
     spread = _Z * math.sqrt(variance) / (auc * (1 - auc))
     return float(expit(logit(auc) - spread)), float(expit(logit(auc) + spread))
-
-
-def _is_missing(score: Score) -> bool:
-    return score is None or math.isnan(score)

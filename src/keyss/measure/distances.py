@@ -1,4 +1,4 @@
-"""Distances between the Gaussians of two models as distributions, and how much of them is chance.
+"""Distances between the Gaussians of two models as distributions, beside those between control models.
 
 Exact 1-D Wasserstein distances along axes and random directions (sliced Wasserstein, Bonneel et al. 2015) of
 features that are equal for equal Gaussians, however they are stored. They detect what 3D-Sinkhorn misses: see
@@ -7,10 +7,12 @@ features that are equal for equal Gaussians, however they are stored. They detec
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from statistics import fmean
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +29,38 @@ MAX_GAUSSIANS = 100_000  # of each model; larger ones are subsampled
 _RESOLUTION = 1e-6  # of a row's largest magnitude: a smaller range is rounding
 
 
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Beside(Generic[T]):
+    """A measure of two models, taken of a model and of control models of its scene."""
+
+    stego: tuple[T, ...]  # each control against the model
+    control: tuple[T, ...]  # each pair of controls: seed-to-seed variation
+    original: tuple[T, ...] = ()  # each control against the cover's own plain model
+
+
+def beside_controls(
+    measure: Callable[[Gaussians, Gaussians], T],
+    model: Gaussians,
+    controls: Sequence[Gaussians],
+    original: Gaussians | None = None,
+) -> Beside[T]:
+    """Take a measure of `model` and of `controls`, plain models of the same scene from other seeds.
+
+    `original`: another plain model of the scene that is compared with the controls too, since it can be
+    further from them than they are from each other. Raises UsageError for fewer than two controls.
+    """
+    if len(controls) < 2:
+        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
+    return Beside(
+        stego=tuple(measure(control, model) for control in controls),
+        control=tuple(measure(one, two) for one, two in combinations(controls, 2)),
+        original=() if original is None else tuple(measure(control, original) for control in controls),
+    )
+
+
 @dataclass(frozen=True)
 class AttributeDistance:
     """The distance of one attribute from control models, in units of their 5 to 95 % range."""
@@ -37,21 +71,6 @@ class AttributeDistance:
     original: float | None = None  # the same ratio for the cover's own plain model
 
 
-def attribute_distances(
-    reference: Gaussians, other: Gaussians, *, seed: int = 0, slices: int = SLICES
-) -> dict[str, float]:
-    """Wasserstein distances of two models' attributes, in units of the reference's 5 to 95 % range.
-
-    By attribute, as in `features`: the mean over its axes and `slices` random directions. `joint`: the mean
-    over random directions in the space of all attributes, equally weighted. All comparisons with one `seed`
-    share their directions. An attribute that is constant in the reference is measured in units of the range
-    of both models; one that is the same constant in both is skipped. Models may differ in size and SH degree;
-    one with more than `MAX_GAUSSIANS` Gaussians is subsampled. Raises UsageError for an empty model.
-    """
-    one, two = (features(model, limit=MAX_GAUSSIANS, seed=seed) for model in (reference, other))
-    return _distances(one, two, seed, slices)
-
-
 def against_controls(
     model: Gaussians,
     controls: Sequence[Gaussians],
@@ -59,31 +78,44 @@ def against_controls(
     original: Gaussians | None = None,
     seed: int = 0,
 ) -> dict[str, AttributeDistance]:
-    """Distances of `model` from control models of the scene, and of the controls from each other.
+    """`attribute_distances` by attribute: see `beside_controls`. Raises UsageError for an empty model."""
+    result = beside_controls(partial(attribute_distances, seed=seed), model, controls, original)
+    rows = {}
+    for name in result.control[0]:
+        stego, control = (fmean(each[name] for each in group) for group in (result.stego, result.control))
+        ratio = own = None
+        if control:
+            ratio = stego / control
+            own = fmean(each[name] for each in result.original) / control if result.original else None
+        rows[name] = AttributeDistance(stego, control, ratio, own)
+    return rows
 
-    By attribute, as in `attribute_distances`. `original`: another model of the scene that is compared with
-    the controls too, since a plain model can be further from them than they are from each other. Raises
-    UsageError for fewer than two controls and for an empty model.
+
+def attribute_distances(reference: Gaussians, other: Gaussians, *, seed: int = 0) -> dict[str, float]:
+    """Wasserstein distances of two models' attributes, in units of the reference's 5 to 95 % range.
+
+    By attribute, as in `features`: the mean over its axes and 32 random directions. `joint`: the mean over
+    random directions in the space of all attributes, equally weighted. All comparisons with one `seed` share
+    their directions. An attribute that is constant in the reference is measured in units of the range of both
+    models; one that is the same constant in both is skipped. Models may differ in size and SH degree; one
+    with more than `MAX_GAUSSIANS` Gaussians is subsampled. Raises UsageError for an empty model.
     """
-    if len(controls) < 2:
-        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
-    plain = [features(each, limit=MAX_GAUSSIANS, seed=seed) for each in controls]
-
-    def mean_distances(other: Gaussians) -> dict[str, float]:
-        theirs = features(other, limit=MAX_GAUSSIANS, seed=seed)
-        return _means([_distances(each, theirs, seed, SLICES) for each in plain])
-
-    distance = mean_distances(model)
-    control = _means([_distances(one, two, seed, SLICES) for one, two in combinations(plain, 2)])
-    own = {} if original is None else mean_distances(original)
-
-    def ratio(distances: dict[str, float], name: str) -> float | None:
-        return distances[name] / control[name] if name in distances and control[name] else None
-
-    return {
-        name: AttributeDistance(distance[name], control[name], ratio(distance, name), ratio(own, name))
-        for name in distance
-    }
+    both = [features(model, limit=MAX_GAUSSIANS, seed=seed) for model in (reference, other)]
+    generator = np.random.default_rng(seed)
+    result, rows = {}, []
+    for name in ATTRIBUTES:
+        axes = [model[name].T for model in both]
+        along_axes, units = _along(*axes)
+        scaled = [_in_units(each, units[:, None]) for each in axes]
+        directions = _directions(generator, len(units))
+        along_slices, widths = _along(directions @ scaled[0], directions @ scaled[1])
+        result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
+        weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
+        rows.append([weight * each for each in scaled])
+    one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    directions = _directions(generator, len(one))
+    result["joint"] = _mean(*_along(directions @ one, directions @ two))
+    return result
 
 
 def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -> dict[str, Floats]:
@@ -119,33 +151,9 @@ def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -
     return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
-def _means(distances: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {name: fmean(each[name] for each in distances) for name in distances[0]}
-
-
-def _distances(
-    reference: dict[str, Floats], other: dict[str, Floats], seed: int, slices: int
-) -> dict[str, float]:
-    generator = np.random.default_rng(seed)
-    result, rows = {}, []
-    for name in ATTRIBUTES:
-        axes = reference[name].T, other[name].T
-        along_axes, units = _along(*axes)
-        scaled = [_in_units(each, units[:, None]) for each in axes]
-        directions = _directions(generator, slices, len(units))
-        along_slices, widths = _along(directions @ scaled[0], directions @ scaled[1])
-        result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
-        weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
-        rows.append([weight * each for each in scaled])
-    one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    directions = _directions(generator, slices, len(one))
-    result["joint"] = _mean(*_along(directions @ one, directions @ two))
-    return result
-
-
-def _directions(generator: np.random.Generator, count: int, size: int) -> Floats:
-    """[count, size] random unit vectors; none in one dimension, where the axis is enough."""
-    vectors = generator.standard_normal((count if size > 1 else 0, size))
+def _directions(generator: np.random.Generator, size: int) -> Floats:
+    """[SLICES, size] random unit vectors; none in one dimension, where the axis is enough."""
+    vectors = generator.standard_normal((SLICES if size > 1 else 0, size))
     unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     return unit
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import torch
-from torch import Tensor
 
 from keyss.core.alignment import align
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
-from keyss.core.similarity import Similarity
+from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import (
     ImageQuality,
     mean_psnr,
@@ -55,7 +53,7 @@ class PsnrRange:
 
 @dataclass(frozen=True)
 class WrongKeys:
-    """PSNRs of what decoders show for wrong embeddings, on test views."""
+    """PSNRs of decoded models under wrong embeddings, on test views."""
 
     keys: int
     vs_cover: PsnrRange  # means over the decoders
@@ -81,7 +79,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class HidingQuality:
-    """Cover and secrets on their test views, with the numbers to compare them with."""
+    """Cover and secrets on their test views, beside plain models, wrong keys and chance."""
 
     cover: ImageQuality
     secrets: tuple[ImageQuality, ...]
@@ -102,76 +100,80 @@ def measure_hiding(
     seed: int = 0,
     shown: Sequence[Shown] | None = None,  # of stego model and secrets, if known: they are not rendered again
 ) -> HidingQuality:
-    """Qualities of cover and secrets, of plain models, and of what wrong keys show.
+    """Measure cover and secrets, their plain models, and renders under wrong keys.
 
-    Wrong keys are embeddings sampled like those of random keys. Whoever has a decoder without its key sees
-    what they show; it should look like the cover, that is, be at the chance level. Raises UsageError for no
-    wrong keys.
+    Wrong keys are embeddings sampled like those of random keys. An attacker with a decoder but no key sees
+    what they decode to; it should look like the cover, that is, be at the chance level. Raises UsageError for
+    no wrong keys.
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
-    cover, secrets = scenes[0], scenes[1:]
-    wrong = random_embeddings(wrong_keys, torch.Generator().manual_seed(seed))
     if shown is None:
-        models = [stego, *(each.reveal(stego).to(stego.device) for each in opened)]
+        models = [stego, *(secret.reveal(stego).to(stego.device) for secret in opened)]
         shown = list(map(show, models, baselines, scenes))
+    cover = scenes[0]
+    placed = [in_cover(*pair, cover) for pair in zip(opened, scenes[1:], strict=True)]
     return HidingQuality(
         cover=shown[0].quality,
-        secrets=tuple(each.quality for each in shown[1:]),
+        secrets=tuple(secret.quality for secret in shown[1:]),
         baseline=BaselineQuality(
             shown[0].plain,
-            tuple(each.plain for each in shown[1:]),
+            tuple(secret.plain for secret in shown[1:]),
             tuple(None if model is None else len(model) for model in baselines),
             tuple(steps),
             tuple(equal),
         ),
-        wrong_key=what_wrong_keys_show(stego, opened, scenes, wrong),
-        chance_level=tuple(
-            _psnr_in(secret, stego, frame_of(each, secret, cover))
-            for each, secret in zip(opened, secrets, strict=True)
-        ),
+        wrong_key=_wrong_keys(stego, opened, cover, placed, wrong_keys, seed),
+        chance_level=tuple(_psnr(stego, scene) for scene in placed),
     )
 
 
+def in_cover(opened: Opened, secret: Scene, cover: Scene) -> Scene:
+    """The secret's scene with its test cameras in the cover's frame.
+
+    A secret without a frame of its own there is placed where its training cameras fit the cover's best.
+    """
+    frame = opened.frame
+    if frame is None:
+        frame = align([view.camera for view in secret.train], [view.camera for view in cover.train])
+    moved = tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in secret.test)
+    return replace(secret, test=moved)
+
+
 @torch.no_grad()
-def what_wrong_keys_show(
-    stego: Gaussians, opened: Sequence[Opened], scenes: Sequence[Scene], embeddings: Tensor
+def _wrong_keys(
+    stego: Gaussians,
+    opened: Sequence[Opened],
+    cover: Scene,
+    secrets: Sequence[Scene],  # in the cover's frame
+    count: int,
+    seed: int,
 ) -> WrongKeys | None:
-    """PSNRs of what decoders show for wrong embeddings [E, 64]; None without decoders."""
-    cover = scenes[0]
-    decoders = [
-        (each.decode, frame_of(each, secret, cover), secret)
-        for each, secret in zip(opened, scenes[1:], strict=True)
-        if each.decode is not None
-    ]
-    if not decoders:
-        return None
+    """PSNRs of decoded models under wrong embeddings; None without decoders."""
+    embeddings = random_embeddings(count, torch.Generator().manual_seed(seed))
     vs_cover: list[list[float]] = []
     vs_secrets: list[list[float]] = []
-    for decode, frame, secret in decoders:
+    for secret, scene in zip(opened, secrets, strict=True):
+        if secret.decode is None:
+            continue
         vs_cover.append([])
         vs_secrets.append([])
         for embedding in embeddings:  # one model at a time: they are large
-            shown = decode(stego, embedding)
-            vs_cover[-1].append(_psnr_in(cover, shown))
-            vs_secrets[-1].append(_psnr_in(secret, shown, frame))
-    means = [fmean(each) for each in zip(*vs_cover, strict=True)]
-    return WrongKeys(len(embeddings), _range(means), tuple(map(_range, vs_secrets)))
-
-
-def frame_of(opened: Opened, secret: Scene, cover: Scene) -> Similarity:
-    """From the secret's frame into the cover's; if it has none there, where the cameras fit best."""
-    if opened.frame is not None:
-        return opened.frame
-    return align([view.camera for view in secret.train], [view.camera for view in cover.train])
+            decoded = secret.decode(stego, embedding)
+            vs_cover[-1].append(_psnr(decoded, cover))
+            vs_secrets[-1].append(_psnr(decoded, scene))
+    if not vs_cover:
+        return None
+    means = [fmean(psnrs) for psnrs in zip(*vs_cover, strict=True)]
+    return WrongKeys(count, _range(means), tuple(map(_range, vs_secrets)))
 
 
 @torch.no_grad()
 def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
-    """Both models on the test views of their scene; every view is rendered once, and no render is kept.
+    """Compare both models with the test views of their scene; each view is rendered once, none is kept.
 
     Fidelity compares a model with the plain model itself, independently of photos. `of_plain`: the scene has
-    no photos, its images are renders of the plain model, which are not rendered again.
+    no photos; its images are renders of the plain model, which are not rendered again.
     """
     background = scene.background.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
@@ -194,7 +196,7 @@ def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: b
             empty.append((background - expected).square().mean())
     if plain is None:
         return Shown(mean_quality(qualities), None, None)
-    psnr, nothing = (-10 * torch.stack(each).mean().clamp_min(1e-12).log10() for each in (errors, empty))
+    psnr, nothing = (-10 * torch.stack(mses).mean().clamp_min(1e-12).log10() for mses in (errors, empty))
     fidelity = RenderFidelity(round(float(psnr), 2), round(float(nothing), 2))
     return Shown(mean_quality(qualities), mean_quality(plains), fidelity)
 
@@ -203,9 +205,5 @@ def _range(values: Sequence[float]) -> PsnrRange:
     return PsnrRange(fmean(values), min(values), max(values))
 
 
-def _psnr_in(scene: Scene, model: Gaussians, frame: Similarity | None = None) -> float:
-    """PSNR of a model on the test views of a scene; `frame` leads from the scene's frame into the model's."""
-    views = scene.test
-    if frame is not None:
-        views = tuple(View(frame.apply_camera(view.camera), view.image) for view in views)
-    return mean_psnr(model, views, scene.background.to(model.device))
+def _psnr(model: Gaussians, scene: Scene) -> float:
+    return mean_psnr(model, scene.test, scene.background.to(model.device))

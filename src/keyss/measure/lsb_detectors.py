@@ -1,9 +1,9 @@
 """StegExpose's four detectors of LSB replacement: chi-square, primary sets, sample pairs and RS.
 
-- Chi-square: are values that differ only in the last bit equally frequent, as random bits make them?
-- Primary sets and sample pairs: how neighbours differ, which LSB replacement evens out. Both count pairs of
+- Chi-square: random last bits make values that differ only in the last bit equally frequent.
+- Primary sets and sample pairs: LSB replacement evens out differences of neighbours. Both count pairs of
   neighbours (u, v) and solve the same quadratic equation for the embedding rate.
-- RS: how often flipping last bits makes small blocks of pixels rougher (regular) or smoother (singular).
+- RS: counts small blocks of pixels that flipped last bits make rougher (regular) or smoother (singular).
 """
 
 from __future__ import annotations

@@ -47,9 +47,9 @@ def sinkhorn_3d(original: Gaussians, other: Gaussians) -> Sinkhorn3D:
     if not (len(original) and len(other)):
         raise UsageError("expected two models with Gaussians in them, got an empty one")
     ours, theirs = _magnitudes(original), _magnitudes(other)
-    found = {name: _sinkhorn(ours[name], theirs[name]) for name in ours}
-    total = sum(found.values())
-    return Sinkhorn3D(**found, mean=total / len(found), sum=total)
+    distances = {name: _sinkhorn(ours[name], theirs[name]) for name in ours}
+    total = sum(distances.values())
+    return Sinkhorn3D(**distances, mean=total / len(distances), sum=total)
 
 
 def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> float:

@@ -21,7 +21,7 @@ from keyss.files.models import DECODED_SUFFIX, read_model, write_model
 from keyss.files.ply_rows import is_compressed
 from keyss.fitting.image_metrics import subsample_views
 from keyss.measure.robustness.conversions import find_package, transform
-from keyss.measure.robustness.survival import Reopen
+from keyss.measure.robustness.survival import Opener, reveal_changed
 from keyss.rendering import render
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -29,14 +29,10 @@ Columns = dict[str, np.ndarray[Any, Any]]
 
 @dataclass(frozen=True)
 class RenderTime:
-    """The time of one render of a model and of a plain model of the same scene; medians."""
+    """The time of one render of a model."""
 
-    model: str
-    ratio: float  # median over pairs of renders, which cancels other load
-    seconds: float
-    plain_seconds: float
-    gaussians: int
-    plain_gaussians: int
+    seconds: float  # median
+    ratio: float  # to a plain model of the same scene: median over pairs of renders, which cancels other load
 
 
 @dataclass(frozen=True)
@@ -46,69 +42,58 @@ class ReaderResult:
     reader: str
     file: str
     loads: bool | None  # whether all values are equal to the last bit; None: not tried
-    gaussians: int | None = None  # as many as it reads
+    gaussians: int | None = None  # number that it reads
     note: str | None = None  # why it fails or was not tried
 
 
 @dataclass(frozen=True)
-class FileSize:
-    """A published or a revealed file."""
-
-    name: str
-    bytes: int
-
-
-@dataclass(frozen=True)
 class SpeedResult:
-    """Times, sizes and readers of the published model ("stego") and of what the keys reveal ("secret N")."""
+    """Times, sizes and readers of the published model ("stego") and of the revealed ones ("secret N")."""
 
-    render: tuple[RenderTime, ...]
+    render: dict[str, RenderTime]
     reveal_seconds: tuple[float, ...]  # from file to file for each secret, key derivation included
-    files: tuple[FileSize, ...]
+    bytes: dict[str, int]
     readers: tuple[ReaderResult, ...]
 
 
 def measure_speed(
     stego: Path,
-    reopen: Sequence[Reopen],  # one for each secret
+    openers: Sequence[Opener],  # one for each secret
     scenes: Sequence[Scene],  # the cover, then the secrets
     plains: Sequence[Gaussians],  # plain 3DGS models of the same scenes
     *,
     rounds: int = 15,
     device: torch.device | str = "cpu",
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> SpeedResult:
     """Measure the published model, and what the keys reveal, beside plain models of the same scenes.
 
-    `progress`: called with models done, models in all, and the next one's name. Raises KeyssError if a secret
-    does not open.
+    `progress`: called with the numbers of models done and of all. Raises KeyssError if a secret does not
+    open.
     """
-    names = ["stego", *(f"secret {number}" for number in range(1, len(scenes)))]
-    files, rendered, revealed = [], [], []
-    read: list[ReaderResult] = []
+    times: dict[str, RenderTime] = {}
+    readings: list[ReaderResult] = []
     with tempfile.TemporaryDirectory() as folder:
-        for number, (name, scene, plain) in enumerate(zip(names, scenes, plains, strict=True)):
+        files, seconds = {"stego": stego}, []
+        for number, opener in enumerate(openers, start=1):
+            file, median_seconds = reveal_seconds(stego, opener, Path(folder) / str(number))
+            files[f"secret {number}"] = file
+            seconds.append(median_seconds)
+        for number, (name, scene, plain) in enumerate(zip(files, scenes, plains, strict=True)):
             if progress is not None:
-                progress(number, len(names), name)
-            file = stego
-            if number > 0:
-                decoded = isinstance(reopen[number - 1](read_model(stego)).gaussians, DecodedGaussians)
-                file = Path(folder) / f"{number}{DECODED_SUFFIX if decoded else '.ply'}"
-                revealed.append(reveal_seconds(stego, reopen[number - 1], file))
-            files.append(FileSize(name, file.stat().st_size))
-            model = read_model(file).to(device)
-            rendered.append(render_time(name, model, plain.to(device), scene, rounds=rounds))
-            read += [replace(each, file=name) for each in readers(file)]
-    if progress is not None:
-        progress(len(names), len(names), "")
-    return SpeedResult(tuple(rendered), tuple(revealed), tuple(files), tuple(read))
+                progress(number, len(files))
+            model = read_model(files[name]).to(device)
+            times[name] = render_time(model, plain.to(device), scene, rounds=rounds)
+            readings += [replace(reading, file=name) for reading in readers(files[name])]
+        sizes = {name: file.stat().st_size for name, file in files.items()}
+    return SpeedResult(times, tuple(seconds), sizes, tuple(readings))
 
 
 @torch.no_grad()
 def render_time(
-    name: str, model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
+    model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
 ) -> RenderTime:
-    """The render time of `model`, called `name`, and of `plain`, from a scene's test cameras.
+    """The render time of `model`, beside `plain`, from a scene's test cameras.
 
     Each round renders at most `views` views with both models, in alternating order; the first round is a
     warm-up.
@@ -124,44 +109,44 @@ def render_time(
                 if model.device.type == "cuda":
                     torch.cuda.synchronize()
                 times[number, index, which] = time.perf_counter() - start
-    counted = times[1:].reshape(-1, 2)
-    seconds, plain_seconds = np.median(counted, axis=0).tolist()
-    ratio = float(np.median(counted[:, 0] / counted[:, 1]))
-    return RenderTime(name, ratio, seconds, plain_seconds, len(model), len(plain))
+    seconds, plain_seconds = times[1:].reshape(-1, 2).T
+    return RenderTime(float(np.median(seconds)), float(np.median(seconds / plain_seconds)))
 
 
-def reveal_seconds(stego: Path, reopen: Reopen, out: Path, *, repeats: int = 3) -> float:
-    """Median of the seconds from the published file to the revealed one at `out`."""
+def reveal_seconds(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) -> tuple[Path, float]:
+    """The revealed file, `out` with the suffix of its format, and the median time from file to file."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        write_model(out, reopen(read_model(stego)).gaussians)
+        revealed = reveal_changed(opener, read_model(stego))
+        file = out.with_suffix(DECODED_SUFFIX if isinstance(revealed, DecodedGaussians) else ".ply")
+        write_model(file, revealed)
         seconds.append(time.perf_counter() - start)
-    return median(seconds)
+    return file, median(seconds)
 
 
 def readers(path: Path) -> list[ReaderResult]:
     """Whether plyfile, gsply and splat-transform read a model file."""
-    programs = (("plyfile", _plyfile), ("gsply", _gsply), ("splat-transform", _splat_transform))
+    programs = {"plyfile": _plyfile, "gsply": _gsply, "splat-transform": _splat_transform}
     if path.name.endswith(DECODED_SUFFIX):
         note = "a network renders it: it is not a 3DGS model"
-        return [ReaderResult(name, path.name, False, note=note) for name, _ in programs]
+        return [ReaderResult(name, path.name, False, note=note) for name in programs]
     if path.suffix != ".ply" or is_compressed(path):
         note = "only a .ply of floats stores every number exactly"
-        return [ReaderResult(name, path.name, None, note=note) for name, _ in programs]
+        return [ReaderResult(name, path.name, None, note=note) for name in programs]
     expected = _columns_of(read_model(path))
-    found: list[ReaderResult] = []
-    for name, read in programs:
+    results: list[ReaderResult] = []
+    for name, read in programs.items():
         try:
             columns = read(path)
         except BackendError as error:
-            found.append(ReaderResult(name, path.name, None, note=f"{error}"))
+            results.append(ReaderResult(name, path.name, None, note=f"{error}"))
         except (KeyssError, OSError, ValueError, KeyError) as error:
-            found.append(ReaderResult(name, path.name, False, note=f"{error}"))
+            results.append(ReaderResult(name, path.name, False, note=f"{error}"))
         else:
             equal = all(np.array_equal(columns[key], values) for key, values in expected.items())
-            found.append(ReaderResult(name, path.name, equal, len(columns["means"])))
-    return found
+            results.append(ReaderResult(name, path.name, equal, len(columns["means"])))
+    return results
 
 
 def _columns_of(model: Gaussians) -> Columns:
@@ -174,7 +159,7 @@ def _plyfile(path: Path) -> Columns:
     def columns(*names: str) -> np.ndarray[Any, Any]:
         return np.stack([vertices[name] for name in names], axis=1)
 
-    rest = sum(each.name.startswith("f_rest_") for each in vertices.properties)
+    rest = sum(field.name.startswith("f_rest_") for field in vertices.properties)
     constant = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     higher = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else constant[:, :0, 0]
     return {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,12 +20,12 @@ from PIL import Image
 from keyss.core.errors import InputError, UsageError
 from keyss.files.images import open_image
 from keyss.fitting.reporting import Reporter, SilentReporter
+from keyss.measure.auc import Auc, auc_between
 from keyss.measure.lsb_detectors import chi_square, primary_sets, rs, sample_pairs
 
 THRESHOLD = 0.2  # the original's
-# In the order of the original program, which matters when it stops early.
-_ORDER = {"primary_sets": primary_sets, "sample_pairs": sample_pairs, "chi_square": chi_square, "rs": rs}
-DETECTORS = ("primary_sets", "chi_square", "sample_pairs", "rs")  # in the order of its table
+# In the order of the original's table.
+DETECTORS = {"primary_sets": primary_sets, "chi_square": chi_square, "sample_pairs": sample_pairs, "rs": rs}
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Scores:
     """StegExpose's scores of one image, each in [0, 1].
 
     A detector is NaN if its equation has no solution, and None if it does not accept the image (Sample Pairs:
-    odd width or height; Chi Square: less than about 87,700 pixels) or was skipped. `fusion` is the mean of
-    the available scores, NaN if there are none: compare only images of one size.
+    odd width or height; Chi Square: less than about 87,700 pixels). `fusion` is the mean of the available
+    scores, NaN if there are none: compare only images of one size.
     """
 
     primary_sets: float | None
@@ -44,30 +44,21 @@ class Scores:
     fusion: float | None  # records store NaN as None
 
 
-def score_image(image: NDArray[np.uint8], *, stop_below: float | None = None) -> Scores:
-    """Scores of an image [H, W, 3] uint8.
-
-    `stop_below` is the original's fast mode: as soon as the mean so far is below it, the remaining detectors
-    are skipped. Such means are not comparable with each other. Raises UsageError for another shape or type.
-    """
+def score_image(image: NDArray[np.uint8]) -> Scores:
+    """Scores of an image [H, W, 3] uint8. Raises UsageError for another shape or type."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise UsageError(f"expected an image [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}")
-    found: dict[str, float | None] = dict.fromkeys(DETECTORS)
-    answers: list[float] = []
-    for name, detector in _ORDER.items():
+    scores: dict[str, float | None] = {}
+    for name, detector in DETECTORS.items():
         score = detector(image)
-        if score is not None:
-            found[name] = score = score if math.isnan(score) else min(abs(score), 1.0)
-            if not math.isnan(score):
-                answers.append(score)
-        if stop_below is not None and answers and sum(answers) / len(answers) < stop_below:
-            break
-    return Scores(**found, fusion=sum(answers) / len(answers) if answers else math.nan)
+        scores[name] = score if score is None or math.isnan(score) else min(abs(score), 1.0)
+    available = _present(scores.values())
+    return Scores(**scores, fusion=sum(available) / len(available) if available else math.nan)
 
 
-def score_file(path: Path | str, *, stop_below: float | None = None) -> Scores:
+def score_file(path: Path | str) -> Scores:
     """`score_image` of a file, decoded as the original does (`read_pixels`). Raises InputError."""
-    return score_image(read_pixels(path), stop_below=stop_below)
+    return score_image(read_pixels(path))
 
 
 def read_pixels(path: Path | str) -> NDArray[np.uint8]:
@@ -101,6 +92,41 @@ def _decode(image: Image.Image) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True)
+class StegExposeAuc:
+    """StegExpose on renders of the same views by two models."""
+
+    plain: tuple[Scores, ...]  # of each view
+    stego: tuple[Scores, ...]
+    fused: Auc  # of the mean of the detectors
+    detectors: dict[str, float | None]  # AUC of each detector; None if it accepts none of the images
+
+
+def stegexpose_auc(
+    plain_images: Sequence[NDArray[np.uint8]], stego_images: Sequence[NDArray[np.uint8]]
+) -> StegExposeAuc:
+    """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
+
+    Chi Square needs about 87,700 pixels, Sample Pairs even sizes. On a renderer's output an AUC near 0.5 is
+    expected whatever is hidden, since no pixel's last bit is replaced. Raises UsageError if the views differ
+    in number or size.
+    """
+    sizes = [[image.shape[:2] for image in images] for images in (plain_images, stego_images)]
+    if not sizes[0] or sizes[0] != sizes[1]:
+        raise UsageError(
+            f"expected renders of the same views, got {len(sizes[0])} and {len(sizes[1])} images"
+            + (" of different sizes" if len(sizes[0]) == len(sizes[1]) > 0 else "")
+        )
+    plain, stego = (tuple(map(score_image, images)) for images in (plain_images, stego_images))
+    detectors: dict[str, float | None] = {}
+    for name in DETECTORS:
+        negatives, positives = ([getattr(scores, name) for scores in group] for group in (plain, stego))
+        answers = _present(negatives + positives)
+        detectors[name] = auc_between(negatives, positives).auc if answers else None
+    fused = ([scores.fusion for scores in group] for group in (plain, stego))
+    return StegExposeAuc(plain, stego, auc_between(*fused), detectors)
+
+
+@dataclass(frozen=True)
 class Row:
     """One image: its file name, its scores, and the verdict."""
 
@@ -120,22 +146,17 @@ class Steganalysis:
     @property
     def mean_fusion(self) -> float | None:
         """Over the images that have one."""
-        found = [row.scores.fusion for row in self.rows]
-        fusions = [fusion for fusion in found if fusion is not None and not math.isnan(fusion)]
+        fusions = _present(row.scores.fusion for row in self.rows)
         return sum(fusions) / len(fusions) if fusions else None
 
 
 def steganalyze(
-    folder: Path | str,
-    threshold: float = THRESHOLD,
-    fast: bool = False,
-    reporter: Reporter | None = None,
+    folder: Path | str, threshold: float = THRESHOLD, reporter: Reporter | None = None
 ) -> Steganalysis:
     """Scores of all images in `folder`, sorted by name; subfolders are ignored.
 
-    `fast` skips detectors of an image as soon as it looks clean (see `score_image`). Unreadable files are
-    skipped and listed in the result. Raises InputError if there is no readable image, and UsageError for a
-    threshold outside of [0, 1].
+    Unreadable files are skipped and listed in the result. Raises InputError if there is no readable image,
+    and UsageError for a threshold outside of [0, 1].
     """
     folder = Path(folder)
     if not 0 <= threshold <= 1:
@@ -148,7 +169,7 @@ def steganalyze(
     try:
         for done, path in enumerate(paths, start=1):
             try:
-                rows.append(_row(path, threshold, fast))
+                rows.append(_row(path, threshold))
             except InputError:
                 skipped.append(path.name)
             reporter.update(done, 0, {})
@@ -181,13 +202,16 @@ def _files(folder: Path) -> list[Path]:
     return paths
 
 
-def _row(path: Path, threshold: float, fast: bool) -> Row:
-    scores = score_file(path, stop_below=threshold if fast else None)
-    fusion = scores.fusion
-    if fusion is None or math.isnan(fusion):
-        return Row(path.name, scores, flagged=False, secret_bytes=0)
+def _row(path: Path, threshold: float) -> Row:
+    scores = score_file(path)
+    fusion = next(iter(_present([scores.fusion])), 0.0)
     return Row(path.name, scores, fusion > threshold, math.floor(fusion * path.stat().st_size / 3 + 0.5))
 
 
 def _spelled(score: float | None) -> str:
     return "null" if score is None else "NaN" if math.isnan(score) else repr(score)
+
+
+def _present(scores: Iterable[float | None]) -> list[float]:
+    """The scores that are neither None nor NaN."""
+    return [score for score in scores if score is not None and not math.isnan(score)]

@@ -6,9 +6,6 @@ separation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
 from statistics import fmean
 
 import numpy as np
@@ -24,15 +21,6 @@ _CELLS = 8  # along each axis
 _TREES, _LEAVES = 50, 16
 
 Ints = npt.NDArray[np.intp]
-
-
-@dataclass(frozen=True)
-class TwoSample:
-    """AUCs of a model against controls, and of controls against each other."""
-
-    stego: tuple[Auc, ...]  # the model against each control
-    control: tuple[Auc, ...]  # each pair of controls
-    original: tuple[Auc, ...] = ()  # the cover's own plain model against each control
 
 
 def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
@@ -61,28 +49,6 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
     )
     auc, margin = fmean(aucs), 1.96 * sum(variances) ** 0.5 / FOLDS
     return Auc(auc, max(auc - margin, 0.0), min(auc + margin, 1.0))
-
-
-def two_sample_against_controls(
-    model: Gaussians,
-    controls: Sequence[Gaussians],
-    *,
-    original: Gaussians | None = None,
-    seed: int = 0,
-) -> TwoSample:
-    """AUCs of `model` against control models of the same scene, and of the controls against each other.
-
-    `original`: another model of the scene that is compared with the controls too. Raises UsageError for fewer
-    than two controls.
-    """
-    if len(controls) < 2:
-        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
-    others = () if original is None else (original,)
-    return TwoSample(
-        stego=tuple(two_sample_auc(each, model, seed=seed) for each in controls),
-        control=tuple(two_sample_auc(one, two, seed=seed) for one, two in combinations(controls, 2)),
-        original=tuple(two_sample_auc(each, other, seed=seed) for each in controls for other in others),
-    )
 
 
 def _folds(positions: npt.NDArray[np.float32], seed: int) -> Ints:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +10,6 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import read_model
-from keyss.measure.robustness.survival import Reopener
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened
@@ -44,11 +43,11 @@ class HidingRun:
     sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
 
     @property
-    def reopeners(self) -> list[Reopener]:
-        """What opens the secrets in a changed model; files that are handed over do not change."""
+    def openers(self) -> list[Callable[[Gaussians], Opened]]:
+        """Functions that open the secrets in a changed model; files that are handed over do not change."""
         if registry.get(self.config.method).capabilities.hands_over:
-            return [Reopener("", lambda stego, key, own=own: own) for own in self.opened]  # type: ignore[misc]
-        return [Reopener(key, registry.open_model) for key in self.keys]
+            return [lambda _, secret=secret: secret for secret in self.opened]  # type: ignore[misc]
+        return [lambda stego, key=key: registry.open_model(stego, key) for key in self.keys]  # type: ignore[misc]
 
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
         """The cover and the secrets with their photos, or with renders of given models."""

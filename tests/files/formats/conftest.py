@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from keyss.core import BackendError
-from keyss.measure.robustness.conversions import find_splat_transform, transform
+from keyss.measure import find_splat_transform, transform
 
 NEWER = Path(__file__).parents[3] / "web" / "node_modules" / ".bin" / "splat-transform"
 

@@ -17,7 +17,7 @@ def test_a_plain_model_is_usual() -> None:
     assert found.least_of_controls > LIMIT
     assert found.least_confirmation > LIMIT
     assert found.confirmations[1] is None
-    assert (found.groups_never_drawn, found.changed_low_bits) == (0, 0)
+    assert (found.invisible_groups, found.changed_low_bits) == (0, 0)
 
 
 def test_new_bits_of_a_rounding_trainer_are_unusual() -> None:
@@ -38,7 +38,7 @@ def test_secrets_in_a_band_are_unusual_counted_and_confirmed() -> None:
     secret = plain(20, 800)
     found = judge(banded(plain(9), secret), [plain(seed) for seed in range(4)], candidates=[secret])
     assert found.least < 1e-6
-    assert found.groups_never_drawn == 1
+    assert found.invisible_groups == 1
     assert found.least_confirmation < LIMIT
 
 

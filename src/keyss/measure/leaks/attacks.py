@@ -1,34 +1,45 @@
-"""Attacks by name: changes of a model that may show a secret without its key."""
+"""Attacks by name: changes of a model that may show a secret without its key.
+
+Transparent Gaussians may belong to a secret (KeySS, figures 2 and 6). A second scene that is stored in
+attributes that do not render (lengths of quaternions, harmonics of transparent Gaussians), or trained
+differently, may form a group of its own. No attack changes a model in place.
+"""
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
-from typing import get_args
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.channels import is_appended
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera, Scene
+from keyss.core import Camera, Gaussians, Scene, import_extra
 from keyss.fitting.image_metrics import subsample_views
 from keyss.keys import random_embeddings
-from keyss.measure.leaks import views
 from keyss.rendering import contributions
 
+OPAQUE = 0.99  # the maximum alpha of a Gaussian in 3DGS
 THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures use 0.05
 SHARES = (0.1, 0.3, 0.5)  # of the least contributing
 DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
 SEARCH_SAMPLE = 1000  # Gaussians used to search embeddings; more do not change the result
 
-Shown = Iterator[tuple[str, Gaussians]]
-Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.base.Opened.decode`
-Parameter = str | int | float | list[float]
+_BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, robust to outliers
+_TO_SIGMA = 1.4826  # from a median absolute deviation to the standard deviation of a normal distribution
+_MIN_SPREAD = 1e-3  # of a logarithm: attributes that differ by rounding have no outliers
+_MIN_LENGTH = 1e-12
+_CLUSTER_SAMPLE = 5000  # Gaussians used to find clusters
+_MIN_CLUSTERED = 10
+
+Variants = Iterator[tuple[str, Gaussians]]  # labelled models to render
+Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.opened.Opened.decode`
 
 
 @dataclass(frozen=True)
@@ -37,8 +48,7 @@ class Attack:
 
     name: str
     sentence: str
-    parameters: dict[str, Parameter]
-    show: Callable[[Gaussians], Shown]  # labelled models to render, one per variant
+    show: Callable[[Gaussians], Variants]
     with_key: bool = False  # not an attack, but the reference: the revealed secret
 
 
@@ -49,39 +59,40 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
         Attack(
             "restored opacities",
             "Gaussians below an opacity are made opaque and the others left out, or all made opaque.",
-            {"thresholds": list(THRESHOLDS)},
-            _of_faint(views.opaque, also_of_all=True),
+            partial(_faint, _opaque, and_all=True),
         ),
         Attack(
             "rescaled opacities",
             "Gaussians below an opacity alone, all opacities multiplied by one factor.",
-            {"thresholds": list(THRESHOLDS)},
-            _of_faint(views.rescaled),
+            partial(_faint, _rescaled),
         ),
         Attack(
             "matched opacities",
             "Gaussians below an opacity alone, with the opacities of the others, given by rank.",
-            {"thresholds": list(THRESHOLDS)},
-            lambda model: ((f"below {t}", views.matched(model, t)) for t in THRESHOLDS),
+            _matched,
         ),
         Attack(
             "inverted opacities",
             "Opacities o become 1 - o, of Gaussians below an opacity alone or of all.",
-            {"thresholds": list(THRESHOLDS)},
-            _of_faint(views.inverted, also_of_all=True),
+            partial(_faint, _inverted, and_all=True),
         ),
         Attack(
             "least contribution",
             "The Gaussians that add least to the cover's views are made opaque, the others left out.",
-            {"shares": list(SHARES), "views": len(cameras)},
-            lambda model: _least_contributing(model, cameras),
+            partial(_least_contributing, cameras),
         ),
-        *(_outliers(attribute) for attribute in get_args(views.Attribute)),
+        *(
+            Attack(
+                f"outliers in {attribute}",
+                f"Gaussians of unusual {attribute} are made opaque, the others left out.",
+                partial(_outliers, attribute),
+            )
+            for attribute in ATTRIBUTES
+        ),
         Attack(
             "clusters",
-            "Groups of like attributes (a mixture of normal distributions), each alone and made opaque.",
-            {"clusters": list(CLUSTERS), "seed": seed},
-            lambda model: _clusters(model, seed),
+            "Groups of similar attributes (a mixture of normal distributions), each alone and made opaque.",
+            partial(_clusters, seed),
         ),
     ]
 
@@ -89,22 +100,21 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
 def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed: int = 0) -> Attack:
     """The attack with a secret's decoder and everything encrypted with it, but without the key.
 
-    `decode`: see `keyss.methods.base.Opened`. Without a gradient in the embedding, the search is random.
+    `decode`: see `keyss.methods.opened.Opened`. Without a gradient in the embedding, the search is random.
     """
 
-    def show(model: Gaussians) -> Shown:
-        found = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
+    def show(model: Gaussians) -> Variants:
+        embeddings = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
             search = partial(search_embeddings, decode, model, limit=SEARCH_SAMPLE, balance=balance)
-            found[name] = search(restarts=restarts, steps=steps, seed=seed)
-        for name, embeddings in found.items():
-            for index, embedding in enumerate(embeddings, start=1):
+            embeddings[name] = search(restarts=restarts, steps=steps, seed=seed)
+        for name, vectors in embeddings.items():
+            for index, embedding in enumerate(vectors, start=1):
                 yield f"{name}, {index}", decode(model, embedding)
 
     return Attack(
         "decoder without its key",
         "Random embeddings, and those under which the decoder changes most, searched by gradient.",
-        {"restarts": restarts, "steps": steps, "seed": seed},
         show,
     )
 
@@ -123,10 +133,11 @@ def search_embeddings(
     """[restarts, 64] unit vectors for which the decoder seems to show another scene, the best first.
 
     In the published scheme the key is a vector that enters the decoder's first layers. Whoever has the
-    network can search for the vector that exchanges most, without knowing the secret: gradient ascent from
-    random starts on the mean change of the opacities, less `balance` times the change of their mean. Making
-    some Gaussians visible and as many others invisible replaces one scene by another; only adding or removing
-    does not. `balance=0` counts all change, which finds a secret that needs more Gaussians than the cover.
+    network can search for the vector that exchanges most Gaussians, without knowing the secret: gradient
+    ascent from random starts on the mean change of the opacities, less `balance` times the change of their
+    mean. Making some Gaussians visible and as many others invisible replaces one scene by another; only
+    adding or removing does not. `balance=0` counts all change, which finds a secret that needs more Gaussians
+    than the cover.
 
     A random subset of `limit` Gaussians is decoded; appended Gaussians, which no decoder changes, are
     ignored. Returns the random starts if the decoded opacities have no gradient in the embedding.
@@ -144,7 +155,7 @@ def search_embeddings(
     starts = random_embeddings(restarts, generator)
     if not exchanged(starts[0].to(stego.device).requires_grad_()).requires_grad:
         return starts
-    found = []
+    scored = []
     for start in starts:
         direction = start.to(stego.device).requires_grad_()
         optimizer = torch.optim.Adam([direction], lr=0.02)
@@ -153,56 +164,141 @@ def search_embeddings(
             (-exchanged(direction)).backward()
             optimizer.step()
         with torch.no_grad():
-            found.append((float(exchanged(direction)), F.normalize(direction.detach(), dim=0).cpu()))
-    found.sort(key=lambda pair: -pair[0])
-    return torch.stack([embedding for _, embedding in found])
+            scored.append((float(exchanged(direction)), F.normalize(direction.detach(), dim=0).cpu()))
+    scored.sort(key=lambda pair: -pair[0])
+    return torch.stack([embedding for _, embedding in scored])
 
 
 def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
     """The reference: the secret in the cover's frame, as its key reveals it."""
     return Attack(
         "with the key",
-        "Not an attack: what there is to find.",
-        {},
+        "Not an attack: the secret itself.",
         lambda model: iter([("revealed", reveal(model))]),
         with_key=True,
     )
 
 
-def _of_faint(
-    change: Callable[[Gaussians], Gaussians], *, also_of_all: bool = False
-) -> Callable[[Gaussians], Shown]:
-    """Applies a change to the Gaussians below each threshold, and optionally to all."""
-
-    def show(model: Gaussians) -> Shown:
-        for threshold in THRESHOLDS:
-            yield f"below {threshold}", change(views.faint(model, threshold))
-        if also_of_all:
-            yield "all", change(model)
-
-    return show
+def _opaque(model: Gaussians) -> Gaussians:
+    """All Gaussians with opacity OPAQUE."""
+    logit = math.log(OPAQUE / (1 - OPAQUE))
+    return replace(model, opacity_logits=torch.full_like(model.opacity_logits, logit))
 
 
-def _least_contributing(model: Gaussians, cameras: Sequence[Camera]) -> Shown:
-    weights = contributions(model, cameras)
+def _rescaled(model: Gaussians) -> Gaussians:
+    """Opacities times the factor that makes the largest ones OPAQUE."""
+    if len(model) == 0:
+        return model
+    opacities = model.opacity_logits.double().sigmoid()
+    top = opacities.sort().values[int(_BRIGHTEST * (len(model) - 1))]
+    scaled = (opacities * (OPAQUE / top)).clamp(max=OPAQUE)
+    return replace(model, opacity_logits=scaled.logit().to(model.opacity_logits))
+
+
+def _inverted(model: Gaussians) -> Gaussians:
+    """Opacities o become 1 - o."""
+    return replace(model, opacity_logits=-model.opacity_logits)
+
+
+def _faint(change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_all: bool = False) -> Variants:
+    """Change the Gaussians below each threshold alone, and optionally the whole model."""
+    for threshold in THRESHOLDS:
+        yield f"below {threshold}", change(model[model.opacities < threshold])
+    if and_all:
+        yield "all", change(model)
+
+
+def _matched(model: Gaussians) -> Variants:
+    """The Gaussians below each threshold with the opacities of the others by rank.
+
+    Undoes any monotone reduction of opacities.
+    """
+    for threshold in THRESHOLDS:
+        below = model.opacities < threshold
+        part, others = model[below], model.opacity_logits[~below].sort().values
+        if len(part) and len(others):
+            ranks = part.opacity_logits.argsort().argsort()
+            rows = ((ranks + 0.5) * (len(others) / len(part))).long().clamp(max=len(others) - 1)
+            part = replace(part, opacity_logits=others[rows])
+        yield f"below {threshold}", part
+
+
+def _least_contributing(cameras: Sequence[Camera], model: Gaussians) -> Variants:
+    """The shares of the Gaussians that contribute least to the cameras' images, made opaque."""
+    order = contributions(model, cameras).argsort(stable=True)
     for share in SHARES:
-        yield f"{share:.0%}", views.opaque(views.least_contributing(model, weights, share))
+        yield f"{share:.0%}", _opaque(model[order[: round(share * len(model))]])
 
 
-def _outliers(attribute: views.Attribute) -> Attack:
-    def show(model: Gaussians) -> Shown:
-        for side, deviation in product(get_args(views.Side), DEVIATIONS):
-            yield f"{side}, {deviation} deviations", views.outliers(model, attribute, side, deviation)
-
-    return Attack(
-        f"outliers in {attribute}",
-        f"Gaussians of unusual {attribute} are made opaque, the others left out.",
-        {"deviations": list(DEVIATIONS)},
-        show,
-    )
+def _quaternion_length(model: Gaussians) -> Tensor:
+    """[N] natural logarithm."""
+    length: Tensor = model.quats.norm(dim=1).clamp_min(_MIN_LENGTH).log()
+    return length
 
 
-def _clusters(model: Gaussians, seed: int) -> Shown:
+def _scale(model: Gaussians) -> Tensor:
+    """[N] natural logarithm of the geometric mean."""
+    return model.log_scales.mean(dim=1)
+
+
+def _sh_energy(model: Gaussians) -> Tensor:
+    """[N] natural logarithm of the sum of squares of the harmonics above the constant one."""
+    energy: Tensor = model.sh[:, 1:].square().sum((1, 2)).clamp_min(_MIN_LENGTH).log()
+    return energy
+
+
+ATTRIBUTES = {"quaternion length": _quaternion_length, "scale": _scale, "SH energy": _sh_energy}
+
+
+def _outliers(attribute: str, model: Gaussians) -> Variants:
+    """Only the Gaussians whose robust z-score in an attribute is beyond a limit, made opaque.
+
+    The score is the distance from the model's median over the standard deviation estimated by the median
+    absolute deviation, negated on the low side.
+    """
+    score = ATTRIBUTES[attribute](model)
+    if len(model):
+        score = score - score.median()
+        score = score / (_TO_SIGMA * score.abs().median()).clamp_min(_MIN_SPREAD)
+    for side, sign in (("low", -1), ("high", 1)):
+        for deviation in DEVIATIONS:
+            yield f"{side}, {deviation} deviations", _opaque(model[sign * score > deviation])
+
+
+def _clusters(seed: int, model: Gaussians) -> Variants:
+    """Groups of similar Gaussians, each alone and made opaque, the largest first.
+
+    A Gaussian mixture of opacity logit, sorted log scales, constant colour, and the logarithms of quaternion
+    length and SH energy, all standardised. Without positions, which would cut the scene into pieces. A model
+    of fewer than ten Gaussians is one group, and the others are empty.
+    """
     for count in CLUSTERS:
-        for index, part in enumerate(views.clusters(model, count, seed), start=1):
-            yield f"{index} of {count}", part
+        labels = torch.zeros(len(model), dtype=torch.long)
+        if len(model) >= _MIN_CLUSTERED:
+            labels = _cluster_labels(model, count, seed)
+        order = torch.bincount(labels, minlength=count).argsort(descending=True, stable=True)
+        for index, label in enumerate(order, start=1):
+            yield f"{index} of {count}", _opaque(model[(labels == label).to(model.device)])
+
+
+def _cluster_labels(model: Gaussians, count: int, seed: int) -> Tensor:
+    """[N] the cluster of each Gaussian, on the CPU."""
+    columns = [
+        model.opacity_logits[:, None],
+        model.log_scales.sort(dim=1).values,
+        model.sh[:, 0],
+        _quaternion_length(model)[:, None],
+        _sh_energy(model)[:, None],
+    ]
+    features = torch.cat(columns, dim=1)
+    spread = features.std(dim=0, correction=0).clamp_min(_MIN_SPREAD)
+    rows = ((features - features.mean(dim=0)) / spread).cpu().double().numpy()
+    sample = np.random.default_rng(seed).permutation(len(rows))[:_CLUSTER_SAMPLE]
+    mixtures = import_extra("sklearn.mixture", "audit", "find clusters")
+    threadpoolctl = import_extra("threadpoolctl", "audit", "find clusters")
+    mixture = mixtures.GaussianMixture(count, reg_covar=1e-3, random_state=seed)
+    # For matrices of 9 x 9, starting threads takes a hundred times as long as the work.
+    with threadpoolctl.threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a mixture that has not converged is good enough
+        mixture.fit(rows[sample])
+    return torch.from_numpy(mixture.predict(rows))

@@ -1,4 +1,4 @@
-"""Attacks on a stego model and on plain models, and how much of the secret they show."""
+"""Runs attacks on a stego model and on plain models, and scores the images against the secret."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
-from keyss.core.similarity import Similarity
+from keyss.core.scene import Scene
 from keyss.fitting.image_metrics import subsample_views
-from keyss.measure.leaks.attacks import Attack, Parameter
-from keyss.measure.leaks.scores import LeakScores, scores
+from keyss.measure.leaks.attacks import Attack
+from keyss.measure.leaks.scores import LeakScores, leak_scores
 from keyss.rendering import render
 
 _GAP = 4  # pixels between the parts of a picture
@@ -24,96 +23,70 @@ _GAP = 4  # pixels between the parts of a picture
 
 @dataclass(frozen=True)
 class AttackResult:
-    """What an attack shows of a secret in the stego model and in control models.
+    """How much more of a secret an attack shows in the stego model than in control models.
 
-    An attack has variants: thresholds, shares, clusters. Each score is the maximum over them, since an
-    attacker recognises the secret; `best` is the variant that shows most of its shapes.
+    An attack has variants: thresholds, shares, clusters. The maximum over them counts, since an attacker
+    recognises the secret.
     """
 
     attack: str
     sentence: str
-    parameters: dict[str, Parameter]
     with_key: bool  # not an attack, but the revealed secret
-    views: int  # number of variants
+    scores: LeakScores  # each the maximum over the variants
+    leak: LeakScores  # `scores` less those of the controls, which have as many variants
     best: str  # the variant with the largest `LeakScores.evidence`, which is pictured and judged
-    best_leak: LeakScores  # its scores less `control`
-    scores: LeakScores
-    control: LeakScores  # the mean over the control models
-    control_max: LeakScores  # the maximum over them
-    leak: LeakScores  # `scores` less `control`, which cancels the number of variants
+    best_leak: LeakScores  # its scores less those of the controls
     picture: str | None = None  # name of a file, in an audit
 
 
+@torch.no_grad()
 def look_for_secret(
     stego: Gaussians,
     controls: Sequence[Gaussians],
     secret: Scene,
-    frame: Similarity,
     attacks: Sequence[Attack],
     *,
-    test_views: int = 8,
+    max_views: int = 8,
 ) -> tuple[list[AttackResult], dict[str, Tensor]]:
     """How well attacks show the secret, from its own test cameras, against its photos.
 
-    The strictest assumption: the attacker looks from where the secret was photographed. `stego` and
-    `controls`, plain models of the cover, are in the cover's frame; `frame` leads from the frame of `secret`
-    into it. At most `test_views` test views are used. Images are uint8 [H, W, 3] by the attack's name: its
-    best variant on the stego model and on the first control, from the first test camera, and the photo.
-    Raises UsageError without a control or without test views.
+    The strictest assumption: the attacker looks from where the secret was photographed. `controls` are plain
+    models of the cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`), of
+    which at most `max_views` are used. Images are uint8 [H, W, 3] by the attack's name: its best variant on
+    the stego model and on the first control, from the first test camera, and the photo. Raises UsageError
+    without a control or without test views.
     """
     if not controls:
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
     if not secret.test:
         raise UsageError(f"leaks: the scene {secret.name} has no test views")
-    views = [
-        View(frame.apply_camera(view.camera), view.image) for view in subsample_views(secret.test, test_views)
-    ]
+    views = subsample_views(secret.test, max_views)
+
+    def look(attack: Attack, model: Gaussians) -> dict[str, tuple[LeakScores, Tensor]]:
+        """Scores of all variants of an attack, and pictures [H, W, 3] uint8 from the first view."""
+        shown = {}
+        for label, variant in attack.show(model):
+            image = render(variant, views[0].camera, secret.background).clamp(0, 1)
+            picture = (image * 255).round().to(torch.uint8).cpu()
+            shown[label] = leak_scores(variant, views, secret.background), picture
+        return shown
+
     results, pictures = [], {}
-    for each in attacks:
-        found = _look(each, stego, views, secret.background)
-        innocent = [_look(each, model, views, secret.background) for model in controls]
-        highest = [LeakScores.combined(max, [variant.scores for variant in one]) for one in innocent]
+    for attack in attacks:
+        variants = look(attack, stego)
+        of_controls = [look(attack, model) for model in controls]
+        highest = [LeakScores.combined(max, [each for each, _ in shown.values()]) for shown in of_controls]
         control = LeakScores.combined(fmean, highest)
-        best = max(found, key=lambda variant: (variant.scores - control).evidence())
-        scored = LeakScores.combined(max, [variant.scores for variant in found])
+        leaks = {label: own - control for label, (own, _) in variants.items()}
+        best = max(leaks, key=lambda label: leaks[label].evidence())
+        scored = LeakScores.combined(max, [own for own, _ in variants.values()])
         results.append(
             AttackResult(
-                attack=each.name,
-                sentence=each.sentence,
-                parameters=each.parameters,
-                with_key=each.with_key,
-                views=len(found),
-                best=best.label,
-                best_leak=best.scores - control,
-                scores=scored,
-                control=control,
-                control_max=LeakScores.combined(max, highest),
-                leak=scored - control,
+                attack.name, attack.sentence, attack.with_key, scored, scored - control, best, leaks[best]
             )
         )
-        same = next((variant for variant in innocent[0] if variant.label == best.label), innocent[0][0])
-        pictures[each.name] = _beside([best.picture, same.picture, views[0].image])
+        pictures[attack.name] = _beside([variants[best][1], of_controls[0][best][1], views[0].image])
     return results, pictures
-
-
-@dataclass(frozen=True)
-class _Variant:
-    """One variant of an attack on a model."""
-
-    label: str
-    scores: LeakScores
-    picture: Tensor  # [H, W, 3] uint8, from the first view
-
-
-@torch.no_grad()
-def _look(attack: Attack, model: Gaussians, views: Sequence[View], background: Tensor) -> list[_Variant]:
-    """All variants of an attack on a model."""
-    found = []
-    for label, shown in attack.show(model):
-        image = render(shown, views[0].camera, background).clamp(0, 1)
-        picture = (image * 255).round().to(torch.uint8).cpu()
-        found.append(_Variant(label, scores(shown, views, background), picture))
-    return found
 
 
 def _beside(images: Sequence[Tensor]) -> Tensor:

@@ -1,4 +1,4 @@
-"""How much of a photo an image shows, also after the best adjustment of exposure and colours."""
+"""Similarity of images to photos, after the best fit of colours."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import View
-from keyss.fitting.image_metrics import psnr
-from keyss.fitting.losses import Target, ssim
+from keyss.fitting.image_metrics import view_quality
 from keyss.rendering import render
 
 # Limits of a leak, in scores that respond to the secret's shapes and not to haze.
@@ -28,16 +27,13 @@ COARSE = 64  # pixels of the longer side: shapes that are slightly misplaced sti
 class LeakScores:
     """How well images show photos: means over views, or differences of such means.
 
-    Without the colour fit any bright cloud is closer to a photo than black: plain PSNR and SSIM show that
-    something is visible, not that it is the secret.
+    PSNR and SSIM after the best fit of colours. Without it any bright cloud is closer to a photo than black.
     """
 
-    psnr: float  # dB
-    ssim: float  # as in 3DGS
+    psnr_fitted: float  # dB
+    ssim_fitted: float  # as in 3DGS
     gradient: float  # `gradient_correlation`
     gradient_coarse: float  # the same of `coarse` images
-    psnr_fitted: float  # after `fit_colours`, dB
-    ssim_fitted: float
 
     @staticmethod
     def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
@@ -45,10 +41,9 @@ class LeakScores:
         return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
 
     def evidence(self) -> float:
-        """A leak relative to its limits: above 1 the secret's shapes show.
+        """The maximum of a leak's scores relative to their limits; above 1 the secret's shapes show.
 
-        The largest of PSNR and SSIM after the colour fit and of the coarse gradients, which haze alone does
-        not increase.
+        Of those that haze alone does not increase.
         """
         return max(
             self.psnr_fitted / PSNR_LIMIT,
@@ -92,23 +87,16 @@ def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def scores(model: Gaussians, views: Sequence[View], background: Tensor) -> LeakScores:
-    """How well a model shows the photos of views."""
+def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> LeakScores:
+    """Scores of a model against the photos of views, means over the views."""
     rows = []
     for view in views:
         photo = view.image.to(model.device).float() / 255
         image = render(model, view.camera, background).clamp(0, 1)
-        fitted, target = fit_colours(image, photo).clamp(0, 1), Target.of(photo)
-        rows.append(
-            LeakScores(
-                psnr(image, photo),
-                float(ssim(image, target)),
-                gradient_correlation(image, photo),
-                gradient_correlation(coarse(image), coarse(photo)),
-                psnr(fitted, photo),
-                float(ssim(fitted, target)),
-            )
-        )
+        fitted = view_quality(fit_colours(image, photo).clamp(0, 1), photo)
+        gradient = gradient_correlation(image, photo)
+        gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
+        rows.append(LeakScores(fitted.psnr, fitted.ssim, gradient, gradient_coarse))
     return LeakScores.combined(fmean, rows)
 
 

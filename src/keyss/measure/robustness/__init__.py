@@ -1,1 +1,1 @@
-"""What is left of a cover and of its secrets when the published model has been changed."""
+"""Changes of a published model, and what they cost its cover and its secrets."""

@@ -1,4 +1,4 @@
-"""Changes of a published model: what happens to files, and attacks with photos of the cover.
+"""Changes of a published model: accidents that files meet, and attacks with photos of the cover.
 
 Each is a pure function from `Gaussians` to `Gaussians`; all randomness follows from its seed.
 """
@@ -38,7 +38,6 @@ class Change:
     unit: str  # of the strength
     sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
-    seed: int | None = None  # None if nothing is random
 
     def __call__(self, model: Gaussians) -> Gaussians:
         return self.apply(model)
@@ -53,7 +52,7 @@ def random_pruning(share: float, seed: int = 0) -> Change:
         return model[order[_removed(share, model) :].sort().values.to(model.device)]
 
     sentence = f"A random {share:.0%} of the Gaussians are removed."
-    return Change("random pruning", share, "share removed", sentence, apply, seed)
+    return Change("random pruning", share, "share removed", sentence, apply)
 
 
 def opacity_pruning(share: float) -> Change:
@@ -80,7 +79,7 @@ def noise(attribute: str, strength: float, seed: int = 0) -> Change:
 
     def noisy(values: Tensor) -> Tensor:
         random = torch.randn(values.shape, generator=_generator(f"noise on {attribute}", seed)).to(values)
-        return values + strength * spread(values) * random
+        return values + strength * _spread(values) * random
 
     def apply(model: Gaussians) -> Gaussians:
         if attribute in _FIELDS:
@@ -91,10 +90,10 @@ def noise(attribute: str, strength: float, seed: int = 0) -> Change:
         return replace(model, sh=torch.cat(changed, dim=1))
 
     sentence = f"Normal noise of {strength:g} times its spread is added to the {attribute} of every Gaussian."
-    return Change(f"noise on {attribute}", strength, "spreads of the attribute", sentence, apply, seed)
+    return Change(f"noise on {attribute}", strength, "spreads of the attribute", sentence, apply)
 
 
-def spread(values: Tensor) -> Tensor:
+def _spread(values: Tensor) -> Tensor:
     """[...] of values [N, ...]: half the distance between their quantiles 0.159 and 0.841."""
     low, high = np.quantile(values.detach().cpu().numpy(), (0.158655, 0.841345), axis=0)
     return torch.as_tensor((high - low) / 2, dtype=values.dtype, device=values.device)
@@ -109,7 +108,7 @@ def cropping(seed: int = 0) -> Change:
         return model[order[len(model) // 2 :].sort().values]
 
     sentence = "Only the half of the Gaussians on one side of a plane is kept."
-    return Change("cropping", 0.5, "share removed", sentence, apply, seed)
+    return Change("cropping", 0.5, "share removed", sentence, apply)
 
 
 def fewer_harmonics(degree: int) -> Change:
@@ -124,28 +123,28 @@ def fewer_harmonics(degree: int) -> Change:
 
 def half_floats() -> Change:
     """Round every number to half precision (IEEE 754 binary16) and back."""
-    sentence = "Every number is rounded to half precision."
-    return Change(
-        "half floats",
-        16,
-        "bits a number",
-        sentence,
-        lambda model: model.map(lambda values: values.half().float()),
-    )
+
+    def apply(model: Gaussians) -> Gaussians:
+        return model.map(lambda values: values.half().float())
+
+    return Change("half floats", 16, "bits a number", "Every number is rounded to half precision.", apply)
 
 
 def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
+
+    def apply(model: Gaussians) -> Gaussians:
+        return refined(model, cover, steps, seed)
+
     sentence = f"Training continues on the cover's photos for {steps} steps."
-    return Change(
-        "fine-tuning", steps, "steps", sentence, lambda model: refined(model, cover, steps, seed), seed
-    )
+    return Change("fine-tuning", steps, "steps", sentence, apply)
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
-    """Prune what the cover's training views do not use, then train: after GSPure (arXiv 2511.22262).
+    """Prune the Gaussians that the cover's training views do not use, then train.
 
-    `given_up`: see `unused`. GSPure finds what to prune by the same weights, but clusters them.
+    Follows GSPure (arXiv 2511.22262), which prunes by the same weights, but clusters them. `given_up`: see
+    `unused`.
     """
 
     def apply(model: Gaussians) -> Gaussians:
@@ -156,22 +155,20 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
         f"{f', giving up {given_up:.1%} of what those show' if given_up else ''}; "
         f"then training continues for {steps} steps."
     )
-    return Change("purification", given_up, "share of the blending weight given up", sentence, apply, seed)
+    return Change("purification", given_up, "share of the blending weight given up", sentence, apply)
 
 
 def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
-    """[N] the Gaussians that contribute nothing to the training views, and then those that contribute least.
+    """[N] True for the Gaussians that contribute least to the training views, but never for all.
 
-    Their share of the blending weights, summed over pixels and views, is at most `given_up`. Never all of
-    them.
+    Their share of the blending weights, summed over pixels and views, is at most `given_up`; with 0 they
+    contribute nothing.
     """
     weights = contributions(model, [view.camera for view in subsample_views(cover.train, VIEWS)]).double()
     ascending, order = weights.sort(stable=True)
     chosen = ascending.cumsum(0) <= given_up * ascending.sum()
     chosen[-1] = False
-    result = torch.zeros_like(chosen)
-    result[order] = chosen
-    return result
+    return torch.zeros_like(chosen).index_put((order,), chosen)
 
 
 def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
@@ -194,9 +191,9 @@ def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussi
 
 
 def _generator(use: str, seed: int) -> torch.Generator:
-    """Random numbers that are independent of a training with the same seed, and of other uses.
+    """Random numbers independent of a training with the same seed, and of other uses.
 
-    Removing exactly what a training chose, such as a secret's anchors, would not be random.
+    Otherwise a change could remove exactly the Gaussians that a training chose, such as a secret's anchors.
     """
     digest = hashlib.sha256(f"keyss/robustness/{use} {seed}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)

@@ -16,12 +16,8 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
-import numpy.typing as npt
-import torch
-
 from keyss.core.errors import BackendError, KeyssError
-from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
 from keyss.measure.robustness.changes import Change
 
@@ -82,13 +78,13 @@ def find_splat_transform() -> str:
     """The program: KEYSS_SPLAT_TRANSFORM, else node_modules here, else on the PATH. Raises BackendError."""
     here = Path("node_modules") / ".bin" / "splat-transform"
     named = os.environ.get("KEYSS_SPLAT_TRANSFORM")
-    found = named or (str(here.absolute()) if here.exists() else shutil.which("splat-transform"))
-    if not found or not Path(found).exists():
+    program = named or (str(here.absolute()) if here.exists() else shutil.which("splat-transform"))
+    if not program or not Path(program).exists():
         raise BackendError(
             "splat-transform is not installed (npm install --no-save @playcanvas/splat-transform@2.7.1, "
             "or its path in KEYSS_SPLAT_TRANSFORM)"
         )
-    return found
+    return program
 
 
 def find_package(name: str) -> ModuleType:
@@ -108,9 +104,9 @@ def transform(source: Path, target: Path, *options: str) -> Path:
     except subprocess.TimeoutExpired as error:
         raise BackendError(f"splat-transform took more than {TIMEOUT:.0f} s for {target.name}") from error
     except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
+        message = getattr(error, "stderr", None) or str(error)
         raise BackendError(
-            f"splat-transform failed on {target.name}: {said.strip().splitlines()[-1]}"
+            f"splat-transform failed on {target.name}: {message.strip().splitlines()[-1]}"
         ) from error
     return target
 
@@ -138,17 +134,6 @@ def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
 
 
 def _splat(source: Path, folder: Path) -> tuple[Path, Path]:
-    """antimatter15's format: positions and scales as floats, colour, opacity and rotation as bytes."""
-    model, there = read_model(source), folder / "there.splat"
-    rows = np.zeros(len(model), dtype=[("p", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
-    rows["p"], rows["s"] = model.means.numpy(), model.scales.numpy()
-    rows["c"][:, :3] = _bytes((0.5 + SH_C0 * model.sh[:, 0]) * 255)
-    rows["c"][:, 3] = _bytes(model.opacities * 255)
-    rows["q"] = _bytes(torch.nn.functional.normalize(model.quats, dim=1) * 128 + 128)
-    there.write_bytes(rows.tobytes())
+    there = folder / "there.splat"
+    write_model(there, read_model(source))
     return there, transform(there, folder / "back.ply")
-
-
-def _bytes(values: torch.Tensor) -> npt.NDArray[np.uint8]:
-    result: npt.NDArray[np.uint8] = values.round().clamp(0, 255).to(torch.uint8).numpy()
-    return result

@@ -1,4 +1,4 @@
-"""Numbers that are close for a reason: are their low bits related, as they should be?
+"""Low bits of numbers that agree for a reason.
 
 Channels of a grey Gaussian, axes of a round one, neighbours that were one Gaussian before a split, Gaussians
 that share whole rows: if their high bits are equal, their low bits are close or equal too, unless replaced.
@@ -11,8 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
+from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
-from keyss.measure.stealth.words import Bits, Floats, Ints, Words, ulps
+from keyss.measure.stealth.words import Bits, Floats, Ints, Words, doubles, ulps
 
 _LOW = 13  # bits that may have been replaced
 _CLOSE = 1 << 5  # steps of the last bit
@@ -22,22 +23,23 @@ _MOVED, _AROUND = 1 << _LOW, 1 << (_LOW + 3)
 _GROUPS = {"axes": (1,), "quaternion": (2,), "channels": (5, 6, 7), "constant colour": (4,)}
 
 
-def agreement(words: Words, positions: Floats) -> dict[str, Statistic]:
-    """Of pairs with equal high bits, how many have close low bits (exact null: independent low bits).
+def agreement(model: Gaussians, words: Words) -> dict[str, Statistic]:
+    """Shares of pairs with close low bits among those with equal high bits, and of pairs slightly apart.
 
-    And how many more pairs are slightly apart than a smooth density gives: equal ones before embedding.
+    The exact null of the first is independent low bits. Pairs slightly apart beyond a smooth density were
+    equal before embedding.
     """
-    found: dict[str, Statistic] = {}
+    statistics: dict[str, Statistic] = {}
     for name, attributes in _GROUPS.items():
         pairs = list(_within(words, attributes))
         if pairs:
             one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            found |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+            statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
     harmless = words.attribute > 0
-    for name, rows in (("neighbours", _neighbours(positions)), ("sharers", _sharers(words))):
+    for name, rows in (("neighbours", _neighbours(doubles(model.means))), ("sharers", _sharers(words))):
         one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
-        found |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
-    return found
+        statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+    return statistics
 
 
 def _of_pairs(one: Bits, other: Bits) -> dict[str, Statistic]:
@@ -88,11 +90,11 @@ def _neighbours(positions: Floats) -> Ints:
 
 def _sharers(words: Words) -> Ints:
     """[P, 2] Gaussians with an equal number in a field, adjacent in the order of that field."""
-    found = [np.zeros((0, 2), np.int64)]
+    pairs = [np.zeros((0, 2), np.int64)]
     for field in range(3, words.bits.shape[1]):
         own = words.bits[:, field]
         rows = np.flatnonzero(words.trained[:, field])
         rows = rows[np.argsort(own[rows], kind="stable")]
         same = np.flatnonzero(own[rows[1:]] == own[rows[:-1]])
-        found.append(np.stack([rows[same], rows[same + 1]], axis=1))
-    return np.unique(np.sort(np.concatenate(found), axis=1), axis=0)
+        pairs.append(np.stack([rows[same], rows[same + 1]], axis=1))
+    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)

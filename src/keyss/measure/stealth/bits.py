@@ -1,6 +1,6 @@
-"""Are the bits of mantissas random, given everything else that an attacker sees?
+"""Bits of mantissas that are not random, given everything else that an attacker sees.
 
-By attribute, magnitude and position of the bit; given the bit below; and whether a number contradicts itself:
+By attribute, magnitude and position of the bit; given the bit below; and numbers that contradict themselves:
 training that leaves a zero in the last bit leaves zeros above it too, embedding does not.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import NOTHING, Statistic, dispersion, normal, share
 from keyss.measure.stealth.words import ATTRIBUTES, MAGNITUDES, MANTISSA, Bits, Flags, Words
 
@@ -17,47 +18,46 @@ _HARMONICS = ATTRIBUTES.index("sh1")
 _MIN_COUNT = 64  # numbers of a stratum
 
 
-def bits(words: Words) -> dict[str, Statistic]:
+def bits(model: Gaussians, words: Words) -> dict[str, Statistic]:
     """Statistics of single numbers, by attribute and magnitude; nulls are exact: fair, independent bits."""
-    found: dict[str, Statistic] = {}
+    statistics: dict[str, Statistic] = {}
     for index, attribute in enumerate(ATTRIBUTES):
         columns = words.of_attribute(index)
         own = words.bits[:, columns][words.trained[:, columns]]
         if len(own):
-            found |= {f"{name}, {attribute}": each for name, each in _of_values(own).items()}
-            found[f"strata of {attribute}"] = _strata(own)
-            found[f"bytes of {attribute}"] = _bytes(own)
+            statistics |= {f"{name}, {attribute}": each for name, each in _of_values(own).items()}
+            statistics[f"strata of {attribute}"] = _strata(own)
+            statistics[f"bytes of {attribute}"] = _bytes(own)
     harmonics = words.attribute >= _HARMONICS
     own, trained = words.bits[:, harmonics], words.trained[:, harmonics]
     exponent = words.exponent[:, harmonics]
     for magnitude, (low, high) in MAGNITUDES.items():
         values = own[trained & (exponent >= low) & (exponent < high)]
-        found |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
+        statistics |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
     small = trained & (exponent < MAGNITUDES["middling"][1])
-    found["zeros together in a Gaussian"] = _together(own, small)
-    found |= {f"Gaussians with tiny harmonics, {name}": each for name, each in _beside_tiny(words).items()}
-    return found
+    statistics["zeros together in a Gaussian"] = _together(own, small)
+    return statistics | _beside_tiny(words)
 
 
 def _of_values(values: Bits) -> dict[str, Statistic]:
     """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 above a zero against above a one."""
-    found = {}
+    statistics = {}
     for name, (low, high) in RANGES.items():
         ones = sum(int((values >> bit & 1).sum()) for bit in range(low, high))
-        found[f"ones in bits {name}"] = share(ones, len(values) * (high - low))
+        statistics[f"ones in bits {name}"] = share(ones, len(values) * (high - low))
     for count in (4, 8):
         zeros = int((values & np.uint32((1 << count) - 1) == 0).sum())
-        found[f"{count} zeros at the end"] = share(
+        statistics[f"{count} zeros at the end"] = share(
             zeros, len(values) if len(values) >> count > 5 else 0, 2.0**-count
         )
     even = values & 1 == 0
     clear = values & np.uint32(14) == 0
-    found["zeros above a zero"] = _difference(clear[even], clear[~even], 1 / 8)
-    return found
+    statistics["zeros above a zero"] = _difference(clear[even], clear[~even], 1 / 8)
+    return statistics
 
 
 def _difference(one: Flags, other: Flags, expected: float) -> Statistic:
-    """How much more frequent in `one` than in `other`, if both are by chance `expected`."""
+    """Difference of the shares in `one` and `other`; by chance both are `expected`."""
     if min(len(one), len(other)) < _MIN_COUNT:
         return NOTHING
     error = (expected * (1 - expected) * (1 / len(one) + 1 / len(other))) ** 0.5
@@ -90,7 +90,7 @@ def _bytes(values: Bits) -> Statistic:
 
 
 def _together(values: Bits, chosen: Flags) -> Statistic:
-    """Variance over Gaussians of how many of their small harmonics end in three zeros above the last bit."""
+    """Variance over Gaussians of the number of small harmonics with three zeros above the last bit."""
     zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
     trials = chosen.sum(axis=1)
     rows = trials > 1
@@ -104,12 +104,12 @@ def _together(values: Bits, chosen: Flags) -> Statistic:
 
 
 def _beside_tiny(words: Words) -> dict[str, Statistic]:
-    """Bits of the other numbers of Gaussians with a tiny harmonic: are they treated differently?"""
+    """Ones in the harmonics of Gaussians with a tiny harmonic, and of the others."""
     harmonics = words.attribute >= _HARMONICS
     tiny = (words.trained & (words.exponent < MAGNITUDES["tiny"][1]))[:, harmonics].any(axis=1)
-    found = {}
+    statistics = {}
     for name, rows in (("with", tiny), ("without", ~tiny)):
         values = words.bits[rows][:, harmonics][words.trained[rows][:, harmonics]]
         ones = sum(int((values >> bit & 1).sum()) for bit in range(1, 4))
-        found[f"ones in bits 1-3 {name}"] = share(ones, 3 * len(values))
-    return found
+        statistics[f"Gaussians with tiny harmonics, ones in bits 1-3 {name}"] = share(ones, 3 * len(values))
+    return statistics

@@ -1,7 +1,7 @@
-"""How noisy green and blue are compared with red, which the channel of colours does not write.
+"""Noise in green and blue compared with red, which the channel of colours does not write.
 
-Neighbours in space and rows, often one Gaussian before density control, differ in all three channels by about
-as much. Noise in two of them shows first in the pairs that differ least, and most in small and faint
+Neighbours in space and rows, often one Gaussian before density control, differ about equally in all three
+channels. Noise in two of them shows first in the pairs that differ least, and most in small and faint
 Gaussians.
 """
 
@@ -14,21 +14,21 @@ from scipy.spatial import cKDTree
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic
-from keyss.measure.stealth.words import Floats, Ints, doubles
+from keyss.measure.stealth.words import Floats, Ints, Words, doubles
 
 _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
 _CHANNELS = {"green": 1, "blue": 2}
 _PARTS = ("most visible", "more visible", "less visible", "least visible")
 _MIN_PAIRS = 200
-_TINY = 1e-4  # of a colour: a difference that counts as none
+_TINY = 1e-4  # of a colour: smaller differences count as none
 
 
-def colours(model: Gaussians) -> dict[str, Statistic]:
+def colours(model: Gaussians, words: Words) -> dict[str, Statistic]:
     """Logarithms of ratios of differences; 0 if green or blue vary as red does."""
     values = np.nan_to_num(doubles(model.sh[:, 0]))
-    found: dict[str, Statistic] = {}
+    statistics: dict[str, Statistic] = {}
     if len(values) < _MIN_PAIRS:
-        return found
+        return statistics
     positions = np.nan_to_num(doubles(model.means))
     _, near = cKDTree(positions).query(positions, k=2)
     rows = np.arange(len(values))
@@ -37,21 +37,23 @@ def colours(model: Gaussians) -> dict[str, Statistic]:
         apart = np.abs(values[pair[:, 0]] - values[pair[:, 1]])
         for channel, index in _CHANNELS.items():
             for quantile in _QUANTILES:
-                found[f"{channel} of {name}, {quantile}"] = _ratio(apart[:, index], apart[:, 0], quantile)
+                ratio = _ratio(apart[:, index], apart[:, 0], quantile)
+                statistics[f"{channel} of {name}, {quantile}"] = ratio
             close = apart[apart[:, 0] <= np.quantile(apart[:, 0], 0.1)]
-            found[f"{channel} of {name} with the same red"] = _ratio(close[:, index], apart[:, index], 0.5)
+            ratio = _ratio(close[:, index], apart[:, index], 0.5)
+            statistics[f"{channel} of {name} with the same red"] = ratio
     for name, part in _parts(model):
         apart = np.abs(values[part] - values[near[part, 1]])
         for channel, index in _CHANNELS.items():
-            found[f"{channel} of neighbours, {name}"] = _ratio(apart[:, index], apart[:, 0], 0.25)
+            statistics[f"{channel} of neighbours, {name}"] = _ratio(apart[:, index], apart[:, 0], 0.25)
     inside = {f"{one} and {other}": np.abs(values[:, i] - values[:, j]) for one, other, i, j in _BETWEEN}
     usual = np.median(np.stack(list(inside.values())), axis=1).mean()
     for name, each in inside.items():
         for quantile in _QUANTILES[:2]:
-            found[f"{name}, {quantile}"] = Statistic(
+            statistics[f"{name}, {quantile}"] = Statistic(
                 float(np.log((np.quantile(each, quantile) + _TINY) / (usual + _TINY)))
             )
-    return found
+    return statistics
 
 
 _BETWEEN = (("red", "green", 0, 1), ("red", "blue", 0, 2), ("green", "blue", 1, 2))

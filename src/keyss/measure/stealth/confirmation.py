@@ -1,8 +1,8 @@
-"""Is a candidate model hidden in a file? Scores for an attacker with a candidate, but no key.
+"""Scores for an attacker who has a candidate for the secret, but no key.
 
 Higher scores mean that the file looks more as if it held the candidate. A score alone means nothing, since
-some candidates resemble all files: what counts is whether the true one scores higher than others, and higher
-than in files that hold something else.
+some candidates resemble all files: the true one must score higher than others, and higher than in files that
+hold something else.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, spearmanr
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.opacities import UNDRAWN
+from keyss.measure.stealth.opacities import INVISIBLE
 from keyss.measure.stealth.words import Floats, Words, doubles
 
 MAX_GAUSSIANS = 20_000  # of each model
@@ -29,22 +29,22 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
     degree = min(file.sh_degree, candidate.sh_degree)
     file, candidate = (_thinned(each.with_sh_degree(degree)) for each in (file, candidate))
     parts = _parts(file)
-    found = {"identical high bits": _identity(file, candidate)}
+    scores = {"identical high bits": _identity(file, candidate)}
     if degree:
-        found |= _by_rows(_energies(file), _energies(candidate))
+        scores |= _by_rows(_energies(file), _energies(candidate))
     theirs = _marginals(candidate)
     for name, part in parts.items():
         own = _marginals(part)
-        found[f"marginals, {name}"] = -float(
+        scores[f"marginals, {name}"] = -float(
             np.mean([ks_2samp(own[key], theirs[key], method="asymp").statistic for key in own])
         )
-        found[f"extent, {name}"] = -float(np.abs(np.log(_extent(part) / _extent(candidate))).mean())
-        found[f"number, {name}"] = -abs(float(np.log(len(part) / len(candidate))))
-    return found
+        scores[f"extent, {name}"] = -float(np.abs(np.log(_extent(part) / _extent(candidate))).mean())
+        scores[f"number, {name}"] = -abs(float(np.log(len(part) / len(candidate))))
+    return scores
 
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
-    """Share of the Gaussians that `other` has too, with other low bits: two copies of a cover reveal it."""
+    """Share of the Gaussians that `other` has too, but with other low bits."""
     own, theirs = (_high_rows(each, slice(None)) for each in (file, other))
     whole = [{row.tobytes() for row in Words.of(each).bits} for each in (file, other)]
     shared = np.isin(own, theirs)
@@ -58,11 +58,11 @@ def _thinned(model: Gaussians) -> Gaussians:
 
 
 def _parts(file: Gaussians) -> dict[str, Gaussians]:
-    """Parts of a file that may be a secret: all, never drawn, faint, and the second half."""
+    """Parts of a file that may be a secret: all, invisible, faint, and the second half."""
     faint = file.opacity_logits < file.opacity_logits.median()
     parts = {
         "whole": file,
-        "never drawn": file[file.opacity_logits < UNDRAWN],
+        "invisible": file[file.opacity_logits < INVISIBLE],
         "faint": file[faint],
         "second half": file[len(file) // 2 :],
     }
@@ -79,7 +79,7 @@ def _energies(model: Gaussians) -> Floats:
 
 
 def _by_rows(own: Floats, theirs: Floats) -> dict[str, float]:
-    """Nearest rows: how many match, how well the best do, and whether they are in the same order."""
+    """Nearest rows: the share that matches, distances of the best, and correlation of their order."""
     count = min(len(own), len(theirs))
     at_ends = max(
         _correlation(own[part, 0], theirs[:count, 0]) for part in (slice(0, count), slice(-count, None))
@@ -126,15 +126,15 @@ def _identity(file: Gaussians, candidate: Gaussians) -> float:
 def _marginals(model: Gaussians) -> dict[str, Floats]:
     """Quantities that do not depend on the frame: shapes, energies, colours."""
     scales = np.sort(doubles(model.log_scales), axis=1)
-    found = {
+    marginals = {
         "flatness": scales[:, 1] - scales[:, 0],
         "elongation": scales[:, 2] - scales[:, 1],
         "brightness": model.sh[:, 0].detach().cpu().double().mean(1).numpy(),
         "length": model.quats.detach().cpu().double().norm(dim=1).numpy(),
     }
     if model.sh_degree:
-        found |= {f"energy {index}": column for index, column in enumerate(_energies(model).T)}
-    return found
+        marginals |= {f"energy {index}": column for index, column in enumerate(_energies(model).T)}
+    return marginals
 
 
 def _extent(model: Gaussians) -> Floats:

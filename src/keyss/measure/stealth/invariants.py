@@ -1,4 +1,4 @@
-"""Properties that some tools keep exactly, and that changed low bits keep only nearly."""
+"""Properties that some tools keep exactly, and changed low bits only nearly."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ _WINDOW = 32
 
 def invariants(model: Gaussians, words: Words) -> dict[str, Statistic]:
     """Unit quaternions in the whole file and in parts of it, repeated values, clusters, short numbers."""
-    found = _lengths(model)
+    statistics = _lengths(model)
     for index, attribute in enumerate(ATTRIBUTES):
         own = words.bits[:, words.of_attribute(index)]
         if not own.size:
             continue
         trained = words.trained[:, words.of_attribute(index)]
-        found[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
+        statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
         repeated = sum(_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
-        found[f"repeated values, {attribute}"] = portion(repeated, own.size)
+        statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
         clusters = [
             _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
         ]
         hits, trials = (sum(each) for each in zip(*clusters, strict=True))
-        found[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
-    return found
+        statistics[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
+    return statistics
 
 
 def _lengths(model: Gaussians) -> dict[str, Statistic]:
-    """How many quaternions have unit length, overall and in parts, and how many nearly."""
+    """Shares of quaternions of exactly and of nearly unit length, overall and in parts."""
     error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
     unit = error < _UNIT
     nearly = int((~unit & (error < _MOVED)).sum())
     around = int(((error >= _MOVED) & (error < _AROUND)).sum())
-    found = {
+    statistics = {
         "quaternions of unit length": portion(float(unit.sum()), len(unit)),
         "quaternions of nearly unit length": more_than_smooth(
             nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
@@ -56,26 +56,26 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
         count, hits = np.bincount(part), np.bincount(part, weights=unit)
         shares = (hits / np.maximum(count, 1))[count >= _MIN_GAUSSIANS]
         spread = float(shares.max() - shares.min()) if len(shares) else 0.0
-        found[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
-    return found
+        statistics[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
+    return statistics
 
 
 def _cells(positions: Floats) -> Ints:
     """[N] index of the cell between quantiles of each coordinate."""
     cuts = np.quantile(positions, np.arange(1, _CELLS) / _CELLS, axis=0)
     index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
-    found: Ints = np.ravel_multi_index(index, (_CELLS,) * 3)
-    return found
+    cells: Ints = np.ravel_multi_index(index, (_CELLS,) * 3)
+    return cells
 
 
 def _repeated(values: Bits) -> int:
-    """How often values occur that occur more than once."""
+    """Number of values that are not unique."""
     _, counts = np.unique(values, return_counts=True)
     return int(counts[counts > 1].sum())
 
 
 def _clusters(values: Floats) -> tuple[int, int]:
-    """How many gaps between sorted values are far smaller than their neighbours, and the number of gaps.
+    """Number of gaps between sorted values that are far smaller than their neighbours, and of all gaps.
 
     For a smooth density, gaps over their mean are exponential: one in a hundred is below 0.01.
     """

@@ -1,19 +1,20 @@
-"""The distribution of opacities, which hiding below the threshold of drawing changes."""
+"""The distribution of opacities, which hiding Gaussians too faint to be rendered changes."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, portion
-from keyss.measure.stealth.words import Floats, doubles
+from keyss.measure.stealth.words import Floats, Words, doubles
 
-UNDRAWN = -5.6  # logits below are never drawn
+INVISIBLE = -5.6  # logits below are never rendered
 _SHARES = {
     "logit below -12": (-np.inf, -12.0),
     "logit -12 to -8": (-12.0, -8.0),
-    "never drawn": (-np.inf, UNDRAWN),
-    "drawn, below 0.005": (-5.54, -5.293),
+    "invisible": (-np.inf, INVISIBLE),
+    "visible, below 0.005": (-5.54, -5.293),
     "0.005 to 0.05": (-5.293, -2.944),
     "0.05 to 0.5": (-2.944, 0.0),
     "0.5 to 0.9": (0.0, 2.197),
@@ -22,29 +23,35 @@ _SHARES = {
 _FAINT = -2.944
 _BANDWIDTH, _STEP = 0.15, 0.05  # logits
 _MIN_GAUSSIANS = 30  # of a mode
-_DIP = 0.5  # of the lower of two modes: how far the density must fall between them
+_DIP = 0.5  # of the lower of two modes: the density must fall to this between them
 
 
-def opacities(model: Gaussians) -> dict[str, Statistic]:
-    """Shares by opacity, and how faint Gaussians differ from the others."""
+def opacities(model: Gaussians, words: Words) -> dict[str, Statistic]:
+    """Shares by opacity, and differences between faint Gaussians and the others."""
     logits = doubles(model.opacity_logits)
-    found = {
+    statistics = {
         f"share of opacities, {name}": portion(float(((logits >= low) & (logits < high)).sum()), len(logits))
         for name, (low, high) in _SHARES.items()
     }
-    found["modes of faint opacities"] = Statistic(float(len(modes(logits[logits < _FAINT]))))
+    statistics["modes of faint opacities"] = Statistic(float(len(_modes(logits[logits < _FAINT]))))
     faint = logits < _FAINT
     for name, values in _shapes(model).items():
         few = min(faint.sum(), (~faint).sum()) < _MIN_GAUSSIANS
         parted = np.nan if few else float(np.median(values[faint]) - np.median(values[~faint]))
-        found[f"faint against opaque, {name}"] = Statistic(parted)
-        found[f"median {name}"] = Statistic(float(np.median(values)))
-        found[f"spread of {name}"] = Statistic(float(np.subtract(*np.quantile(values, (0.9, 0.1)))))
-    return found
+        statistics[f"faint against opaque, {name}"] = Statistic(parted)
+        statistics[f"median {name}"] = Statistic(float(np.median(values)))
+        statistics[f"spread of {name}"] = Statistic(float(np.subtract(*np.quantile(values, (0.9, 0.1)))))
+    return statistics
 
 
-def modes(logits: Floats) -> list[float]:
-    """Separate peaks of the density of opacity logits [N]: one for each group hidden there."""
+def invisible_modes(model: Gaussians) -> list[float]:
+    """Peaks of the density of opacity logits too low to be rendered: one for each group hidden there."""
+    logits = doubles(model.opacity_logits)
+    return _modes(logits[logits < INVISIBLE])
+
+
+def _modes(logits: Floats) -> list[float]:
+    """Separate peaks of the density of opacity logits [N]."""
     if len(logits) < _MIN_GAUSSIANS:
         return []
     low, high = logits.min() - 1, logits.max() + 1
@@ -53,30 +60,18 @@ def modes(logits: Floats) -> list[float]:
     reach = int(4 * _BANDWIDTH / _STEP)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * _STEP / _BANDWIDTH) ** 2)
     density = np.convolve(counts, kernel, mode="same")
-    found: list[int] = []
-    lowest = 0.0  # since the last mode
-    for at in range(1, len(density) - 1):
-        lowest = min(lowest, density[at])
-        if not (
-            density[at] >= density[at - 1]
-            and density[at] > density[at + 1]
-            and density[at] >= _MIN_GAUSSIANS / 2
-        ):
-            continue
-        if found and lowest > _DIP * min(density[found[-1]], density[at]):
-            if density[at] > density[found[-1]]:
-                found[-1] = at
-        else:
-            found.append(at)
-        lowest = density[at]
-    return [float(edges[at] + _STEP / 2) for at in found]
+    # A peak must fall to _DIP of its height on both sides, or to the end.
+    margins = np.pad(density, 1)
+    peaks, properties = find_peaks(margins, height=_MIN_GAUSSIANS / 2, prominence=0)
+    separate = properties["prominences"] >= (1 - _DIP) * properties["peak_heights"]
+    return [float(edges[at - 1] + _STEP / 2) for at in peaks[separate]]
 
 
 def _shapes(model: Gaussians) -> dict[str, Floats]:
     scales = doubles(model.log_scales)
     ordered = np.sort(scales, axis=1)
     lengths = model.quats.detach().cpu().double().norm(dim=1).numpy()
-    found = {
+    shapes = {
         "size": scales.mean(axis=1),
         "flatness": ordered[:, 1] - ordered[:, 0],
         "elongation": ordered[:, 2] - ordered[:, 1],
@@ -84,5 +79,5 @@ def _shapes(model: Gaussians) -> dict[str, Floats]:
     }
     for band in range(1, model.sh_degree + 1):
         part = model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double()
-        found[f"harmonics of degree {band}"] = part.square().sum((1, 2)).clamp_min(1e-24).log().numpy()
-    return found
+        shapes[f"harmonics of degree {band}"] = part.square().sum((1, 2)).clamp_min(1e-24).log().numpy()
+    return shapes

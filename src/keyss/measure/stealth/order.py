@@ -1,4 +1,4 @@
-"""The order of rows: how it correlates with their content, and whether adjacent rows are related."""
+"""The order of rows: its correlation with their content, and relations of adjacent rows."""
 
 from __future__ import annotations
 
@@ -10,49 +10,49 @@ from scipy.stats import ks_2samp, rankdata
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import Statistic, normal, portion
-from keyss.measure.stealth.words import Floats, doubles
+from keyss.measure.stealth.words import Floats, Words, doubles
 
 _KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
 _NEAR = 1e-5  # of the model's size
 
 
-def order(model: Gaussians) -> dict[str, Statistic]:
+def order(model: Gaussians, words: Words) -> dict[str, Statistic]:
     """Correlations of the content of rows with their number, and halves against each other; null: any order.
 
     Plain models have an order too, given by density control: compared with controls, a shuffled file is as
     unusual as one with a second model at its end.
     """
-    found: dict[str, Statistic] = {}
+    statistics: dict[str, Statistic] = {}
     count = len(model)
     if count < 100:
-        return found
+        return statistics
     rows = np.arange(count)
-    for name, values in columns(model).items():
+    for name, values in _columns(model).items():
         ranks = rankdata(values)
         correlation = float(np.corrcoef(rows, ranks)[0, 1]) if np.ptp(values) > 0 else 0.0
-        found[f"row and {name}, correlation"] = normal(correlation, 1 / math.sqrt(count - 1))
+        statistics[f"row and {name}, correlation"] = normal(correlation, 1 / math.sqrt(count - 1))
         half = ks_2samp(values[: count // 2], values[count // 2 :], method="asymp")
-        found[f"halves of rows, {name}"] = Statistic(
+        statistics[f"halves of rows, {name}"] = Statistic(
             float(half.statistic), _KS_SPREAD * math.sqrt(4 / count), float(half.pvalue)
         )
         jumps = np.abs(np.diff(ranks)).mean() / count
-        found[f"neighbouring rows, {name}"] = normal(float(jumps), 0.2236 / math.sqrt(count), 1 / 3)
+        statistics[f"neighbouring rows, {name}"] = normal(float(jumps), 0.2236 / math.sqrt(count), 1 / 3)
     positions = doubles(model.means)
     size = float(np.linalg.norm(np.subtract(*np.quantile(positions, (0.9, 0.1), axis=0)))) or 1.0
     pairs = len(cKDTree(positions).query_pairs(_NEAR * size, output_type="ndarray"))
-    found["near duplicates"] = portion(pairs, count)
-    return found
+    statistics["near duplicates"] = portion(pairs, count)
+    return statistics
 
 
-def columns(model: Gaussians) -> dict[str, Floats]:
-    """[N] numbers of each Gaussian that orders are compared by."""
+def _columns(model: Gaussians) -> dict[str, Floats]:
+    """[N] the content of each Gaussian by name."""
     positions = model.means.detach().cpu().double()
-    found = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}
-    found["distance"] = (positions - positions.median(0).values).norm(dim=1)
-    found["size"] = model.log_scales.detach().cpu().double().mean(1)
-    found["opacity"] = model.opacity_logits.detach().cpu().double()
-    found["brightness"] = model.sh[:, 0].detach().cpu().double().mean(1)
-    found["length of quaternion"] = model.quats.detach().cpu().double().norm(dim=1)
+    contents = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}
+    contents["distance"] = (positions - positions.median(0).values).norm(dim=1)
+    contents["size"] = model.log_scales.detach().cpu().double().mean(1)
+    contents["opacity"] = model.opacity_logits.detach().cpu().double()
+    contents["brightness"] = model.sh[:, 0].detach().cpu().double().mean(1)
+    contents["length of quaternion"] = model.quats.detach().cpu().double().norm(dim=1)
     if model.sh_degree:
-        found["harmonics"] = model.sh[:, 1:].detach().cpu().double().square().sum((1, 2))
-    return {name: np.nan_to_num(values.numpy()) for name, values in found.items()}
+        contents["harmonics"] = model.sh[:, 1:].detach().cpu().double().square().sum((1, 2))
+    return {name: np.nan_to_num(values.numpy()) for name, values in contents.items()}

@@ -1,4 +1,4 @@
-"""One number about a file, with its error and its null distribution."""
+"""One number about a file, with its standard error and its p-value."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.special import bdtrc, chdtrc, ndtr, pdtrc
 class Statistic:
     """The value of a detector on one file.
 
-    `error`: the standard error of sampling, if known; trainings may vary by more, which only control models
-    show. `p`: the probability of at least as much under an exact null, if there is one.
+    `error`: the standard error of sampling, if known; control models may vary by more. `p`: the probability
+    of at least this value under an exact null, if there is one.
     """
 
     value: float  # NaN if there is too little data

@@ -46,9 +46,9 @@ class Words:
 
     @cached_property
     def trained(self) -> Flags:
-        """[N, F] which numbers are not short: see _SHORT."""
-        found: Flags = (self.bits & _SHORT) != 0
-        return found
+        """[N, F] True for numbers that are not short: see _SHORT."""
+        result: Flags = (self.bits & _SHORT) != 0
+        return result
 
     def of_attribute(self, index: int) -> slice:
         """Columns."""
@@ -58,8 +58,8 @@ class Words:
 
 def doubles(values: Tensor) -> Floats:
     """A tensor as float64 on the CPU."""
-    found: Floats = values.detach().cpu().double().numpy()
-    return found
+    result: Floats = values.detach().cpu().double().numpy()
+    return result
 
 
 def ulps(one: Bits, other: Bits) -> Ints:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from audit.audited import audited_run, found_in
+from audits.audited import audited_run, found_in
 from shared import made_once
 
 

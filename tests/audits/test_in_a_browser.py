@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from audit.audited import found_in, run_with
+from audits.audited import found_in, run_with
 from keyss.audits import audit
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
@@ -36,7 +36,7 @@ def report(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the audit with pictures of one colour each in its first slider."""
     data = found_in(run_folder)
     run = run_with(run_folder, tmp_path_factory.mktemp("coloured"), data)
-    items = {item["label"]: item["file"] for item in data["images"]["pictures"][0]["items"]}
+    items = next(iter(data["images"]["pictures"].values()))
     for label, colour in {"photo": RED, "stego model": BLUE, "plain model": GREEN}.items():
         Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / items[label])
     audit(run, report_only=True)

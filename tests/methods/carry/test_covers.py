@@ -1,4 +1,4 @@
-"""What becomes of a cover: nothing that it shows, and nothing that is not its own."""
+"""A refitted cover shows what the cover shows, and holds no Gaussians that are not its own."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import matplotlib
 import pytest
 from markupsafe import Markup
 
-from audit.pages import Parsed
+from audits.pages import Parsed
 from keyss.audits import figures
 from keyss.measure import ChangedQuality, ChangeResult
 
@@ -25,9 +25,8 @@ def lost(attack: str, points: Points) -> list[ChangeResult]:
             strength,
             "u",
             "",
-            None,
-            cover=ChangedQuality(30.0, 0.9, cover),
-            secrets=(ChangedQuality(30.0, 0.9, secret or 0.0, opens=secret is not None),),
+            cover=ChangedQuality(30.0, cover),
+            secrets=(ChangedQuality(30.0, secret or 0.0, opens=secret is not None),),
         )
         for strength, (cover, secret) in enumerate(points)
     ]
@@ -98,5 +97,5 @@ def test_secrets_that_do_not_open_are_marked() -> None:
 
 def test_nothing_is_drawn_from_nothing() -> None:
     assert figures.losses([]) == []
-    skipped = ChangeResult("conversion", 1, "times", "", None, skipped="no tool")
+    skipped = ChangeResult("conversion", 1, "times", "", skipped="no tool")
     assert figures.losses([skipped]) == []

@@ -6,21 +6,18 @@ import json
 import shutil
 from dataclasses import fields
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 import torch
 
 import keyss
 from keyss import Secret
-from keyss.audits import Audit, audit, parts, read_audit
-from keyss.audits.progress import PartProgress, PartResult
-from keyss.audits.record import LeaksResult
-from keyss.audits.subject import AuditSubject
+from keyss.audits import Audit, PartResult, audit, parts, read_audit
 from keyss.cli import main
 from keyss.cli.measuring import PartName
 from keyss.core import InputError, Interrupted, OutputError, UsageError, WrongKeyError
-from keyss.measure import FileSize, SpeedResult
+from keyss.measure import SpeedResult
 from test_api import ANY, write_nerfstudio
 from tiny_scenes import tiny_scene
 
@@ -45,17 +42,17 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two parts that only note that they were called; the second can be told to fail."""
     called: list[str] = []
 
-    def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[SpeedResult]:
+    def speed(subject: Any, seed: int, progress: Any) -> PartResult[SpeedResult]:
         called.append("speed")
         progress(1, 2)
-        result = SpeedResult((), (), (FileSize("stego", len(subject.stego)),), ())
+        result = SpeedResult({}, (), {"stego": len(subject.stego)}, ())
         return PartResult(result, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)})
 
-    def leaks(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[LeaksResult]:
+    def leaks(subject: Any, seed: int, progress: Any) -> PartResult[Any]:
         called.append("leaks")
         if called.count("leaks") == 1 and "fail" in called:
             raise KeyboardInterrupt
-        return PartResult(LeaksResult(((),) * len(subject.controls)))
+        return PartResult(((),) * len(subject.controls))
 
     monkeypatch.setattr("keyss.audits.run.PARTS", {"speed": speed, "leaks": leaks})
     return called
@@ -64,17 +61,17 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def gaussians_of(found: Audit) -> int:
     """What the first of the parts noted."""
     assert found.speed is not None
-    return found.speed.files[0].bytes
+    return found.speed.bytes["stego"]
 
 
 def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     found = audit(run, [KEY], controls=2)
     assert calls == ["speed", "leaks"]
     assert read_audit(run) == found
-    assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 3
+    assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 4
     assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "stego.ply"))
-    assert found.leaks == LeaksResult(((), ()))
-    assert (found.controls.models, len(set(found.controls.seeds))) == (2, 2)
+    assert found.leaks == ((), ())
+    assert (len(found.controls), len(set(found.controls))) == (2, 2)
     assert (run / "private" / "audit" / "pictures" / "a.png").exists()
     assert not (run / "private" / "checkpoint").exists()
     assert KEY not in (run / "private" / "audit" / "audit.json").read_text()
@@ -146,16 +143,16 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     assert found.parameters is not None
     assert set(found.parameters.distances) >= {"position", "scale", "rotation", "opacity", "joint"}
     assert all(each.original is not None for each in found.parameters.distances.values())
-    metrics, sinkhorn = json.loads((run / "private" / "metrics.json").read_text()), found.parameters.sinkhorn
+    metrics = json.loads((run / "private" / "metrics.json").read_text())
     psnrs = metrics["cover"]["psnr"] + metrics["secrets"][0]["psnr"]
-    assert sinkhorn.score == pytest.approx(psnrs * (1 - sinkhorn.stego.sum))
+    assert found.parameters.score == pytest.approx(psnrs * (1 - found.parameters.sinkhorn.sum))
     sizes = [len(each) for each in vars(found.parameters.two_sample).values()]
     assert sizes == [2, 1, 2]
     assert found.leaks is not None
-    assert not any(row.with_key for row in found.leaks.secrets[0])  # records never lie in the cover's frame
+    assert not any(row.with_key for row in found.leaks[0])  # records never lie in the cover's frame
     assert found.images is not None
-    pictures = {item.file for view in found.images.pictures for item in view.items}
-    pictures |= {str(row.picture) for row in found.leaks.secrets[0]}
+    pictures = {file for files in found.images.pictures.values() for file in files.values()}
+    pictures |= {str(row.picture) for row in found.leaks[0]}
     assert all((run / "private" / "audit" / name).is_file() for name in pictures)
     page = (run / "private" / "report.html").read_text()
     assert "data:image/png" in page

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from markupsafe import Markup
 
-from audit.audited import found_in, run_with, with_all_texts
-from audit.pages import Parsed
+from audits.audited import found_in, run_with, with_all_texts
+from audits.pages import Parsed
 from keyss.audits import audit, figures, page as page_module
 from keyss.core import InputError, OutputError
 from keyss.files.layout import usual_up
@@ -89,7 +89,7 @@ def test_what_was_hidden_where(page: Parsed, data: dict[str, Any]) -> None:
     for fact in (
         f"{data['run']['gaussians']:,} Gaussians",
         "40 pixels wide",
-        f"2 plain models of the cover, seeds {', '.join(map(str, data['controls']['seeds']))}",
+        f"2 plain models of the cover, seeds {', '.join(map(str, data['controls']))}",
         f"keyss {data['keyss']}, took ",
         "measures are within their limits.",
         '"iterations": 20',
@@ -100,21 +100,22 @@ def test_what_was_hidden_where(page: Parsed, data: dict[str, Any]) -> None:
 
 def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> None:
     images, parameters, robustness = data["images"], data["parameters"], data["robustness"]
-    psnrs = [each["mean"]["psnr"] for each in (images["cover"], images["cover_baseline"], *images["secrets"])]
+    psnrs = [model["images"]["mean"]["psnr"] for model in images["models"]]
+    psnrs += [images["models"][0]["baseline"]["mean"]["psnr"]]
     shown = [f"{psnr:.2f}" for psnr in psnrs]
-    shown += [f"{data['wrong_key']['shown']['vs_secrets'][1]['max']:.2f}"]
-    shown += [f"{data['leaks']['secrets'][1][0]['scores']['gradient']:.3f}"]
-    shown += [f"{parameters['sinkhorn']['stego']['sum']:.4f}", f"{parameters['sinkhorn']['score']:.2f}"]
+    shown += [f"{data['wrong_key']['vs_secrets'][1]['max']:.2f}"]
+    shown += [f"{data['leaks'][1][0]['scores']['gradient']:.3f}"]
+    shown += [f"{parameters['sinkhorn']['sum']:.4f}", f"{parameters['score']:.2f}"]
     shown += [f"{data['stegexpose']['stego']['plain'][3]['rs']:.4f}"]
-    shown += [f"{robustness['changes'][1]['secrets'][1]['psnr']:.2f}"]
-    shown += [f"{data['speed']['render'][0]['ratio']:.2f}×", "does not open", "Mean of 3 draws."]
+    shown += [f"{robustness[1]['secrets'][1]['psnr']:.2f}"]
+    shown += [f"{data['speed']['render']['stego']['ratio']:.2f}×", "does not open", "Mean over 3 seeds."]
     assert [number for number in shown if number.replace("-", "−") not in page.text] == []
     assert "half floats bits a number – 16.0" in page.text  # of low bits nothing is left
 
 
 def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]) -> None:
-    named = [item for view in data["images"]["pictures"] for item in view["items"]]
-    leaks = [row["picture"] for attacks in data["leaks"]["secrets"] for row in attacks]
+    named = [file for files in data["images"]["pictures"].values() for file in files]
+    leaks = [row["picture"] for attacks in data["leaks"] for row in attacks]
     assert page.tags.count("img") == len(named) + len(leaks)
     assert page.tags.count("svg") == 2  # losses of two secrets
     assert all(alt for alt in page.values("alt"))
@@ -247,7 +248,9 @@ ATTACKS = [
 @pytest.mark.parametrize("text", ATTACKS)
 def test_texts_of_others_stay_text(run_folder: Path, data: dict[str, Any], tmp_path: Path, text: str) -> None:
     """Every text and every free name of the audit, all at once, figures included."""
-    data = with_all_texts(data, text, lambda name: name in ("file", "picture", "first"))
+    data = with_all_texts(data, text, lambda name: name in ("picture", "pictures"))
+    files = [file for files in data["images"]["pictures"].values() for file in files.values()]
+    data["images"]["pictures"] = {text: {text: files[0], "other": files[1]}}
     data["parameters"]["distances"] = {text: data["parameters"]["distances"]["opacity"]}
     data["run"]["config"] = {text: {text: text}}
     page = parsed(run_with(run_folder, tmp_path, data))
