@@ -146,3 +146,20 @@ def test_a_secret_loses_harmonics_that_the_cover_has_no_room_for() -> None:
     assert result.stego.sh_degree == 1
     assert keyss.reveal(result.stego, KEY).gaussians.sh_degree == 0
     assert 10 < result.metrics.against_plain[1].psnr < 60
+
+
+@pytest.mark.parametrize(
+    ("options", "changed"),
+    [
+        (CarryOptions(), False),
+        (CarryOptions(publish="spz"), False),
+        (CarryOptions(publish="any"), False),
+        (CarryOptions(sh_degree=1), True),
+        (CarryOptions(publish="spz", sh_degree=0), True),
+    ],
+)
+def test_plans_note_what_a_cover_loses_before_embedding(options: CarryOptions, changed: bool) -> None:
+    models = trained_like(2500, sh_degree=2), trained_like(20, 1, 0)
+    sources = [Source(model, False) for model in models]
+    notes = registry.get("carry").plan(sources, _prepare(options, *models)).notes
+    assert any("leave the cover at" in note for note in notes) == changed

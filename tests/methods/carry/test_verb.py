@@ -12,10 +12,10 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss import CarryOptions, FitConfig, Gaussians, Secret
+from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import LOW_BITS
 from keyss.cli import main
-from keyss.core import InputError, UsageError, WrongKeyError, compensate_pruning
+from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.methods import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
@@ -204,16 +204,6 @@ def test_pruning_keeps_what_is_visible() -> None:
     kept = most_visible(model, 600)
     assert torch.equal(kept.means, model.means[400:])
     assert most_visible(model, 1000) is model
-
-
-def test_compensation_makes_up_for_what_is_lost() -> None:
-    model = trained_like(1000)
-    assert compensate_pruning(model, 1000) is model
-    rest = compensate_pruning(model[:500], 1000)
-    assert (rest.opacities >= model[:500].opacities - 1e-6).all()
-    assert torch.allclose(rest.opacities, 1 - (1 - model[:500].opacities) ** 2, atol=1e-5)
-    sure = Gaussians(model.means, model.quats, model.log_scales, model.opacity_logits * 0 + 40, model.sh)
-    assert torch.isfinite(compensate_pruning(sure[:1], 1000).opacity_logits).all()
 
 
 def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -> None:

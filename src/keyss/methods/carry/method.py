@@ -11,7 +11,7 @@ from keyss.core.errors import KeyssWarning, UsageError
 from keyss.methods.base import Capabilities, Context, Source, Stego, role_of
 from keyss.methods.carry.options import CarryOptions
 from keyss.methods.carry.refit import MODEL_ITERATIONS, refitted
-from keyss.methods.carry.room import PayloadRoom, SecretSize, room_for
+from keyss.methods.carry.room import SecretSize, WholeRoom, room_for
 from keyss.methods.plan import Plan
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
@@ -71,9 +71,9 @@ class CarryMethod:
         room, secret_sizes = room_for(cover.given, options), _secret_sizes(secrets, options)
         sizes = room.sizes(secret_sizes)
         appended, notes = room.appended(secret_sizes), []
-        if cover.given is not None and room.prepared is not None and room.prepared.cover is not cover.given:
-            psnr = psnr_between(cover.given, room.prepared.cover)
-            notes.append(f"new harmonics or low bits leave the cover at {psnr:.1f} dB PSNR against itself")
+        if cover.given is not None and room.cover is not None and room.cover is not cover.given:
+            psnr = psnr_between(cover.given, room.cover)
+            notes.append(f"other harmonics or low bits leave the cover at {psnr:.1f} dB PSNR against itself")
         for index, (secret, (_, degree)) in enumerate(zip(secrets, sizes, strict=True)):
             if secret.given is not None and secret.given.sh_degree > degree:
                 psnr = psnr_between(secret.given, secret.given.with_sh_degree(degree))
@@ -85,7 +85,7 @@ class CarryMethod:
             notes.append(
                 f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}"
             )
-        elif isinstance(room, PayloadRoom):
+        elif isinstance(room, WholeRoom):
             how = "about" if room.prepared is None else "exactly"
             notes.append(f"the {room.channel.place} have room for {how} {room.room.capacity:,} bytes")
         counts = [count for count, _ in sizes]

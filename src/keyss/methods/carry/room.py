@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from keyss.channels import LOW_BITS, TYPICAL_SHARE, Channel, LowBitsCover, PreparedCover, Room
+from keyss.channels import APPENDED, LOW_BITS, TYPICAL_SHARE, Channel, LowBitsCover, PreparedCover, Room
 from keyss.channels.low_bits.bits import Layout
-from keyss.channels.low_bits.channel import LowBitsRoom
+from keyss.channels.low_bits.layout import Carriers
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
@@ -54,7 +54,7 @@ class RecordRoom:
 
     gaussians: int  # of the cover
     sh_degree: int  # of the cover
-    room: LowBitsRoom
+    room: Carriers
     prepared: LowBitsCover | None = None  # None: not fitted yet
     refit_share = 1.0  # of the Gaussians that fit before a refit
     more_room = _ANY
@@ -71,21 +71,26 @@ class RecordRoom:
         if cover is not None:
             cover = of_degree(cover, degree, entropy)
         layout = Layout(degree) if cover is None else Layout.of(cover)
-        if largest_degree(LowBitsRoom(0, layout.width).record_bytes(1)) is None:
+        if largest_degree(Carriers(0, layout.width).record_bytes(1)) is None:
             unit = "" if layout.quats else " with unit quaternions"
             raise UsageError(
                 f"a model of SH degree {degree}{unit} has no room for anything in its low bits; "
                 f"`sh_degree={1 if layout.quats else 2}` makes room, {_ANY}"
             )
         if cover is None:
-            return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
+            return RecordRoom(count, degree, Carriers(int(TYPICAL_SHARE * count), layout.width))
         try:
             prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
         except InputError as error:
             others = "" if options.dither else "`dither=True` may give it others, "
             raise InputError(f"{error}; {others}{_ANY}") from error
-        room = LowBitsRoom(prepared.carriers, prepared.layout.width)
+        room = Carriers(prepared.carriers, prepared.layout.width)
         return RecordRoom(len(cover), degree, room, prepared)
+
+    @property
+    def cover(self) -> Gaussians | None:
+        """The cover before embedding."""
+        return None if self.prepared is None else self.prepared.cover
 
     @property
     def max_secret_degree(self) -> int:
@@ -127,26 +132,29 @@ class RecordRoom:
 
 
 @dataclass(frozen=True)
-class PayloadRoom:
+class WholeRoom:
     """The room for payloads: of a prepared cover, or about that of one not fitted yet."""
 
     gaussians: int  # of the cover
     sh_degree: int  # of the published model
     channel: Channel
     room: Room
-    prepared: PreparedCover | None = None  # None: not fitted yet
+    cover: Gaussians | None = None  # before embedding; None: not fitted yet
+    prepared: PreparedCover | None = None
     max_secret_degree = 3
     refit_share = 0.97  # of the Gaussians that fit before a refit, which changes how well they compress
     more_room = '`publish="ply"` has more room'
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions) -> PayloadRoom:
+    def of(cover: Gaussians | None, options: CarryOptions) -> WholeRoom:
         """The room in `cover`. Raises InputError for a cover without room."""
         degree, count, channel = options.fit.sh_degree, options.fit.max_gaussians, options.place
         if cover is None:
-            return PayloadRoom(count, degree, channel, channel.room(count, degree))
-        prepared = channel.prepare(cover.with_sh_degree(min(cover.sh_degree, degree)))
-        return PayloadRoom(len(cover), prepared.cover.sh_degree, channel, prepared, prepared)
+            return WholeRoom(count, degree, channel, channel.room(count, degree))
+        if cover.sh_degree > degree:
+            cover = cover.with_sh_degree(degree)
+        prepared = channel.prepare(cover)
+        return WholeRoom(len(cover), cover.sh_degree, channel, prepared, cover, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
         """See `RecordRoom.sizes`; an estimate for secrets that do not fit."""
@@ -163,17 +171,19 @@ class PayloadRoom:
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
         """About how many Gaussians the model grows by."""
-        return sum(self.channel.appended(secret.payload_bytes) for secret in secrets)
+        if not self.room.grows:
+            return 0
+        return sum(APPENDED.appended(secret.payload_bytes) for secret in secrets)
 
 
 def room_for(
     cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None
-) -> RecordRoom | PayloadRoom:
+) -> RecordRoom | WholeRoom:
     """The room in a cover, or about that in one that is not fitted yet.
 
     Raises UsageError and InputError for a cover without room.
     """
-    return RecordRoom.of(cover, options, entropy) if options.place.records else PayloadRoom.of(cover, options)
+    return RecordRoom.of(cover, options, entropy) if options.place.records else WholeRoom.of(cover, options)
 
 
 def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:

@@ -66,7 +66,7 @@ def embed_models(
     return Stego(stego, opened, details=details, verified=True)
 
 
-def encode_all(cover: PreparedCover, models: Sequence[Gaussians]) -> list[Records]:
+def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:
     """The records of all models, as precise as they fit into `cover` together. Raises UsageError if not."""
     plans = cover.plan_records([record_request(len(model), model.sh_degree) for model in models])
     found = []
