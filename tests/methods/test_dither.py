@@ -12,7 +12,7 @@ from channels.low_bits.trained_like import keys, trained_like
 from files.test_ply import assert_same_bits
 from keyss.channels import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians, InputError
-from keyss.methods import dither
+from keyss.methods import dither_model
 from keyss.rendering import psnr_between
 from methods.carry.carried import embed_derived, extract_derived
 
@@ -43,7 +43,7 @@ def test_quantised_models_can_carry_again_and_would_be_rounded_back(
     coarse = model.map(change)
     with pytest.raises(InputError, match="low bits"):
         LOW_BITS.prepare(coarse)
-    fine = dither(coarse, ENTROPY)
+    fine = dither_model(coarse, ENTROPY)
     assert LOW_BITS.prepare(fine).usable.mean() > 0.9
     assert torch.equal(fine.means, coarse.means)
     assert torch.equal(fine.sh[:, 0], coarse.sh[:, 0])
@@ -59,17 +59,17 @@ def test_an_added_offset_is_noticed_and_dithered(model: Gaussians) -> None:
     moved = Gaussians(model.means, model.quats, _added(model.log_scales), model.opacity_logits, model.sh)
     with pytest.raises(InputError, match="random low bits"):
         LOW_BITS.prepare(moved)
-    fine = dither(moved, ENTROPY)
+    fine = dither_model(moved, ENTROPY)
     assert torch.equal(fine.quats, moved.quats)
     assert LOW_BITS.prepare(fine).usable.mean() > 0.5
     assert float((fine.log_scales - moved.log_scales).abs().max()) < 0.01
 
 
 def test_trained_models_and_properties_of_one_value_stay_as_they_are(model: Gaussians) -> None:
-    assert_same_bits(dither(model, ENTROPY), model)
+    assert_same_bits(dither_model(model, ENTROPY), model)
     flat = model.map(torch.clone)
     flat.sh[:, 9:] = 0
-    assert_same_bits(dither(flat, ENTROPY), flat)
+    assert_same_bits(dither_model(flat, ENTROPY), flat)
 
 
 def test_the_cost_is_what_pictures_show(model: Gaussians) -> None:
@@ -82,11 +82,11 @@ def test_the_cost_is_what_pictures_show(model: Gaussians) -> None:
     )
     assert psnr_between(small, small) == pytest.approx(120)
     steps = small.map(_steps)
-    assert 30 < psnr_between(steps, dither(steps, ENTROPY)) < 80
+    assert 30 < psnr_between(steps, dither_model(steps, ENTROPY)) < 80
 
 
 def test_other_entropy_gives_other_bits(model: Gaussians) -> None:
     steps = model.map(_steps)
-    one, other = dither(steps, ENTROPY), dither(steps, bytes([1] * 32))
+    one, other = dither_model(steps, ENTROPY), dither_model(steps, bytes([1] * 32))
     assert (one.quats.numpy() != other.quats.numpy()).mean() > 0.99
     assert np.isfinite(one.sh.numpy()).all()

@@ -11,7 +11,7 @@ from .carry.options import CarryOptions as CarryOptions
 from .carry.refit import most_contributing as most_contributing
 from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, of_degree as of_degree
 from .decoy import Decoy as Decoy
-from .dither import dither as dither
+from .dither import dither_model as dither_model
 from .joint import JointTraining as JointTraining
 from .keyss.clip_keys import ClipKeys as ClipKeys
 from .keyss.decoder import (

@@ -30,7 +30,7 @@ _FAINT = 1e-3  # standard deviation of new harmonics
 Floats = npt.NDArray[np.float32]
 
 
-def dither(model: Gaussians, entropy: bytes) -> Gaussians:
+def dither_model(model: Gaussians, entropy: bytes) -> Gaussians:
     """`model` with new low bits where they are not random; positions and constant colours stay.
 
     `entropy`: 32 bytes that nobody else knows. Properties with a single value stay unchanged, and so do

@@ -14,7 +14,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.dither import dither, raised
+from keyss.methods.dither import dither_model, raised
 from keyss.methods.points import divided
 from keyss.methods.records.embedding import largest_degree, record_request, shares
 from keyss.methods.records.precision import least_bytes, most_visible, pruned
@@ -193,7 +193,7 @@ def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
     except InputError:
         if entropy is None:
             raise
-    return LOW_BITS.prepare(dither(cover, entropy))
+    return LOW_BITS.prepare(dither_model(cover, entropy))
 
 
 def of_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
