@@ -16,8 +16,8 @@ import pytest
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
 from keyss import Secret, hide
-from keyss.channels import LOW_BITS, opening
-from keyss.channels.low_bits import cells, reading
+from keyss.channels import LOW_BITS, base, opening
+from keyss.channels.low_bits import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
@@ -87,7 +87,7 @@ class TestOpensNothing:
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         """Counts derived keys, and blocks of AES."""
         done = {"keys": 0, "blocks": 0}
-        encrypt, derive = cells.encrypted_blocks, reading.DerivedKey
+        encrypt, derive = cells.encrypted_blocks, base.DerivedKey
 
         def counted(key: bytes, data: np.ndarray) -> np.ndarray:
             done["blocks"] += data.size // 16
@@ -98,7 +98,7 @@ class TestOpensNothing:
             return derive(*arguments)  # type: ignore[arg-type]
 
         monkeypatch.setattr(cells, "encrypted_blocks", counted)
-        for module in (opening, reading):
+        for module in (opening, base):
             monkeypatch.setattr(module, "DerivedKey", derived)
         return done
 
@@ -116,7 +116,7 @@ class TestOpensNothing:
             made.append(dict(work))
         assert said[0] == said[1] == said[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == reading.SALTS_TRIED
+        assert made[0]["keys"] == base.SALTS_TRIED
         assert_refused(said[0], 3, "opens nothing here")
         for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in said[0].err

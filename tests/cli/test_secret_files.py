@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from channels.colours.made import cover
 from channels.low_bits.trained_like import trained_like
 from cli.said import Said, assert_refused, listing
 from keyss import write_model
-from keyss.channels import Payload, packing
+from keyss.channels import Payload, pack_payload, unpack_payload
 from keyss.cli import main
 from keyss.core import InputError, UsageError
 from keyss.methods import HiddenFile
@@ -110,16 +109,13 @@ def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
 def test_any_bytes_and_any_name_come_back(data: bytes, name: str) -> None:
     file = HiddenFile(name.encode(errors="replace").decode(), data)
     assert HiddenFile.of(file.payload()) == file
-    assert packing.unpack_payload(packing.pack_payload(file.payload())) == file.payload()
+    assert unpack_payload(pack_payload(file.payload())) == file.payload()
 
 
-_BOMB = b"\x09file" + zlib.compress(bytes(10**6))
-
-
-@pytest.mark.parametrize("data", [b"", b"\1", b"\x09filejunk", _BOMB, b"\x09fil"])
+@pytest.mark.parametrize("data", [b"", b"\0x", b"file", b"sixteen letters!\0x", b"\xff\0x"])
 def test_what_no_writer_packed_is_refused(data: bytes) -> None:
     with pytest.raises(InputError):
-        packing.unpack_payload(data)
+        unpack_payload(data)
 
 
 @given(st.binary(max_size=300))

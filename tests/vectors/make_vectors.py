@@ -43,11 +43,11 @@ from keyss.channels import (  # noqa: E402
     SUFFIXES,
     CodesChannel,
     Payload,
+    in_counted_order,
+    last_bits,
     open_content,
 )
-from keyss.channels.codes.channel import _last_bits  # noqa: E402
 from keyss.channels.codes.fields import _log2  # noqa: E402
-from keyss.channels.codes.order import Counted  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
@@ -73,7 +73,7 @@ from vectors.surviving import NAMES, write_surviving  # noqa: E402
 def cell() -> dict[str, object]:
     """A cell as docs/format.md describes it, by the library's own modes of operation."""
     secret, identity = bytes(range(32)), bytes(range(16))
-    label, data, slot, tag_bytes = "chunk", b"\x02\x01\x00chunk", 1, 6
+    label, data, slot, tag_bytes = "record", b"\x02\x01\x00record", 1, 4
 
     def key(use: str) -> bytes:
         return HKDFExpand(SHA256(), 32, f"keyss/v1/{label}/{use}".encode()).derive(secret)
@@ -90,7 +90,6 @@ def cell() -> dict[str, object]:
         "label": label,
         "identity": identity.hex(),
         "slot": slot,
-        "tag_bytes": tag_bytes,
         "data": data.hex(),
         "cell": (tag + bytes(a ^ b for a, b in zip(data, stream, strict=False))).hex(),
     }
@@ -226,7 +225,7 @@ def write_counted() -> None:
 
 def counted(model: CodedGaussians) -> dict[str, Any]:
     """The last bits of all levels: their number, and SHA-256 of a byte for each."""
-    bits = _last_bits(Counted.of(model.codes).fields)
+    bits = last_bits(in_counted_order(model.codes)[1])
     return {"count": len(bits), "sha256": hashlib.sha256(bits.tobytes()).hexdigest()}
 
 

@@ -31,9 +31,9 @@ test('one changed bit costs one Gaussian at most', async () => {
 });
 
 test('a cell', () => {
-  const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number; tag_bytes: number } }>('sealing.json');
+  const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number } }>('sealing.json');
   const data = hex(cell.data);
-  const cipher = new CellCipher(hex(cell.secret), cell.label, data.length, cell.tag_bytes);
+  const cipher = new CellCipher(hex(cell.secret), cell.label, data.length);
   const low = hex(cell.cell);
   expect(cipher.decrypt(hex(cell.identity), low, low.length, 0, cell.slot)).toEqual({ rows: [0], data: [data] });
   low[0] ^= 1;

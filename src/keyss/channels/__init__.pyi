@@ -13,20 +13,31 @@ from .base import (
     pack_method as pack_method,
     unpack_method as unpack_method,
 )
-from .codes.channel import CodesChannel as CodesChannel, CodesCover as CodesCover, CodesReader as CodesReader
-from .colours.channel import Colours as Colours, ColoursCover as ColoursCover
+from .codes.channel import (
+    CodesChannel as CodesChannel,
+    CodesCover as CodesCover,
+    CodesReader as CodesReader,
+    last_bits as last_bits,
+)
+from .codes.order import in_counted_order as in_counted_order
+from .colours.channel import COLOURS as COLOURS, ColoursCover as ColoursCover
 from .low_bits.bits import identities as identities, read_low_bits as read_low_bits
 from .low_bits.channel import LOW_BITS as LOW_BITS, LowBitsCover as LowBitsCover
+from .low_bits.layout import (
+    TYPICAL_SHARE as TYPICAL_SHARE,
+    LowBitsRoom as LowBitsRoom,
+    check_payload_fits as check_payload_fits,
+)
 from .low_bits.reading import LowBitsReader as LowBitsReader
-from .low_bits.spread import TYPICAL_SHARE as TYPICAL_SHARE, check_payload_fits as check_payload_fits
+from .low_bits.salts import salt_rows as salt_rows
 from .low_bits.usable import (
     chance_of_bits as chance_of_bits,
     is_uniform as is_uniform,
     usable_carriers as usable_carriers,
 )
 from .opening import open_content as open_content, quick_attempt as quick_attempt
+from .payloads import pack_payload as pack_payload, unpack_payload as unpack_payload
 from .publishing import (
-    STRENGTH as STRENGTH,
     SUFFIXES as SUFFIXES,
     AnyChannel as AnyChannel,
     Publish as Publish,

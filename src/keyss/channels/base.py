@@ -1,43 +1,46 @@
-"""The one protocol of all channels: places in a published model where bits can lie, to be found with a key.
+"""The protocol of all channels: places in a published model where bits are stored and found with a key.
 
-A channel knows nothing of what its bits mean. Every channel carries *payloads*: bytes that come out whole or
-not at all. Some carry *records* too: many small pieces of one size that are found one by one, so that a model
+A channel does not interpret its bits. Every channel carries *payloads*: bytes that come out whole or not at
+all. Low bits carry *records* too: many small pieces of one size that are found one by one, so that a model
 that lost Gaussians has lost as many records and no more.
 
-Four channels implement it: `low_bits`, `codes`, `appended` and `colours`. Which one a hiding uses follows
-from where the model will be published (`publishing`); readers try them all (`opening`).
+The place of publication determines the channel of a hiding (`publishing`); readers try them all (`opening`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from keyss.core.errors import UsageError
+from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
+from keyss.keys.derivation import DerivedKey, KeyDerivation
 
 Bytes = npt.NDArray[np.uint8]
 
 METHOD_BYTES = 15  # of the name of a method in files
+SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
 
 
 @dataclass(frozen=True)
 class Payload:
     """Bytes that come out whole or not at all."""
 
-    method: str  # who reads them, 1 to METHOD_BYTES ASCII characters
+    method: str  # 1 to METHOD_BYTES ASCII characters
     data: bytes
-    # Where it was cut into chunks: those that were read and those that were written.
+    # Of a payload that was cut into chunks: those that were read and those that were written.
     chunks: tuple[int, int] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
 class RecordRequest:
-    """Records that are to be embedded, before they are encoded: the channel chooses their size."""
+    """Records to be embedded, before they are encoded: the channel chooses their size."""
 
     count: int
     least_bytes: int  # of a record
@@ -48,7 +51,7 @@ class RecordRequest:
 class RecordPlan:
     """What the channel offers for a `RecordRequest`."""
 
-    record_bytes: int  # the most that a record may have
+    record_bytes: int  # the largest size of a record
     copies: int  # the most records that may be embedded a second time
     cells_per_carrier: int  # records that share one Gaussian
 
@@ -57,8 +60,8 @@ class RecordPlan:
 class Records:
     """Pieces of one size that come out one by one, in any order."""
 
-    method: str  # who reads them, 1 to METHOD_BYTES ASCII characters
-    header: bytes  # how they are read; comes out whole or not at all
+    method: str  # 1 to METHOD_BYTES ASCII characters
+    header: bytes  # what the method needs to read them; comes out whole or not at all
     records: Bytes  # [R, size]
     plan: RecordPlan  # as the channel gave it
     # [C] indices of records that are embedded a second time, because losing them costs most; empty when read.
@@ -68,12 +71,17 @@ class Records:
 Content = Payload | Records
 
 
+def check_method(name: str) -> bytes:
+    """The name of a method in ASCII. Raises ValueError unless it has 1 to METHOD_BYTES characters."""
+    encoded = name.encode("ascii")
+    if not 1 <= len(encoded) <= METHOD_BYTES:
+        raise ValueError(f"expected the name of a method, 1 to {METHOD_BYTES} characters, got {name!r}")
+    return encoded
+
+
 def pack_method(name: str) -> bytes:
     """METHOD_BYTES of the name of a method."""
-    packed = name.encode("ascii")
-    if not 1 <= len(packed) <= METHOD_BYTES:
-        raise ValueError(f"expected the name of a method, 1 to {METHOD_BYTES} characters, got {name!r}")
-    return packed.ljust(METHOD_BYTES, b"\0")
+    return check_method(name).ljust(METHOD_BYTES, b"\0")
 
 
 def unpack_method(packed: bytes) -> str:
@@ -82,7 +90,7 @@ def unpack_method(packed: bytes) -> str:
 
 
 class Room(Protocol):
-    """What fits into a cover: exact for a prepared one, estimated for one that is still to be fitted."""
+    """How much fits into a cover: exact for a prepared one, estimated for one not fitted yet."""
 
     @property
     def carriers(self) -> int:
@@ -98,17 +106,21 @@ class Room(Protocol):
 
     @property
     def grows(self) -> bool:
-        """Whether the model grows by what is hidden, so that this should be short."""
+        """True if the model grows with the hidden data, which should be short then."""
 
-    def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
-        """Records that fit for all requests together, however many they ask for; 0 without records."""
 
-    def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
-        """How each request's records are to be encoded. Raises UsageError with the number that fits."""
+@dataclass(frozen=True)
+class RoomEstimate:
+    """The room in a cover that is not fitted yet."""
+
+    carriers: int
+    capacity: int
+    overhead: int
+    grows: bool = False
 
 
 class PreparedCover(Room, Protocol):
-    """A cover whose room in a channel is known: what fits is known before anything else runs."""
+    """A cover whose room in a channel is known before anything else runs."""
 
     @property
     def cover(self) -> Gaussians:
@@ -117,9 +129,9 @@ class PreparedCover(Room, Protocol):
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover with one (key, content) for each secret in it; all contents are payloads, or records.
 
-        `entropy`: at least 32 bytes that nobody else can know, from which all that is random is derived; by
-        default the system's. Raises UsageError for equal keys and for what does not fit. Warns (KeyssWarning)
-        where the holder of one key can notice that there are other secrets.
+        `entropy`: at least 32 bytes that nobody else can know, from which all randomness is derived; by
+        default the system's. Raises UsageError for equal keys and for contents that do not fit. Warns
+        (KeyssWarning) where the holder of one key can notice that there are other secrets.
         """
 
 
@@ -127,10 +139,28 @@ class Reader(Protocol):
     """A stego model as a channel reads it."""
 
     def open(self, key: str) -> Content:
-        """What `key` opens. Raises WrongKeyError when it opens nothing, InputError for what is damaged.
+        """The content that `key` opens. Raises WrongKeyError if it opens nothing, InputError for damage."""
 
-        Warns (KeyssWarning) where the key opens something else too.
-        """
+
+class SaltedReader(ABC):
+    """A `Reader` that tries a key under one salt of Argon2id at a time."""
+
+    salts: Sequence[bytes]  # the likeliest first
+
+    @abstractmethod
+    def extract(self, key: DerivedKey) -> Content:
+        """`open` after key derivation under one salt."""
+
+    def keys(self, key: str) -> Iterator[DerivedKey]:
+        """`key` under each salt to be tried; each takes 0.1 s."""
+        return (DerivedKey(key, KeyDerivation(salt=salt)) for salt in self.salts[:SALTS_TRIED])
+
+    def open(self, key: str) -> Content:
+        """See `Reader`. Changed or added Gaussians may have taken the place of the first salt."""
+        for derived in self.keys(key):
+            with suppress(WrongKeyError):
+                return self.extract(derived)
+        raise WrongKeyError()
 
 
 class Channel(Protocol):
@@ -142,69 +172,28 @@ class Channel(Protocol):
 
     @property
     def place(self) -> str:
-        """What the secret lies in, for messages: "low bits", "codes of the spz file" and so on."""
+        """The place in messages: "low bits", "codes of the spz file" and so on."""
 
     @property
     def survives(self) -> bool:
-        """Whether secrets survive conversion to other formats; else the file is passed on as it is."""
+        """True if secrets survive conversion to other formats; else the file is passed on unchanged."""
 
     @property
     def grows(self) -> bool:
-        """Whether the model grows by what is hidden; see `Room`."""
+        """See `Room`."""
 
     @property
     def records(self) -> bool:
-        """Whether it carries records."""
+        """True if the channel carries records."""
 
     def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises InputError for a cover that has no room, or none that is unseen.
+        """Find the carriers. Raises InputError for a cover without room, or none that is unseen.
 
         Raises OutputError for a cover that the format of the published file does not hold.
         """
 
     def room(self, gaussians: int, sh_degree: int) -> Room:
-        """About what fits into a cover of which so many Gaussians can carry something."""
-
-    def largest_record(self, sh_degree: int) -> int:
-        """Bytes of the largest record in a model of this SH degree; 0 without records or room for any."""
-
-    def appended(self, size: int) -> int:
-        """Gaussians by which the model grows for a payload of `size` bytes."""
+        """About what fits into a cover with so many Gaussians that can carry something."""
 
     def reader(self, stego: Gaussians) -> Reader | None:
-        """What reads this model; None where nothing can lie in it."""
-
-
-class PayloadChannel:
-    """Part of a `Channel` without records, in which models do not grow."""
-
-    grows = False
-    records = False
-
-    def largest_record(self, sh_degree: int) -> int:
-        return 0
-
-    def appended(self, size: int) -> int:
-        return 0
-
-
-class PayloadsOnly:
-    """Part of a `Room` without records."""
-
-    grows = False
-
-    def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
-        return 0
-
-    def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
-        raise UsageError("this channel carries payloads, not records")
-
-
-@dataclass(frozen=True)
-class PayloadRoom(PayloadsOnly):
-    """A `Room` without records."""
-
-    carriers: int
-    capacity: int
-    overhead: int
-    grows: bool = False
+        """The reader of a model; None where nothing can be stored."""

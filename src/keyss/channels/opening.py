@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
-from keyss.channels.base import Content, Reader
+from keyss.channels.base import Content, Reader, SaltedReader
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
@@ -15,7 +14,7 @@ from keyss.keys.derivation import DerivedKey, KeyDerivation
 
 
 def open_content(stego: Gaussians, key: str) -> Content:
-    """What `key` opens in any channel. Raises WrongKeyError, and InputError for what is damaged."""
+    """The content that `key` opens in any channel. Raises WrongKeyError, and InputError for damage."""
     for reader in _readers(stego):
         with suppress(WrongKeyError):
             return reader.open(key)
@@ -24,21 +23,19 @@ def open_content(stego: Gaussians, key: str) -> Content:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What a key opens under the likeliest salt, and what it becomes there."""
+    """A key under the likeliest salt, and what it opens there."""
 
     key: DerivedKey
     content: Content | None
-    appended: bool  # whether there are appended Gaussians
+    appended: bool  # True if there are appended Gaussians
 
 
 def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
-    """A single attempt, which takes a wrong key as long as a right one; None where nothing can be read.
+    """A single attempt, which takes as long for a wrong key as for a right one; None without a salt.
 
-    Raises InputError for what is damaged.
+    Raises InputError for damage.
     """
-    from keyss.channels.appended.channel import APPENDED
-
-    appended = APPENDED.reader(stego)  # everybody sees that they are there
+    appended = _appended(stego)  # everybody sees that they are there
     reader = appended or _exact(stego)
     if reader is None or not reader.salts:
         return None
@@ -49,32 +46,18 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     return Attempt(derived, content, appended is not None)
 
 
-class _SaltedReader(Reader, Protocol):
-    """A reader that tries a key under one salt at a time."""
-
-    @property
-    def salts(self) -> Sequence[bytes]:
-        """The likeliest first."""
-
-    def extract(self, key: DerivedKey) -> Content:
-        """`open` after key derivation."""
-
-
 def _readers(stego: Gaussians) -> Iterator[Reader]:
-    """The channels in which something may lie, each loaded when the ones before opened nothing."""
-    if exact := _exact(stego):
-        yield exact
-    from keyss.channels.appended.channel import APPENDED
+    """The readers of a model; each channel is loaded when the ones before opened nothing."""
+    for reader in (_exact, _appended):
+        if own := reader(stego):
+            yield own
+    from keyss.channels.colours.channel import COLOURS
 
-    if appended := APPENDED.reader(stego):
-        yield appended
-    from keyss.channels.colours.channel import Colours
-
-    yield Colours().reader(stego)
+    yield COLOURS.reader(stego)
 
 
-def _exact(stego: Gaussians) -> _SaltedReader | None:
-    """What reads bits that only the very file has: codes where there are some, else low bits."""
+def _exact(stego: Gaussians) -> SaltedReader | None:
+    """The reader of bits that only the very file has: codes of a coded file, else low bits."""
     if isinstance(stego, CodedGaussians):
         from keyss.channels.codes.channel import CodesChannel
 
@@ -82,3 +65,9 @@ def _exact(stego: Gaussians) -> _SaltedReader | None:
     from keyss.channels.low_bits.channel import LOW_BITS
 
     return LOW_BITS.reader(stego)
+
+
+def _appended(stego: Gaussians) -> SaltedReader | None:
+    from keyss.channels.appended.channel import APPENDED
+
+    return APPENDED.reader(stego)

@@ -1,4 +1,4 @@
-"""The channel that follows from where a model will be published: one table, which everything else asks."""
+"""The channel for each place of publication: one table, which everything else asks."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from keyss.files.formats.common import CodedGaussians
 Publish = Literal["ply", "spz", "sog", "compressed-ply", "any"]
 AnyChannel = Literal["appended", "colours"]  # of a model that may be converted to any format
 
-STRENGTH = 45.0  # dB PSNR that views of a model keep, at least, when colours carry something
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of files whose codes carry
 
 
-def channel_for(publish: Publish, channel: AnyChannel = "appended", *, strength: float = STRENGTH) -> Channel:
-    """The channel for a model that is passed on in the format `publish`, or as "any".
+def channel_for(publish: Publish, channel: AnyChannel = "appended") -> Channel:
+    """The channel for a model that is published in the format `publish`, or as "any".
 
-    `strength` (dB): of colours. Loads that channel only. Raises UsageError for what does not go together.
+    Loads that channel only. Raises UsageError for unknown names.
     """
     if publish not in get_args(Publish) or channel not in get_args(AnyChannel):
         raise UsageError(
@@ -38,13 +37,13 @@ def channel_for(publish: Publish, channel: AnyChannel = "appended", *, strength:
         from keyss.channels.appended.channel import APPENDED
 
         return APPENDED
-    from keyss.channels.colours.channel import Colours
+    from keyss.channels.colours.channel import COLOURS
 
-    return Colours(strength)
+    return COLOURS
 
 
 def suffix_of(stego: Gaussians) -> str:
-    """How the name of a file ends that keeps all that a published model carries."""
+    """The suffix of a file that keeps everything a published model carries."""
     if not isinstance(stego, CodedGaussians):
         return ".ply"
     return SUFFIXES[type(stego.codes).__module__.rpartition(".")[2].replace("_", "-")]

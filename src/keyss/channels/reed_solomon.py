@@ -2,23 +2,87 @@
 
 A systematic code of length n <= 255 with the generator polynomial (x - 1)(x - a)...(x - a^(n-k-1)), a = 2,
 over the field of the polynomial x^8 + x^4 + x^3 + x^2 + 1: the same codewords, byte for byte, as `reedsolo`
-makes. That library works on one codeword of bytes at a time and takes minutes for what lies in a model; here
-a chunk is a row of an array, all its bytes are coded at once, and lost rows are found by solving a linear
-system. Which rows are lost is known (every chunk carries its number and a tag), so there are no errors to
-locate.
+makes. That library codes one codeword of bytes at a time and takes minutes for the payload of a model; here
+a chunk is a row of an array, and all its bytes are coded at once. Every chunk carries its number and a tag,
+so that the lost rows are known: there are no errors to locate, only a linear system to solve.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
+from keyss.core.errors import InputError
+
 MAX_CHUNKS = 255  # of one codeword
+LOST = "the key is right, but too much of the model was lost or changed since something was hidden in it"
 _POLYNOMIAL = 0x11D
 
 Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Codewords:
+    """Data in `count` codewords of `n` chunks of `width` bytes, any `k` of which give a codeword back.
+
+    Chunk i of codeword c has the number i * count + c. Raises ValueError for impossible numbers.
+    """
+
+    count: int
+    n: int
+    k: int
+    width: int
+
+    def __post_init__(self) -> None:
+        if not (self.count >= 1 and 1 <= self.k <= self.n <= MAX_CHUNKS):
+            raise ValueError(f"impossible codewords: {self}")
+
+    @property
+    def chunks(self) -> int:
+        return self.count * self.n
+
+    @property
+    def size(self) -> int:
+        """Bytes of data."""
+        return self.count * self.k * self.width
+
+    def encode(self, data: bytes) -> Bytes:
+        """[chunks, width] of at most `size` bytes, in the order of their numbers."""
+        rows = np.frombuffer(data.ljust(self.size, b"\0"), np.uint8).reshape(self.k, -1)
+        return encode(rows, self.n).reshape(-1, self.width)
+
+    def decode(self, numbers: npt.NDArray[np.int64], chunks: Bytes) -> bytes:
+        """The data from chunks [C, width] with `numbers` [C], in any order.
+
+        Different chunks with one number are left out: one of them is there by chance. Raises InputError if
+        too few are left.
+        """
+        inside = numbers < self.chunks
+        own, first, of_own = np.unique(numbers[inside], return_index=True, return_inverse=True)
+        chunks, left = chunks[inside], len(own)
+        data = None
+        if left >= self.count * self.k:  # else there is no need for as much memory
+            chosen = chunks[first]
+            sure = np.ones(left, bool)
+            sure[of_own[(chunks != chosen[of_own]).any(axis=1)]] = False
+            data = self._decoded(own[sure], chosen[sure])
+        if data is None:
+            raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
+        return data.tobytes()
+
+    def _decoded(self, numbers: npt.NDArray[np.int64], chunks: Bytes) -> Bytes | None:
+        data = np.empty((self.k, self.count, self.width), np.uint8)
+        rows, codewords = np.divmod(numbers, self.count)
+        for codeword in range(self.count):
+            own = codewords == codeword
+            decoded = decode(dict(zip(rows[own].tolist(), chunks[own], strict=True)), self.k, self.n)
+            if decoded is None:
+                return None
+            data[:, codeword] = decoded
+        return data
 
 
 def _tables() -> tuple[Bytes, list[int], list[int]]:

@@ -212,7 +212,7 @@ def test_it_opens_from_what_gsply_writes(stego: Gaussians, tmp_path: Path) -> No
 
 
 def test_too_great_a_loss_is_told_from_a_wrong_key(stego: Gaussians) -> None:
-    with pytest.raises(InputError, match=r"the key is right, but too much .* packets are left"):
+    with pytest.raises(InputError, match=r"the key is right, but too much .* chunks are left"):
         opened(cropping(1)(stego))
     with pytest.raises(WrongKeyError):
         opened(stego[stego.opacities > 2 * DRAWN_OPACITY])

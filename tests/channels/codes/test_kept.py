@@ -8,21 +8,20 @@ import numpy as np
 import pytest
 
 from channels.codes.published import FORMATS, codes_of, written
-from keyss.channels import CodesCover
+from keyss.channels import CodesCover, in_counted_order
 from keyss.channels.codes.fields import sog_distances
 from keyss.channels.codes.kept import changeable
-from keyss.channels.codes.order import Counted
 
 SECRET = bytes(32)
 
 
 def test_gaussians_nearer_to_each_other_than_by_chance_stay() -> None:
     codes = codes_of(".spz")
-    fields = Counted.of(codes).fields
+    fields = in_counted_order(codes)[1]
     positions = codes.positions.copy()
     positions[1000:1200] = positions[:200] + np.array([1, 0, 0])
     near = replace(codes, positions=positions)
-    free = np.stack(changeable(near, Counted.of(near).fields, SECRET)[:3])
+    free = np.stack(changeable(near, in_counted_order(near)[1], SECRET)[:3])
     assert free[:, :200].mean() < 0.1 > free[:, 1000:1200].mean()
     apart = np.stack(changeable(codes, fields, SECRET)[:3])
     assert apart[:, :200].mean() > 0.8 < free[:, 2000:].mean()
@@ -30,14 +29,13 @@ def test_gaussians_nearer_to_each_other_than_by_chance_stay() -> None:
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_neighbours_with_equal_rotations_keep_them(suffix: str) -> None:
-    codes = Counted.of(codes_of(suffix)).codes
+    codes = in_counted_order(codes_of(suffix))[0]
     means = FORMATS[suffix].dequantise(codes).means.numpy()
     for row in (10, 2000, 4000):
         nearest = int(np.linalg.norm(means - means[row], axis=1).argsort()[1])
         rotations = codes.rotations.copy()
         rotations[nearest] = rotations[row]
-        changed = Counted.of(replace(codes, rotations=rotations))
-        free = np.stack(changeable(changed.codes, changed.fields, SECRET))
+        free = np.stack(changeable(*in_counted_order(replace(codes, rotations=rotations)), SECRET))
         assert not free[:, [row, nearest]].any()
         assert free.any(axis=0).mean() > 0.8
 
@@ -59,7 +57,7 @@ def test_steps_of_a_sog_stay_as_large_as_they_are() -> None:
     cover = CodesCover.of(codes)
     distances = [
         sog_distances(each, each.positions)
-        for each in (cover.codes, Counted.of(written(cover, b"data")).codes)
+        for each in (cover.codes, in_counted_order(written(cover, b"data"))[0])
     ]
     assert len(np.unique(distances[0])) > 1
     assert np.array_equal(*distances)

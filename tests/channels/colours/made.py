@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from keyss.channels import Payload, PreparedCover, channel_for
+from keyss.channels import COLOURS, Payload, PreparedCover
 from keyss.core import Gaussians
 from measure.lifelike import lifelike
 
-COLOURS = channel_for("any", "colours")
 METHOD = "t"
 PACKED = 1 + len(METHOD)  # bytes beside the data
 

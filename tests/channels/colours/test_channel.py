@@ -16,23 +16,23 @@ import torch
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from channels.colours.made import COLOURS, PACKED, cover, embed, extract
-from keyss.channels import Colours, ColoursCover
+from channels.colours.made import PACKED, cover, embed, extract
+from keyss.channels import COLOURS, ColoursCover
 from keyss.channels.colours.carriers import CELL, Numbers
-from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
+from keyss.channels.colours.fountain import Fountain
+from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, derived, read_header
 from keyss.channels.colours.reading import ColoursReader
-from keyss.channels.colours.salts import SALTS, Salts
+from keyss.channels.colours.salts import Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, Similarity, UsageError, WrongKeyError
-from keyss.measure import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
+from keyss.measure import converters, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
 
 ENTROPY = bytes(range(32))
-STRENGTH = 45.0
 
 
 @pytest.fixture(scope="module")
 def prepared() -> ColoursCover:
-    return Colours().prepare(cover(6000))
+    return COLOURS.prepare(cover(6000))
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: flo
 def test_a_header_made_up_by_chance_hides_no_other(
     prepared: ColoursCover, payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One attempt of 2^16 gives bits whose tag is right, and there are 27 for each key."""
-    made_up = (Header(bytes([number] * FILE_KEY_BYTES), bytes(2), 40, 1, 0, 63, 20, 0) for number in range(2))
+    """One attempt of 2^16 gives bits whose tag is right, and there are 18 for each key."""
+    made_up = (Header(bytes([number] * FILE_KEY_BYTES), bytes(2), 0, 63, 20, 0) for number in range(2))
     monkeypatch.setattr(
         "keyss.channels.colours.reading.read_header", lambda *args: next(made_up, None) or read_header(*args)
     )
@@ -102,8 +102,6 @@ def test_names_are_those_that_agree_best_with_the_header(
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
     with pytest.raises(UsageError, match=f"{prepared.capacity:,} bytes in all"):
         embed(prepared, [("a", payload + b"x")])
-    with pytest.raises(UsageError, match="`strength`"):
-        _ = Colours(math.nan).prepare(prepared.cover).capacity
 
 
 def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, stego: Gaussians) -> None:
@@ -115,22 +113,12 @@ def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, st
     assert (model.sh != stego.sh).any(dim=2).any(dim=1).float().mean() > 0.5
 
 
-def test_it_costs_no_more_than_was_asked_for(prepared: ColoursCover, stego: Gaussians) -> None:
-    assert psnr_between(prepared.cover, stego) > STRENGTH
-    sizes = [Colours(strength).prepare(prepared.cover).capacity for strength in (40.0, 50.0, 60.0)]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] > 1.3 * sizes[2]
-
-
-def test_a_small_payload_changes_far_less_than_a_large_one(prepared: ColoursCover, stego: Gaussians) -> None:
+def test_changes_are_invisible_and_in_proportion(prepared: ColoursCover, stego: Gaussians) -> None:
+    assert psnr_between(prepared.cover, stego) > 48
     small = embed(prepared, [("a", bytes(20))], entropy=ENTROPY)
-    full, little = ((each.sh[:, 0] - prepared.cover.sh[:, 0]).square().sum() for each in (stego, small))
-    assert little < full / 30
-    assert float((small.sh != prepared.cover.sh).any(dim=2).any(dim=1).float().mean()) < 0.6
+    full, little = ((each.sh != prepared.cover.sh).any(dim=2).float().mean() for each in (stego, small))
+    assert little < 0.6 * full
     assert float((small.sh - prepared.cover.sh).abs().quantile(0.99)) < 0.0277
-    others = [embed(prepared, [("a", bytes(20))], entropy=bytes([seed] * 32)) for seed in range(4)]
-    psnr = np.mean([psnr_between(prepared.cover, each) for each in others])  # depends on where salts are
-    assert psnr > psnr_between(prepared.cover, stego) + 3
 
 
 def _spz(model: Gaussians) -> Gaussians:
@@ -167,9 +155,7 @@ def test_a_full_model_opens_after(name: str, stego: Gaussians, payload: bytes) -
 
 
 HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
-    "one half": cropping(1),
-    "another half": cropping(2),
-    "a random half": random_pruning(0.5),
+    "a random third": random_pruning(1 / 3),
     "without the faintest": opacity_pruning(0.25),
     "scaling before spz": lambda model: _spz(_turned(0.4)(model)),
     "another scene beside it": lambda model: Gaussians.cat([cover(2000, seed=5), model]),
@@ -196,7 +182,7 @@ def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes)
 
 
 def test_two_keys_open_their_own_and_a_third_nothing(prepared: ColoursCover) -> None:
-    data = {name: os.urandom(prepared.unseen_capacity // 3 - PACKED) for name in "ab"}
+    data = {name: os.urandom(prepared.unseen_capacity // 4 - PACKED) for name in "ab"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         stego = embed(prepared, [(name, data[name]) for name in "ab"], entropy=ENTROPY)
@@ -221,11 +207,16 @@ def test_equal_keys_and_none_are_refused(prepared: ColoursCover) -> None:
 
 
 def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: ColoursCover) -> None:
-    """But for what lies under a salt that two files share by chance, which is told (docs/channels.md)."""
-    many = [embed(prepared, [("a", b"same")]) for _ in range(6)]
+    """But for what lies under a salt that two files share by chance, which docs/channels.md tells.
+
+    Each of 16 salts is shared by two files with a chance of 1/49: of 45 pairs, 14.7 salts with a standard
+    deviation of 3.8. That is tested with one entropy; the rest holds for any pair that shares none.
+    """
+    entropies = [bytes([index]) * 32 for index in range(10)]
+    many = [embed(prepared, [("a", b"same")], entropy=entropy) for entropy in entropies]
     salts = [set(Salts.of(Numbers.of(each)).salts) for each in many]
-    shared = {pair: len(salts[pair[0]] & salts[pair[1]]) for pair in combinations(range(6), 2)}
-    assert max(shared.values()) < SALTS // 4
+    shared = {pair: len(salts[pair[0]] & salts[pair[1]]) for pair in combinations(range(10), 2)}
+    assert sum(shared.values()) < 14.7 + 4 * 3.8
     first, second = (many[index] for index in min(shared, key=lambda pair: shared[pair]))
     assert min(shared.values()) == 0
     written = [(each.sh[:, 0] - prepared.cover.sh[:, 0])[:, 1:].flatten() for each in (first, second)]
@@ -240,16 +231,18 @@ def test_entropy_decides_everything(prepared: ColoursCover) -> None:
     assert torch.equal(one.sh, same.sh)
 
 
-def test_what_was_destroyed_is_told_from_what_was_never_there(
+def test_a_lost_payload_is_told_from_one_that_was_never_there(
     stego: Gaussians, prepared: ColoursCover
 ) -> None:
-    """Headers stand a little more loss than payloads; now and then one is lost first all the same."""
-    told = 0
-    for seed in range(5):
-        with pytest.raises((InputError, WrongKeyError)) as error:
-            extract(random_pruning(0.45, seed)(stego), "a")
-        told += "the key is right, but too much" in str(error.value)
-    assert told >= 3
+    """All colours but those of salts and headers are the cover's again."""
+    numbers = Numbers.of(stego)
+    index, salts = Index(numbers.carriers(round(numbers.size / CELL) * CELL)), Salts.of(numbers)
+    headers = [index.rows(secret) for secret in derived("a", salts.salts)[1]]
+    kept = numbers.rows[np.concatenate([salts.rows, *headers])]
+    sh = prepared.cover.sh.clone()
+    sh[kept] = stego.sh[kept]
+    with pytest.raises(InputError, match="the key is right, but too much"):
+        extract(replace(stego, sh=sh), "a")
     with pytest.raises(WrongKeyError):
         extract(prepared.cover, "a")
 
@@ -257,8 +250,6 @@ def test_what_was_destroyed_is_told_from_what_was_never_there(
 def test_a_changed_bit_of_the_payload_is_never_handed_out(
     stego: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from keyss.channels.colours.fountain import Fountain
-
     decode = Fountain.decode
 
     def wrong(self: Fountain, *arguments: object) -> tuple[np.ndarray, bool]:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.spatial import cKDTree
 
-from keyss.channels.colours import carriers
 from keyss.channels.colours.likeness import Likeness
-from keyss.channels.colours.salts import Salts, moved, renewed
-from measure.lifelike import lifelike
 
 NOISE = 0.0275
+Doubles = npt.NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
-def model() -> tuple[carriers.Doubles, carriers.Doubles]:
+def model() -> tuple[Doubles, Doubles]:
     """Colours [N, 3] and positions [N, 3]: each with a neighbour of nearly the same colour."""
     random = np.random.default_rng(0)
     positions = random.normal(size=(2000, 3))
@@ -25,13 +24,13 @@ def model() -> tuple[carriers.Doubles, carriers.Doubles]:
     return np.concatenate([smooth, near]), np.concatenate([positions, beside])
 
 
-def noisy(colours: carriers.Doubles, seed: int) -> carriers.Doubles:
+def noisy(colours: Doubles, seed: int) -> Doubles:
     new = colours.copy()
     new[:, 1:] += np.random.default_rng(seed).uniform(-NOISE, NOISE, (len(colours), 2))
     return new
 
 
-def apart(colours: carriers.Doubles, positions: carriers.Doubles) -> carriers.Doubles:
+def apart(colours: Doubles, positions: Doubles) -> Doubles:
     """Logarithms of quantiles of how much green differs between nearest neighbours."""
     nearest = cKDTree(positions).query(positions, k=2)[1][:, 1]
     quantiles = np.quantile(np.abs(colours[:, 1] - colours[nearest, 1]), (0.05, 0.1, 0.25, 0.5))
@@ -39,7 +38,7 @@ def apart(colours: carriers.Doubles, positions: carriers.Doubles) -> carriers.Do
 
 
 def test_what_is_admitted_leaves_differences_between_neighbours_as_they_were(
-    model: tuple[carriers.Doubles, carriers.Doubles],
+    model: tuple[Doubles, Doubles],
 ) -> None:
     colours, positions = model
     likeness, new = Likeness.of(colours, positions, noisy(colours, 1)), noisy(colours, 2)
@@ -52,7 +51,7 @@ def test_what_is_admitted_leaves_differences_between_neighbours_as_they_were(
     assert 0.1 < which.mean() < 0.6  # half are of a kind that hardly ever may move
 
 
-def test_numbers_that_should_stay_are_not_admitted(model: tuple[carriers.Doubles, carriers.Doubles]) -> None:
+def test_numbers_that_should_stay_are_not_admitted(model: tuple[Doubles, Doubles]) -> None:
     colours, positions = model
     likeness = Likeness.of(colours, positions, noisy(colours, 1))
     assert not likeness.admitted(colours, colours, np.random.default_rng(0)).any()
@@ -75,23 +74,3 @@ def test_few_gaussians_and_equal_ones_are_no_trouble(count: int) -> None:
     colours, positions = np.zeros((count, 3)), np.zeros((count, 3))
     likeness = Likeness.of(colours, positions, noisy(colours, 1))
     assert likeness.admitted(colours, noisy(colours, 2), np.random.default_rng(0)).shape == (count, 2)
-
-
-def test_salts_move_by_whole_cells_to_where_colours_are_usual() -> None:
-    """Green and blue of these models are near red, as those of trained ones are: salts should stay so."""
-    cover = lifelike(4000, 0).with_sh_degree(0)
-    numbers = carriers.Numbers.of(cover)
-    random = np.random.default_rng(0)
-    grey = numbers.colours[:, :1] + 0.05 * random.normal(size=(len(numbers.rows), 3))
-    numbers = carriers.Numbers(numbers.rows, numbers.log_scales, numbers.opacities, grey)
-    positions = cover.means.double().numpy()[numbers.rows]
-    likeness = Likeness.of(grey, positions, moved(grey, np.random.default_rng(1)))
-    rows = Salts.of(numbers).rows
-    apart = {}
-    for name, judge in (("likely", likeness), ("any", None)):
-        new = renewed(numbers, np.random.default_rng(2), judge).colours
-        cells = (new - grey) / (5 * carriers.COLOUR_STEP)
-        assert np.abs(cells - cells.round()).max() < 1e-9
-        assert (np.delete(new, rows, axis=0) == np.delete(grey, rows, axis=0)).all()
-        apart[name] = float(np.abs(new[rows, 1] - new[rows, 0]).mean())
-    assert apart["likely"] < 0.5 * apart["any"]

@@ -10,7 +10,7 @@ import torch
 from channels.low_bits.payloads import embed, extract
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, LowBitsReader, RecordRequest, Records
-from keyss.core import Gaussians
+from keyss.core import Gaussians, KeyssWarning
 
 KEY = "the right key"
 
@@ -42,6 +42,13 @@ def test_copies_count_once(cover: Gaussians) -> None:
     assert isinstance(other, Records)
     assert len(one.records) == len(other.records) == 200
     assert {row.tobytes() for row in one.records} == {row.tobytes() for row in other.records}
+
+
+def test_a_key_that_opens_two_secrets_says_so(cover: Gaussians) -> None:
+    """Where two files under one key were merged."""
+    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
+    with pytest.warns(KeyssWarning, match="opens two secrets"):
+        assert extract(Gaussians.cat([first, second]), KEY) in (b"first", b"second")
 
 
 def test_who_adds_or_removes_gaussians_is_not_warned(cover: Gaussians) -> None:

@@ -107,8 +107,8 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     packed = b"".join(parts[number] for number in sorted(parts))
     version, service, method = struct.unpack_from("<BB15s", packed)
     cells, size, header_bytes = struct.unpack_from("<BHH", packed, 29)
-    assert (version, service, method.rstrip(b"\0")) == (2, 2, b"carry")
-    header = packed[40 : 40 + header_bytes]
+    assert (version, service, method.rstrip(b"\0")) == (3, 2, b"carry")
+    header = packed[34 : 34 + header_bytes]
     (count,) = struct.unpack_from("<I", header)
     assert count == EXPECTED["count"]
 

@@ -7,15 +7,15 @@ import tracemalloc
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LowBitsReader, Payload, reed_solomon
+from keyss.channels import LOW_BITS, LowBitsReader, Payload
 from keyss.channels.low_bits import spread, writing
-from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
+from keyss.channels.low_bits.parameters import PAYLOAD, RECORDS, Parameters, pack_codewords
+from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
 from keyss.core import Gaussians, InputError
 from keyss.keys import encryption
 
@@ -46,9 +46,9 @@ def test_payloads_that_compress_too_well_come_out_all_the_same(size: int) -> Non
 
 
 def test_as_many_blocks_as_there_can_be_take_no_memory() -> None:
-    most = spread.Spread(spread.MAX_BLOCKS, reed_solomon.MAX_CHUNKS, reed_solomon.MAX_CHUNKS, 66)
-    with at_most(1), pytest.raises(InputError, match="too much of the model was removed"):
-        most.decode(np.zeros((100, 69), np.uint8), most.capacity)
+    most = Codewords(spread.MAX_CODEWORDS, MAX_CHUNKS, MAX_CHUNKS, 66)
+    with at_most(1), pytest.raises(InputError, match="too much of the model was lost"):
+        most.decode(np.arange(100), np.zeros((100, 66), np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -59,22 +59,22 @@ def cover() -> Gaussians:
 @pytest.mark.parametrize(
     "hostile",
     [
-        lambda found: replace(
-            found, spread=spread.Spread(spread.MAX_BLOCKS, 255, 255, 66), size=1_000_000_000
+        Parameters(
+            PAYLOAD, "carry", b"", 1, 71, pack_codewords(10**9, Codewords(spread.MAX_CODEWORDS, 255, 255, 68))
         ),
-        lambda found: RecordParameters("carry", 1, 71, bytes(4096)),
-        lambda found: RecordParameters("carry", 1, 65_535, b""),
-        lambda found: RecordParameters("carry", 4, 60, b""),
+        Parameters(PAYLOAD, "carry", b"", 1, 71, pack_codewords(69, Codewords(1, 255, 1, 68))),
+        Parameters(PAYLOAD, "carry", b"", 1, 71, b"too short"),
+        Parameters(RECORDS, "carry", b"", 1, 71, bytes(4097)),
+        Parameters(RECORDS, "carry", b"", 1, 65_535, b""),
+        Parameters(RECORDS, "carry", b"", 4, 60, b""),
+        Parameters(3, "carry", b"", 1, 71, b""),
     ],
-    ids=["blocks", "header", "records", "cells"],
+    ids=["codewords", "size", "no codewords", "header", "records", "cells", "service"],
 )
 def test_hostile_parameters_end_in_a_sentence(
-    cover: Gaussians, hostile: object, monkeypatch: pytest.MonkeyPatch
+    cover: Gaussians, hostile: Parameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def packed(method: str, size: int, own: spread.Spread) -> object:
-        return hostile(PayloadParameters(method, size, own))  # type: ignore[operator]
-
-    monkeypatch.setattr(writing, "PayloadParameters", packed)
+    monkeypatch.setattr(writing, "Parameters", lambda *_: hostile)
     stego = LOW_BITS.prepare(cover).embed_derived([(keys(), Payload("carry", b"x"))])
     reader = LowBitsReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):

@@ -12,14 +12,14 @@ from scipy.stats import ks_2samp
 
 from channels.low_bits.trained_like import keys
 from keyss.channels import Content, Payload, RecordRequest, Records
-from keyss.channels.low_bits import ciphers
 from keyss.channels.low_bits.cells import CellCipher
-from keyss.channels.low_bits.layout import SALTS, Carriers
+from keyss.channels.low_bits.layout import SALTS, LowBitsRoom
+from keyss.channels.low_bits.parameters import key_cipher, parameter_cipher, unpack
 from keyss.channels.low_bits.writing import Writer
 from keyss.core import KeyssWarning
 
 CARRIERS, WIDTH = 3000, 75
-ROOM = Carriers(CARRIERS, WIDTH)
+ROOM = LowBitsRoom(CARRIERS, WIDTH)
 NAMES = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
@@ -49,28 +49,22 @@ def _seen(contents: Sequence[Content]) -> list[float]:
     """What the holder of the first key can count of its own cells, and of all others together."""
     writer = Writer(NAMES, WIDTH, os.urandom(32))
     keyed = [([each] * SALTS, content) for each, content in zip([OWN[0], *OWN[1:]], contents, strict=False)]
-    if isinstance(contents[0], Payload):
-        writer.payloads([(key, each) for key, each in keyed if isinstance(each, Payload)], CARRIERS)
-    else:
-        writer.records([(key, each) for key, each in keyed if isinstance(each, Records)])
+    writer.write(keyed)
     low = np.empty_like(writer.table)
     low[writer.order] = writer.table
-    fits, found = ciphers.key_cipher(OWN[0]).decrypt(NAMES, low)
+    fits, found = key_cipher(OWN[0]).decrypt(NAMES, low)
     data_key = found[0].tobytes()
-    headers = fits | ciphers.parameter_cipher(data_key, WIDTH).decrypt(NAMES, low)[0]
-    if isinstance(contents[0], Payload):
-        own = ciphers.chunk_cipher(data_key, WIDTH).decrypt(NAMES, low)[0][:, None]
-    else:
-        cells, size = contents[0].plan.cells_per_carrier, contents[0].records.shape[1]
-        both = [CellCipher(data_key, label, size) for label in ("record", "copy")]
-        step = WIDTH // cells
-        own = np.stack(
-            [
-                np.any([each.decrypt(NAMES, low[:, slot * step :], slot)[0] for each in both], axis=0)
-                for slot in range(cells)
-            ],
-            axis=1,
-        )
+    parts, packed = parameter_cipher(data_key, WIDTH).decrypt(NAMES, low)
+    headers, parameters = fits | parts, unpack(packed)
+    both = [CellCipher(data_key, label, parameters.record_bytes) for label in ("record", "copy")]
+    step = WIDTH // parameters.cells
+    own = np.stack(
+        [
+            np.any([each.decrypt(NAMES, low[:, slot * step :], slot)[0] for each in both], axis=0)
+            for slot in range(parameters.cells)
+        ],
+        axis=1,
+    )
     carriers = own.any(axis=1)
     places = np.flatnonzero(carriers)
     return [

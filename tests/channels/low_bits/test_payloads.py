@@ -17,10 +17,18 @@ from argon2.low_level import Type, hash_secret_raw
 from channels.low_bits.payloads import embed, embed_derived, extract, extract_derived
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
-from keyss.channels import LowBitsReader, check_payload_fits, identities, read_low_bits, usable_carriers
-from keyss.channels.low_bits import cells, ciphers, reading, spread
-from keyss.channels.low_bits.reading import SALTS_TRIED
-from keyss.channels.low_bits.salts import salt_rows
+from keyss.channels import (
+    LOW_BITS,
+    LowBitsReader,
+    base,
+    check_payload_fits,
+    identities,
+    read_low_bits,
+    salt_rows,
+    usable_carriers,
+)
+from keyss.channels.low_bits import cells
+from keyss.channels.low_bits.parameters import key_cipher
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey, generate_key
@@ -101,7 +109,7 @@ def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: in
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
     model = trained_like(4000)
     own, other = keys(), keys(1)
-    room = spread.payload_capacity(4000)
+    room = LOW_BITS.room(3500, 3).capacity
     stego = embed_derived(model, [(own, os.urandom(room * 9 // 10))])
     order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
     first = salt_rows(stego, identities(stego), read_low_bits(stego))[:1]
@@ -190,7 +198,7 @@ def test_the_holder_of_a_key_sees_the_same_whether_there_is_another_secret_or_no
 
 
 def _opened(stego: Gaussians, key: DerivedKey) -> np.ndarray:
-    return ciphers.key_cipher(key).decrypt(identities(stego), read_low_bits(stego))[1]
+    return key_cipher(key).decrypt(identities(stego), read_low_bits(stego))[1]
 
 
 def _neighbours(key: str) -> list[str]:
@@ -263,10 +271,10 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
 
 def test_a_wrong_key_is_tried_under_a_few_salts(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     derived = []
-    monkeypatch.setattr(reading, "DerivedKey", lambda key, derivation: derived.append(key) or keys(5)[0])
+    monkeypatch.setattr(base, "DerivedKey", lambda key, derivation: derived.append(key) or keys(5)[0])
     with pytest.raises(WrongKeyError):
         extract(stego, "The right key")
-    assert len(derived) == SALTS_TRIED
+    assert len(derived) == base.SALTS_TRIED
 
 
 def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
@@ -286,18 +294,17 @@ def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
     check_payload_fits(126_000, 10_000, 1, sh_degree=3)  # the demo
 
 
-def test_capacity_grows_with_the_model_and_its_plan_is_kept_to() -> None:
-    capacity = spread.payload_capacity
-    sizes = [capacity(cells) for cells in (100, 500, 1000, 5000, 20_000, 200_000)]
+def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
+    rooms = [LOW_BITS.room(carriers, 3) for carriers in (100, 500, 1000, 5000, 20_000, 200_000)]
+    sizes = [room.capacity for room in rooms]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
-    assert sizes[-1] / 200_000 > 18
-    assert capacity(20_000, 2) == capacity(20_000, 1) > 1.9 * capacity(20_000, 3)
-    for size in (4096, 131_072):
-        need = spread.carriers_for(size, 1, 75)
-        assert capacity(need) >= size > capacity(need - 1)
-        assert spread.plan_spread(need, 2, 75, size) is not None
-        assert spread.plan_spread(need - 1, 2, 75, size) is None
+    assert sizes[-1] / 200_000 > 38
+    assert rooms[-1].payload_capacity(1) > 1.9 * rooms[-1].payload_capacity(2)
+    for room, capacity in zip(rooms[1:], sizes[1:], strict=True):
+        room.plan_payloads([capacity])
+        with pytest.raises(UsageError, match="too small"):
+            room.plan_payloads([capacity + 1])
 
 
 @pytest.mark.parametrize("change", UNNATURAL)

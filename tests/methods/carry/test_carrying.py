@@ -14,9 +14,8 @@ import torch
 
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
-from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, usable_carriers
-from keyss.channels.low_bits.ciphers import key_cipher
-from keyss.channels.low_bits.salts import salt_rows
+from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
+from keyss.channels.low_bits.parameters import key_cipher
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
@@ -198,7 +197,7 @@ def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
 def test_a_single_bit_costs_one_carrier_at_most(cover: Gaussians, secret: Gaussians) -> None:
     """Any bit of any value: low ones, high ones, positions; through the whole key, both salts included."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
-    own = list(LowBitsReader.of(stego).keys(KEY, 3))
+    own = list(LowBitsReader.of(stego).keys(KEY))[:3]
     whole = rows_of(extract(stego, KEY).gaussians)
     random = np.random.default_rng(0)
     names = LowBitsReader.of(stego).salts
@@ -314,10 +313,10 @@ def test_layouts_follow_from_a_secret_s_own_size() -> None:
     ):
         plans = room.plan_records(fitting)
         assert plans == [room.plan_records([each])[0] for each in fitting]
-        assert room.arrangement(plans, fitting).as_alone
+        assert room.lie_as_alone(plans, fitting)
     for crowded in ([small] * 5, [record_request(60_000, 3)] * 2 + [middle]):
         plans = room.plan_records(crowded)
-        assert not room.arrangement(plans, crowded).as_alone
+        assert not room.lie_as_alone(plans, crowded)
     table = Table.of_size(8 * alone[0].record_bytes, 3)
     assert table is not None
     assert table.total > 560

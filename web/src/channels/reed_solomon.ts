@@ -1,4 +1,5 @@
 /** Reed-Solomon over GF(256) for erasures; see docs/format.md, "A payload". */
+import { tooMuchLost } from '../core/errors.ts';
 
 const POWERS = new Uint8Array(510);
 const LOGARITHMS = new Uint8Array(256);
@@ -21,8 +22,42 @@ function addMultiple(to: Uint8Array, factor: number, from: Uint8Array): void {
   }
 }
 
+/**
+ * Data in `count` codewords of `n` chunks of `width` bytes, any `k` of which give a codeword back. Chunk i of codeword c
+ * has the number i x `count` + c.
+ */
+export interface Codewords {
+  readonly count: number;
+  readonly n: number;
+  readonly k: number;
+  readonly width: number;
+}
+
+/** The data from numbered chunks in any order. Raises InputError where too few are left. */
+export function decoded({ count, n, k, width }: Codewords, chunks: Iterable<readonly [number, Uint8Array]>): Uint8Array {
+  const left = new Map<number, Uint8Array | null>(); // null: of different chunks with one number, one is there by chance
+  for (const [number, chunk] of chunks) {
+    const other = left.get(number);
+    const alike = other === undefined || (other?.every((each, at) => each === chunk[at]) ?? false);
+    if (number < count * n) left.set(number, alike ? chunk : null);
+  }
+  if (left.size < count * k) throw tooMuchLost(); // before there is memory for that many
+  const data = new Uint8Array(count * k * width);
+  for (let codeword = 0; codeword < count; codeword++) {
+    const rows = new Map<number, Uint8Array>();
+    for (let row = 0; row < n; row++) {
+      const chunk = left.get(row * count + codeword);
+      if (chunk) rows.set(row, chunk);
+    }
+    const found = decodeCodeword(rows, k, n);
+    if (found === null) throw tooMuchLost();
+    found.forEach((row, index) => data.set(row, (index * count + codeword) * width));
+  }
+  return data;
+}
+
 /** The k data rows from any k rows of a codeword of n, by their number; null if there are fewer. */
-export function decodeCodeword(rows: Map<number, Uint8Array>, k: number, n: number): Uint8Array[] | null {
+function decodeCodeword(rows: Map<number, Uint8Array>, k: number, n: number): Uint8Array[] | null {
   if (rows.size < k) return null;
   const data: Uint8Array[] = Array.from({ length: k }, (_, index) => rows.get(index)!);
   const lost = [...data.keys()].filter((index) => data[index] === undefined);

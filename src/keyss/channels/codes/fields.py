@@ -1,12 +1,13 @@
 """Which numbers of a format's codes carry bits, and how many each: measured, see docs/channels.md.
 
-A *level* is an integer that grows with what it stands for; a *field* is one coordinate of an attribute of
-all Gaussians. How many bits a level carries follows from what is never written, so that readers know it:
-from the Gaussian's size and the format's step, so that positions move by a fraction of it. All of it is
-arithmetic that is the same on every machine, and no logarithms: a bit more or less anywhere, and nothing
-could be read.
+A *level* is an integer that grows with the number it stands for; a *field* is one coordinate of an attribute
+of all Gaussians. The number of bits that a level carries follows from codes that are never written: from the
+Gaussian's size and the format's step, so that positions move by a fraction of that size. The arithmetic is
+the same on every machine and uses no logarithms: with one bit more or less, nothing can be read.
 
-Which levels are left as they are decides whoever writes (see `kept`); readers need not know.
+Writing matches levels (Sharp 2001) instead of overwriting their bits. Overwriting moves even levels up and
+odd ones down only, which makes pairs of them equally frequent: the attacks of Westfeld and Pfitzmann (1999)
+and of Fridrich et al. (2001) find that.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Doubles = npt.NDArray[np.float64]
 MAX_BITS = 10
 _SHARE = -3.0  # 2 to this: the range of what is written, in sizes of the Gaussian
 _LOG_SCALE = -4.0  # 2 to this: the range of what is written in log scales
-_SIGN, _MAGNITUDE = 512, 511  # of SPZ's rotations
+_SIGN, _MAGNITUDE = 512, 511  # of the rotations of an SPZ of version 3 or newer
 _LOG2_E = 1.4426950408889634
 _VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compressed .ply
 
@@ -57,12 +58,22 @@ class Field:
         bits = self.levels[:, None] >> np.arange(MAX_BITS, dtype=np.int32) & 1
         return bits[self._places()].astype(np.uint8)
 
-    def residues(self, bits: npt.NDArray[np.uint8]) -> Levels:
-        """[N] what the last bits of levels are together that `read` gives as `bits`."""
+    @property
+    def reach(self) -> Levels:
+        """[N] by how many levels `with_bits` moves each at most."""
+        return (1 << self.bits) // 2
+
+    def with_bits(self, bits: npt.NDArray[np.uint8], ties: Doubles) -> Levels:
+        """[N] the nearest levels from which `read` gives `bits` [room].
+
+        `ties` [N] in [-0.5, 0.5]: which of two equally near ones is taken.
+        """
         places = np.zeros((len(self.levels), MAX_BITS), np.int32)
         places[self._places()] = bits
-        found: Levels = (places @ (1 << np.arange(MAX_BITS, dtype=np.int32))).astype(np.int32)
-        return found
+        residues = places @ (1 << np.arange(MAX_BITS, dtype=np.int32))
+        step = 1 << self.bits
+        matched: Levels = (residues + step * ((self.levels + ties - residues) / step).round()).astype("int32")
+        return matched
 
     def _places(self) -> Flags:
         found: Flags = np.arange(MAX_BITS) < self.bits[:, None]
@@ -76,15 +87,15 @@ class Format:
     name: str  # as users know it
     fields: Callable[[Any], list[Field]]
     with_levels: Callable[[Any, Mapping[str, Levels]], Any]  # codes with new levels of some fields
-    # A level of a rotation stands for (level - first) * second; None: what is not stored need not be largest.
-    turns: Callable[[Any], tuple[float, float] | None]
+    # Least and largest level of a rotation's parts: -sqrt(1/2) and sqrt(1/2).
+    rotations: tuple[int, int]
     dequantise: Callable[[Any], Gaussians]
     quantise: Callable[[Gaussians], Any]
-    sorts: bool = True  # whether its writer sorts models
+    sorts: bool = True  # True if its writer sorts models
 
 
 def format_of(codes: Codes) -> Format:
-    """How these codes carry. Raises InputError for formats whose codes do not."""
+    """The format of codes. Raises InputError for formats whose codes carry nothing."""
     if type(codes) not in _FORMATS:
         raise InputError(f"nothing can be carried in the codes of this format: expected {', '.join(FORMATS)}")
     return _FORMATS[type(codes)]
@@ -98,28 +109,25 @@ def sog_distances(codes: SogCodes, levels: npt.NDArray[Any]) -> npt.NDArray[np.i
 
 
 def _spz_fields(codes: SpzCodes) -> list[Field]:
-    bits = 3
-    rotations: Levels = codes.rotations.astype(np.int32)
-    if codes.version == 2:
-        bits = 1
-    else:
-        magnitudes = rotations & _MAGNITUDE
-        rotations = np.where(rotations > _MAGNITUDE, -magnitudes, magnitudes).astype(np.int32)
+    """Rotations of version 2, which no program writes any more, carry nothing."""
     sizes = (_middle(codes.scales) / 16 - 10) * _LOG2_E
-    return [
-        *_fields("positions", codes.positions, _fitting(sizes[:, None] + codes.fractional_bits + _SHARE)),
-        *_fields("rotations", rotations, bits),
-    ]
+    bits = _fitting(sizes[:, None] + codes.fractional_bits + _SHARE)
+    positions = _fields("positions", codes.positions, bits)
+    if codes.version == 2:
+        return positions
+    rotations = codes.rotations.astype(np.int32)
+    magnitudes = rotations & _MAGNITUDE
+    signed = np.where(rotations > _MAGNITUDE, -magnitudes, magnitudes)
+    return [*positions, *_fields("rotations", signed, 3)]
 
 
 def _spz_with_levels(codes: SpzCodes, levels: Mapping[str, Levels]) -> SpzCodes:
-    found = dict(levels)
-    if "rotations" in found and codes.version > 2:
-        signed = found["rotations"]
+    replaced = dict(levels)
+    if "rotations" in levels:
+        signed = levels["rotations"]
         negative: Flags = (signed < 0) | ((signed == 0) & (codes.rotations & _SIGN > 0))  # there is a -0
-        found["rotations"] = np.abs(signed) + _SIGN * negative.astype(np.int32)
-    replaced: SpzCodes = _replaced(codes, found)
-    return replaced
+        replaced["rotations"] = np.abs(signed) + _SIGN * negative.astype(np.int32)
+    return _replaced(codes, replaced)  # type: ignore[no-any-return]
 
 
 def _sog_fields(codes: SogCodes) -> list[Field]:
@@ -146,20 +154,16 @@ def _replaced(codes: Any, levels: Mapping[str, Levels]) -> Any:
     )
 
 
-def _spz_turns(codes: SpzCodes) -> tuple[float, float] | None:
-    return (0.0, 0.5**0.5 / _MAGNITUDE) if codes.version > 2 else None
-
-
 _FORMATS: dict[type[Codes], Format] = {
-    SpzCodes: Format("spz", _spz_fields, _spz_with_levels, _spz_turns, spz.dequantise, spz.quantise, False),
-    SogCodes: Format(
-        "sog", _sog_fields, _replaced, lambda codes: (127.5, 2**0.5 / 255), sog.dequantise, sog.quantise
+    SpzCodes: Format(
+        "spz", _spz_fields, _spz_with_levels, (-511, 511), spz.dequantise, spz.quantise, sorts=False
     ),
+    SogCodes: Format("sog", _sog_fields, _replaced, (0, 255), sog.dequantise, sog.quantise),
     CompressedPlyCodes: Format(
         "compressed-ply",
         _compressed_ply_fields,
         _replaced,
-        lambda codes: (511.5, 2**0.5 / 1023),
+        (0, 1023),
         compressed_ply.dequantise,
         compressed_ply.quantise,
     ),

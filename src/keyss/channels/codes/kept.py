@@ -1,7 +1,7 @@
-"""Levels that writers leave as they are because a change would show; readers need not know (`syndromes`).
+"""Levels that a writer leaves alone because a change would show; readers need not know them (`syndromes`).
 
-Near a limit that levels may not cross, fewer and fewer of them change, at random: with a sharp border they
-would pile up behind it. The randomness follows from the cover, which only the writer has.
+Near a limit that levels may not cross, fewer and fewer of them change, at random: behind a sharp border they
+would pile up. The randomness follows from the cover, which only the writer has.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from keyss.channels.codes.fields import Doubles, Field, Flags, Levels, format_of, sog_distances
-from keyss.channels.codes.matching import reach
 from keyss.channels.mixing import random_fractions
 from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 
-# In sizes of the Gaussian: at this distance from its nearest neighbour half of them are left alone. Clones
-# lie nearer to each other, and more of them than there would be by chance.
+# Distance to the nearest neighbour, in sizes of the Gaussian, at which half of the Gaussians are left alone.
+# Clones lie nearer to each other, and there are more of them than by chance.
 _CLONES = 1 / 8
 _NEIGHBOURS = 4  # of a Gaussian, among which its clones are
-_RAMP = 3  # ranges of what is written
+_RAMP = 3  # width of the ramp before a limit, in ranges of what is written
 _NEAR = 8  # levels away, whose frequencies are compared
 _ROUGH = 0.25  # by how much more often levels may be equal than near each other
 _EQUAL = 0.02  # as a share of the Gaussians
@@ -32,26 +31,26 @@ Integers = npt.NDArray[np.int64]
 
 
 def changeable(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:
-    """Of each field the levels [N] that may be changed. `secret`: 32 secret bytes."""
+    """The levels [N] of each field that may be changed. `secret`: 32 secret bytes."""
     count = len(fields[0].levels)
     alone = _alone(codes, fields, random_fractions(secret, "kept/clones", count))
     turnable = _turnable(codes, fields, random_fractions(secret, "kept/turns", count))
-    found = []
+    free = []
     for field in fields:
         random = random_fractions(secret, f"kept/{field.name}/{field.column}", count)
         own = alone & (_room(codes, field) > random * _RAMP * (1 << field.bits)) & (field.bits > 0)
         if field.name == "rotations":
             own &= turnable
-        found.append(own if is_natural(field.levels[own]) else np.zeros_like(own))
-    return found
+        free.append(own if _is_natural(field.levels[own]) else np.zeros_like(own))
+    return free
 
 
 def _alone(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
-    """[N] which Gaussians lie where by chance one would lie: not clones, some of which move apart slowly.
+    """[N] which Gaussians are no clones, some of which training moves apart slowly.
 
-    Of pairs that are near to each other, few change, for there are more of them than by chance, and these
-    would move apart; with the distance, in sizes of the Gaussian, the share grows smoothly. None changes
-    that has a written attribute in common with a neighbour.
+    There are more near pairs than by chance, and changes would move them apart: the share of those that
+    change grows smoothly with the distance in sizes of the Gaussian. A Gaussian that has a written attribute
+    in common with a neighbour never changes.
     """
     model = format_of(codes).dequantise(codes)
     means, log_scales = (each.double().numpy() for each in (model.means, model.log_scales))
@@ -59,64 +58,52 @@ def _alone(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     distance, near = cKDTree(means).query(means, k=min(_NEIGHBOURS + 1, len(means)))
     ratio = distance[:, 1] / sizes / _CLONES
     both = np.minimum(np.arange(len(means)), near[:, 1])  # of two nearest to each other, both or none
-    found: Flags = random[both] * (1 + ratio**3) < ratio**3
+    alone: Flags = random[both] * (1 + ratio**3) < ratio**3
     for name in {each.name for each in fields}:
         levels = np.stack([each.levels for each in fields if each.name == name], axis=1)
-        found &= ~(levels[near[:, 1:]] == levels[:, None]).all(axis=2).any(axis=1)
-    return found
+        alone &= ~(levels[near[:, 1:]] == levels[:, None]).all(axis=2).any(axis=1)
+    return alone
 
 
 def _room(codes: Codes, field: Field) -> Doubles:
-    """[N] how many levels lie between those that a level may become and what it may not; negative: none."""
-    least, most = field.levels.min(), field.levels.max()
+    """[N] how many levels lie between the reach of each and the nearest limit; negative for none."""
+    least, largest = field.levels.min(), field.levels.max()
     if field.name == "rotations":
-        least, most = {"spz": (-511, 511), "sog": (0, 255)}.get(format_of(codes).name, (0, 1023))
-        if getattr(codes, "version", 3) == 2:
-            least, most = 0, 255
+        least, largest = format_of(codes).rotations
     elif isinstance(codes, CompressedPlyCodes):
-        least, most = 0, (2047, 1023, 2047)[field.column]
-    ends = np.minimum(field.levels - least, most - field.levels)
-    found: Doubles = (ends - 1 - reach(field.bits)).astype(np.float64)
+        least, largest = 0, (2047, 1023, 2047)[field.column]
+    room: Doubles = np.minimum(field.levels - least, largest - field.levels) - 1.0
     if isinstance(codes, SogCodes) and field.name == "positions":
-        found = np.minimum(found, _within_distances(codes, field))
-    return found
+        room = np.minimum(room, _to_next_distance(codes, field))
+    return room - field.reach
 
 
-def _within_distances(codes: SogCodes, field: Field) -> Doubles:
-    """[N] the same for the levels at which `sog_distances`, on which bits depend, changes."""
+def _to_next_distance(codes: SogCodes, field: Field) -> Doubles:
+    """[N] how far each level is from where `sog_distances` changes, on which numbers of bits depend."""
     every = np.zeros((65536, 3), np.int64)
     every[:, field.column] = np.arange(65536)
-    powers = sog_distances(codes, every)[:, field.column]
-    borders = np.flatnonzero(np.diff(powers)) + 0.5
-    if not len(borders):
-        return np.full(len(field.levels), np.inf)
+    borders = np.flatnonzero(np.diff(sog_distances(codes, every)[:, field.column])) + 0.5
+    borders = np.concatenate([[-np.inf], borders, [np.inf]])
     after = np.searchsorted(borders, field.levels)
-    gaps = np.stack(
-        [
-            field.levels - borders[(after - 1).clip(0)],
-            borders[after.clip(max=len(borders) - 1)] - field.levels,
-        ]
-    )
-    found: Doubles = np.abs(gaps).min(axis=0) - 0.5 - reach(field.bits)
-    return found
+    gaps: Doubles = np.minimum(field.levels - borders[after - 1], borders[after] - field.levels) - 0.5
+    return gaps
 
 
 def _turnable(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
-    """[N] which rotations have no part that could become larger than the one left out as the largest."""
-    turns = format_of(codes).turns(codes)
+    """[N] which rotations have no part that could become larger than the one that is not stored."""
     own = [each for each in fields if each.name == "rotations"]
-    if turns is None:
+    if not own:
         return np.ones(len(random), np.bool_)
-    centre, step = turns
-    parts = np.abs(np.stack([each.levels for each in own], axis=1) - centre)
-    parts += np.stack([reach(each.bits) for each in own], axis=1)
-    rest = np.sqrt(np.maximum(0.0, step**-2 - np.square(parts).sum(axis=1)))
-    found: Flags = rest - parts.max(axis=1) > random * _RAMP * (1 << own[0].bits)
-    return found
+    least, largest = format_of(codes).rotations
+    parts = np.abs(np.stack([each.levels for each in own], axis=1) - (least + largest) / 2)
+    parts += np.stack([each.reach for each in own], axis=1)
+    rest = np.sqrt(np.maximum(0.0, (largest - least) ** 2 / 2 - np.square(parts).sum(axis=1)))
+    turnable: Flags = rest - parts.max(axis=1) > random * _RAMP * (1 << own[0].bits)
+    return turnable
 
 
-def is_natural(levels: Levels) -> bool:
-    """Whether matching would not show: levels are not shared by many Gaussians, and not on a lattice.
+def _is_natural(levels: Levels) -> bool:
+    """True if matching does not show: few Gaussians share a level, and levels lie on no lattice.
 
     Equal levels are not much more frequent than neighbouring ones, nor even more than odd ones.
     """

@@ -1,12 +1,12 @@
 """The layout of the last bits of all levels, in order of fields, Gaussians, and the lowest first.
 
     in a fixed random order, in blocks of ZONE_RATE bits: salt (16 bytes), slots (28 bytes each)
-    the others, in an order that follows from the salt, in blocks of as many as a header says: data
+    the others, in an order that the salt determines, in blocks of as many bits as a header says: data
 
-What blocks hold is in `syndromes`. A *slot* is a header encrypted under what a key becomes with the salt, or
-noise. The header says where the key's data begin, how long they are, and how much blocks hold. Data are a
-range that may go on at the start; everything else is noise. The number of slots follows from the room. So
-a key tells where its own data lie, and nothing else.
+How blocks hold bits is in `syndromes`. A *slot* is a header encrypted under the key and the salt, or noise.
+The header tells where the key's data begin, their length, and how many bits a block holds. Data are a range
+that may continue at the start; everything else is noise. The number of slots follows from the room. So a key
+tells where its own data lie, and nothing else.
 """
 
 from __future__ import annotations
@@ -19,26 +19,24 @@ import numpy.typing as npt
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from keyss.channels.codes.fields import Field
-from keyss.channels.codes.syndromes import BLOCK
+from keyss.channels.codes.syndromes import BLOCK, Bits
 from keyss.core.errors import InputError
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, stream
 
 VERSION = 1
 MIN_SLOTS, MAX_SLOTS = 4, 256
 ZONE_RATE = 384  # bits that a block of salt and slots holds: more than half of its bits may have to stay
-_MIN_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits that the least slots, and more of them, may take
+_MIN_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits: for MIN_SLOTS, for more slots
 _HEADER = struct.Struct("<BHIIx")  # version, bits that a block holds, first bit, bytes of data
 SLOT_BYTES = _HEADER.size + 16
 _ASSOCIATED = b"keyss/v1/codes"
 
-Bits = npt.NDArray[np.uint8]  # each 0 or 1
 Order = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a slot tells."""
+    """The content of a slot."""
 
     rate: int  # bits that a block of data holds
     start: int  # of the data, in bits
@@ -52,36 +50,38 @@ class Header:
 
 @dataclass(frozen=True)
 class Zones:
-    """What fits into a number of bits."""
+    """How a number of bits is divided."""
 
     bits: int
 
-    @staticmethod
-    def of(fields: list[Field]) -> Zones:
-        return Zones(sum(each.room for each in fields))
-
     @property
     def slots(self) -> int:
-        """A power of two; 0 where there is no room for what is needed at least."""
+        """A power of two; 0 where there is too little room for MIN_SLOTS."""
         if _zone_blocks(MIN_SLOTS) * BLOCK > self.bits * _MIN_SHARE:
             return 0
-        found = MIN_SLOTS
-        while found < MAX_SLOTS and _zone_blocks(2 * found) * BLOCK <= self.bits * _SHARE:
-            found *= 2
-        return found
+        slots = MIN_SLOTS
+        while slots < MAX_SLOTS and _zone_blocks(2 * slots) * BLOCK <= self.bits * _SHARE:
+            slots *= 2
+        return slots
 
     @property
     def zone_bits(self) -> int:
-        """Bits in which salt and slots lie."""
+        """Bits for salt and slots."""
         return _zone_blocks(self.slots) * BLOCK
 
     @property
     def data_blocks(self) -> int:
         return (self.bits - self.zone_bits) // BLOCK
 
-    def zone_order(self) -> Order:
-        """[bits] of which the first `zone_bits` are those of salt and slots, and the others those of data."""
-        return order(bytes(SALT_BYTES), self.bits)
+    def zone_places(self) -> tuple[Order, Order]:
+        """The bits of salt and slots, and all others."""
+        zone, others = np.split(_order(bytes(SALT_BYTES), self.bits), [self.zone_bits])
+        return zone, others
+
+    def places(self, salt: bytes) -> tuple[Order, Order]:
+        """The bits of salt and slots, and those of data, in the order in which blocks take them."""
+        zone, others = self.zone_places()
+        return zone, others[_order(salt, len(others))][: self.data_blocks * BLOCK]
 
 
 def _zone_blocks(slots: int) -> int:
@@ -89,18 +89,18 @@ def _zone_blocks(slots: int) -> int:
 
 
 def find_header(zone: bytes, key: DerivedKey, room: Zones) -> Header | None:
-    """The header that `key` opens; all slots are tried. Raises InputError for one that makes no sense."""
-    cipher, found = _cipher(key), None
+    """The header that `key` opens; all slots are tried. Raises InputError for an impossible one."""
+    cipher, packed = _cipher(key), None
     for slot in range(room.slots):
         start = SALT_BYTES + slot * SLOT_BYTES
         try:
-            packed = cipher.decrypt(_nonce(slot), zone[start : start + SLOT_BYTES], _ASSOCIATED)
+            opened = cipher.decrypt(_nonce(slot), zone[start : start + SLOT_BYTES], _ASSOCIATED)
         except InvalidTag:
             continue
-        found = found or packed
-    if found is None:
+        packed = packed or opened
+    if packed is None:
         return None
-    version, rate, first, size = _HEADER.unpack(found)
+    version, rate, first, size = _HEADER.unpack(packed)
     if version != VERSION:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
     data_bits = room.data_blocks * rate
@@ -109,10 +109,10 @@ def find_header(zone: bytes, key: DerivedKey, room: Zones) -> Header | None:
     return Header(rate, first, size)
 
 
-def order(salt: bytes, count: int) -> Order:
-    """[count] the bits of data, in the order in which blocks take them."""
+def _order(salt: bytes, count: int) -> Order:
+    """[count] a random order that `salt` determines."""
     numbers = np.frombuffer(stream(salt + bytes(16), "codes/order", 8 * count), "<u8")
-    # Sorted with their numbers in the lower half: this is the same everywhere, and faster than `argsort`.
+    # Sorted with their numbers in the lower half: the same on all machines, and faster than `argsort`.
     lower = np.uint64(2**32 - 1)
     return (np.sort(numbers & ~lower | np.arange(count, dtype=np.uint64)) & lower).astype(np.int64)
 

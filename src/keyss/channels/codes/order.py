@@ -1,12 +1,12 @@
 """Orders of Gaussians: one in which bits are counted, and the one of the file.
 
-Formats whose order does not depend on what is written keep it. A .sog is sorted by `in_morton_order`; its
-bits are counted in an order of what is not written.
+Formats whose order does not depend on written codes keep it. A .sog is sorted by `in_morton_order`; its bits
+are counted in an order of codes that are not written.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,50 +22,41 @@ Rows = npt.NDArray[np.intp]
 _SOG_ARRAYS = ("positions", "largest", "rotations", "scales", "colors", "alphas", "labels")
 
 
-@dataclass(frozen=True)
-class Counted:
-    """Codes in the order in which bits are counted, and what carries."""
+def in_counted_order(codes: Codes) -> tuple[Any, list[Field]]:
+    """The codes in the order in which bits are counted, and their fields.
 
-    codes: Any  # Codes
-    rows: Rows  # [N] where they come from
-    fields: list[Field]
-
-    @staticmethod
-    def of(codes: Codes) -> Counted:
-        """Of a .sog's Gaussians that are alike in all that is not written, none carries."""
-        if not isinstance(codes, SogCodes):
-            fields = format_of(codes).fields(codes)
-            return Counted(codes, np.arange(len(fields[0].levels)), fields)
-        rows, alike = _sog_order(codes)
-        codes = taken(codes, rows)
-        fields = format_of(codes).fields(codes)
-        return Counted(codes, rows, [replace(each, bits=np.where(alike, 0, each.bits)) for each in fields])
-
-
-def taken(codes: SogCodes, rows: Rows) -> SogCodes:
-    """The codes of a .sog in another order."""
-    return replace(codes, **{name: getattr(codes, name)[rows] for name in _SOG_ARRAYS})
+    Gaussians of a .sog that are alike in all codes that are not written carry nothing.
+    """
+    if not isinstance(codes, SogCodes):
+        return codes, format_of(codes).fields(codes)
+    rows, alike = _sog_order(codes)
+    codes = _taken(codes, rows)
+    fields = format_of(codes).fields(codes)
+    return codes, [replace(each, bits=np.where(alike, 0, each.bits)) for each in fields]
 
 
 def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
     """The codes as a writer of the format sorts them.
 
-    It sorts before it rounds, so that a few neighbours seem to be out of order. `within` [N, 3]: where
-    between half a level below and above the numbers lay, at random; extremes lie on their levels, and the
-    curve goes between them.
+    It sorts before it rounds, so that a few neighbours seem to be out of order. `within` [N, 3], random in
+    [-0.5, 0.5]: how far above their levels the numbers were. Extremes lie on their levels.
     """
     if not isinstance(codes, SogCodes):
         return codes
     levels = codes.positions
     extreme = (levels == levels.min(axis=0)) | (levels == levels.max(axis=0))
     means: Floats = positions_of(codes, levels + np.where(extreme, 0.0, within)).astype(np.float32)
-    return taken(codes, morton_order(means))
+    return _taken(codes, morton_order(means))
+
+
+def _taken(codes: SogCodes, rows: Rows) -> SogCodes:
+    return replace(codes, **{name: getattr(codes, name)[rows] for name in _SOG_ARRAYS})
 
 
 def _sog_order(codes: SogCodes) -> tuple[Rows, Flags]:
-    """Gaussians [N] by hashes of what is not written, and which of them, in that order, share one.
+    """The rows [N] by hashes of codes that are not written, and which of them, in that order, share one.
 
-    Where two are equal by chance, a little room is lost.
+    Where two hashes are equal by chance, a little room is lost.
     """
     parts = (codes.scales, codes.colors, codes.alphas, codes.labels, codes.largest)
     levels = sog_distances(codes, codes.positions)

@@ -1,14 +1,13 @@
-"""Which numbers of a model carry something, and by what else of the model a reader knows them again.
+"""Which numbers of a model carry bits, and by which others a reader identifies them.
 
-Written are the constant green and blue coefficients of a Gaussian (`f_dc_1`, `f_dc_2`): of all numbers these
-cost least for what every format leaves of them. A Gaussian is known by its *name*: the cells in which its
-three log scales, its opacity and its red coefficient lie. None of these is changed by writing, and none
-depends on where the model stands, how it is turned, or in what order it is stored.
+Bits are written into the constant green and blue coefficients of Gaussians (`f_dc_1`, `f_dc_2`): of all
+numbers that survive every format, changes of these cost least. A Gaussian is identified by its *name*: the
+cells in which its three log scales, its opacity and its red coefficient lie. Writing changes none of these,
+and none depends on the model's position, rotation or order.
 
-Borders of cells lie where 8-bit formats have the border between two roundings (`.spz`: log scales in
-sixteenths, colours in steps of 1 / 38.25; opacities in 255ths nearly everywhere), so that rounding moves no
-number across one. Where another format or another change may have done so, `Carriers.doubt` says how likely
-it is.
+Borders of cells are the borders between two roundings of 8-bit formats (`.spz`: log scales in sixteenths,
+colours in steps of 1 / 38.25; opacities in 255ths nearly everywhere), so that rounding moves no number across
+one. `Carriers.doubt` is the chance that another format or another change has done so.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from keyss.channels.mixing import row_hashes
 from keyss.core.gaussians import Gaussians
 
 SCALE_STEP, COLOUR_STEP, OPACITY_STEP = 1 / 16, 1 / 38.25, 1 / 255  # of 8-bit formats
@@ -36,7 +36,7 @@ Names = npt.NDArray[np.int16]
 
 @dataclass(frozen=True)
 class Numbers:
-    """What a model's names and carriers are made of, of the C Gaussians that could carry something."""
+    """The numbers of the C Gaussians that can carry something."""
 
     rows: npt.NDArray[np.int64]  # [C] of the model
     log_scales: Doubles  # [C, 3]
@@ -45,7 +45,7 @@ class Numbers:
 
     @staticmethod
     def of(model: Gaussians) -> Numbers:
-        """All that are visible and finite."""
+        """The visible and finite Gaussians."""
         log_scales, colours = _doubles(model.log_scales), _doubles(model.sh[:, 0])
         opacities = _doubles(model.opacities)
         fine = np.isfinite(log_scales).all(axis=1) & np.isfinite(colours).all(axis=1)
@@ -63,11 +63,11 @@ class Numbers:
 
     @property
     def size(self) -> float:
-        """The median log scale: it tells by how much a model was scaled."""
+        """The median log scale, which follows the scale of the model."""
         return float(np.median(self.log_scales.mean(axis=1))) if len(self.rows) else 0.0
 
     def carriers(self, offset: float) -> Carriers:
-        """The carriers and their names. `offset`: what counts as a log scale of zero.
+        """The carriers and their names. `offset`: the log scale that counts as zero.
 
         An offset that is a multiple of `CELL` keeps the borders where formats have theirs.
         """
@@ -104,35 +104,20 @@ class Carriers:
         moved = self.names - np.array([cells] * 3 + [0] * 2, np.int16)
         return Carriers(self.rows, moved, self.doubt, self.values)
 
-    @property
-    def impact(self) -> Doubles:
-        """[C] how much a change of colour shows, from the name: log of area times squared opacity."""
-        log_scales = np.sort((self.names[:, :3] + 0.5) * CELL, axis=1)
-        opacity = (self.names[:, 3] + 0.5) * _OPACITY_STEPS * OPACITY_STEP
-        result: Doubles = log_scales[:, 1] + log_scales[:, 2] + 2 * np.log(opacity.clip(1e-3))
-        return result
-
     def namesakes(self) -> npt.NDArray[np.int64]:
         """[C] how many carriers have the same name, itself included."""
-        _, inverse, counts = np.unique(self._packed(), return_inverse=True, return_counts=True)
+        _, inverse, counts = np.unique(row_hashes(self.names), return_inverse=True, return_counts=True)
         return counts[inverse].astype(np.int64)
 
     def one_of_each(self) -> npt.NDArray[np.int64]:
-        """[D] of all with one name the one whose name is least in doubt: only one is written."""
+        """[D] the carrier of each name that is least in doubt: only this one is written."""
         order = np.argsort(self.doubt, kind="stable")
-        _, first = np.unique(self._packed()[order], return_index=True)
+        _, first = np.unique(row_hashes(self.names)[order], return_index=True)
         return np.sort(order[first])
-
-    def _packed(self) -> npt.NDArray[np.int64]:
-        """[C] equal for equal names only by all likelihood: 10 bytes mixed into 8."""
-        packed = np.zeros(len(self), np.uint64)
-        for column in range(self.names.shape[1]):
-            packed = packed * np.uint64(0x9E3779B97F4A7C15) + self.names[:, column].astype(np.uint64)
-        return packed.astype(np.int64)
 
 
 def _cells(values: Doubles, steps: int, noise: float) -> tuple[Names, Doubles]:
-    """Cells of so many `steps` of a format of values [C, k] in its steps, and chances of having left them."""
+    """Cells of `steps` steps each, of values [C, k] in steps, and the chances of having left them."""
     cells = np.floor(values / steps)
     inside = values - cells * steps
     nearest = np.minimum(inside, steps - inside)

@@ -1,9 +1,9 @@
 """Payloads in colours: they survive formats that round, and changes of order and frame.
 
 A payload is encrypted and authenticated (ChaCha20-Poly1305), made into code bits (`fountain`), and written
-into colours (`lattice`) of Gaussians that are known by what else they are (`carriers`). A *header* under a
-few *salts* holds how it is read; see `header` and `salts`. A key opens its own: nothing in the model tells
-how many secrets there are, or that there are any.
+into colours (`lattice`) of Gaussians that are identified by their other numbers (`carriers`). A *header*
+under a few *salts* tells how it is read; see `header` and `salts`. Nothing in the model tells how many
+secrets there are, or that there are any.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.base import METHOD_BYTES, Content, PayloadChannel, PayloadRoom, PayloadsOnly
+from keyss.channels.base import METHOD_BYTES, Content, RoomEstimate
 from keyss.channels.colours.capacity import Capacity, Layout, bucket_of
 from keyss.channels.colours.carriers import Doubles, Numbers
 from keyss.channels.colours.fountain import Fountain
@@ -33,56 +33,52 @@ from keyss.channels.colours.header import (
     derived,
     written_header,
 )
-from keyss.channels.colours.lattice import SPACING
-from keyss.channels.colours.likeness import Likeness
-from keyss.channels.colours.payload import OVERHEAD, encrypt_payload
-from keyss.channels.colours.reading import ColoursReader
-from keyss.channels.colours.salts import SALTS, Salts, moved, renewed, steady
-from keyss.channels.packing import pack_payload
-from keyss.channels.publishing import STRENGTH
-from keyss.channels.writing import NOTICED, check_keys, randomness
+from keyss.channels.colours.lattice import seeds, write
+from keyss.channels.colours.reading import ASSOCIATED, ColoursReader
+from keyss.channels.colours.salts import SALTS, Salts, renewed, steady
+from keyss.channels.payloads import NOTICED, check_keys, pack_payload, randomness
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
-from keyss.rendering.difference import psnr_between
+from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt
 
-_LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
 _TOO_FEW = "this model has too few Gaussians to hide anything that survives other formats"
-_BITS_PER_GAUSSIAN = 1  # about, of room
+_BITS_PER_GAUSSIAN = 0.5  # of room, about
 _OVERHEAD = METHOD_BYTES + 1  # bytes of a payload beside its data, at most
 
 
-@dataclass(frozen=True)
-class Colours(PayloadChannel):
+class Colours:
     """The channel; see `keyss.channels.base.Channel`."""
-
-    strength: float = STRENGTH  # dB PSNR that views of the model have to keep beside those of the cover
 
     name = "colours"
     place = "colours"
     survives = True
+    grows = False
+    records = False
 
     def prepare(self, cover: Gaussians) -> ColoursCover:
-        return ColoursCover(Capacity(cover, Numbers.of(cover)), self.strength)
+        return ColoursCover(Capacity(cover, Numbers.of(cover)))
 
-    def room(self, gaussians: int, sh_degree: int) -> PayloadRoom:
-        return PayloadRoom(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _OVERHEAD)
+    def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
+        return RoomEstimate(gaussians, int(gaussians * _BITS_PER_GAUSSIAN / 8), _OVERHEAD)
 
     def reader(self, stego: Gaussians) -> ColoursReader:
         return ColoursReader(Numbers.of(stego))
 
 
+COLOURS = Colours()
+
+
 @dataclass(frozen=True)
-class ColoursCover(PayloadsOnly):
+class ColoursCover:
     """A cover whose room is known; see `keyss.channels.base.PreparedCover`.
 
-    Order and all numbers but some greens and blues stay. A payload changes as little as it needs: `strength`
-    is the most that it may cost.
+    Order and all numbers but some greens and blues stay.
     """
 
     room: Capacity
-    strength: float
     overhead = _OVERHEAD
+    grows = False
 
     @property
     def cover(self) -> Gaussians:
@@ -94,80 +90,63 @@ class ColoursCover(PayloadsOnly):
 
     @property
     def capacity(self) -> int:
-        """Of one payload. Raises UsageError for a `strength` that is none."""
-        return self.room.bytes(self.strength)
+        """Bytes of one payload."""
+        return self.room.bytes()
 
     @property
     def unseen_capacity(self) -> int:
-        """Of one payload that leaves all numbers as likely as they were, and is hard to tell."""
-        return self.room.bytes(self.strength, unseen=True)
+        """Bytes of one payload that leaves all numbers as likely as they were, and is hard to detect."""
+        return self.room.bytes(likely=True)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Raises InputError for a model that can carry nothing, too."""
         payloads = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *payloads)
-        random = np.random.default_rng(np.frombuffer(stream(secret, "robust/random", 32), np.uint32))
-        if len(Salts.of(self.room.numbers).salts) < SALTS:
-            raise InputError(_TOO_FEW)
-        sizes = [len(payload) + OVERHEAD for payload in payloads]
-        layouts = self._layouts(sizes)
-        jumps = self._jumps(random) if layouts and layouts[0].likely else None
-        numbers = renewed(self.room.numbers, random, jumps)
+        random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
+        numbers = renewed(self.room.numbers, random)
         salts = Salts.of(numbers)
-        if len(salts.salts) < SALTS:  # two are equal now, which hardly ever happens
+        if len(salts.salts) < SALTS:
             raise InputError(_TOO_FEW)
-        keys = [key for key, _ in contents]
-        writings = [_Writing(*derived(key, salts), data) for key, data in zip(keys, payloads, strict=True)]
+        sizes = [compressed_size(payload) + OVERHEAD for payload in payloads]
+        layouts = self._layouts(sizes)
+        writings = [
+            _Writing(*derived(key, salts.salts), payload)
+            for (key, _), payload in zip(contents, payloads, strict=True)
+        ]
         check_keys([each.check for each in writings])
-        # With more than one bit there is no room for another secret that would not be noticed.
-        if layouts[0].lattice.depth == 1:
-            writings += [_Writing.of_nobody(secret, index) for index in range(len(contents), UNNOTICED)]
-        for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
-            headers = self._headers(layouts, sizes, secret, lower)[: len(writings)]
-            likely = [layouts[min(index, len(layouts) - 1)].likely for index in range(len(writings))]
-            stego = self._written(numbers, salts, writings, headers, likely, random)
-            if psnr_between(self.cover, stego) >= self.strength:
-                break
-        return stego
-
-    def _jumps(self, random: np.random.Generator) -> Likeness:
-        """What is usual in colours, for moves of salts."""
-        colours = self.room.numbers.colours
-        return self.room.likeness.learned(colours, moved(colours, random))
+        writings += [_Writing.of_nobody(secret, index) for index in range(len(contents), UNNOTICED)]
+        likely = [layouts[min(index, len(layouts) - 1)].likely for index in range(len(writings))]
+        headers = self._headers(layouts, sizes, secret)[: len(writings)]
+        return self._written(numbers, salts, writings, headers, likely, random)
 
     def _layouts(self, sizes: Sequence[int]) -> list[Layout]:
         """Of each payload."""
-        each = [self.room.layout([size], self.strength) for size in sizes]
-        found = [own for own in each if own is not None]
+        alone = [self.room.layout([size]) for size in sizes]
+        layouts = [own for own in alone if own is not None]
         noticed = len(sizes) > UNNOTICED
-        if len(found) < len(sizes) or sum(own.shares[0] for own in found) > SHARES:
-            together: Layout | None = self.room.layout(sizes, self.strength)
+        if len(layouts) < len(sizes) or sum(own.shares[0] for own in layouts) > SHARES:
+            together = self.room.layout(sizes)
             if together is None:
                 raise UsageError(
-                    f"expected payloads of {self.capacity:,} bytes in all, as this model holds at this "
-                    f"`strength`, got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
+                    f"expected payloads of {self.capacity:,} bytes in all, as this model holds, got "
+                    f"{sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
                 )
-            found = [replace(together, shares=(share,)) for share in together.shares]
+            layouts = [replace(together, shares=(share,)) for share in together.shares]
             noticed = len(sizes) > 1
         if noticed:
             warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
-        return found
+        return layouts
 
-    def _headers(
-        self, layouts: Sequence[Layout], sizes: Sequence[int], secret: bytes, lower: int
-    ) -> list[Header]:
+    def _headers(self, layouts: Sequence[Layout], sizes: Sequence[int], secret: bytes) -> list[Header]:
         """Of each payload, and of decoys without a key, which look the same."""
-        partition = expand(secret, "robust/partition", 2)
+        partition = expand(secret, "colours/partition", 2)
         headers, first = [], 0
         for index in range(max(len(layouts), UNNOTICED)):
-            layout = layouts[min(index, len(layouts) - 1)]
-            (share,) = layout.shares
             own = index < len(layouts)
+            (share,) = layouts[index].shares if own else (1,)
             header = Header(
-                file_key=expand(secret, f"robust/file-key/{index}", FILE_KEY_BYTES),
+                file_key=expand(secret, f"colours/file-key/{index}", FILE_KEY_BYTES),
                 partition=partition,
-                level=max(0, layout.lattice.level - lower),
-                depth=layout.lattice.depth,
                 first=first if own else 0,
                 last=first + share - 1 if own else 0,
                 bucket=bucket_of(sizes[index]) if own else 0,
@@ -200,9 +179,9 @@ class ColoursCover(PayloadsOnly):
         gaps = steady(numbers)
         index, own = Index(carriers), [header.own(carriers) for header in headers]
         holds, chosen = free.copy(), np.zeros(len(carriers), bool)  # written where that is likely
-        for header, writing in zip(headers, writings, strict=True):
+        for writing in writings:
             for secret in writing.secrets:
-                holds[index.rows(index.places(secret, header.kind.places))] = False
+                holds[index.rows(secret)] = False
         admission = [self.room.admission if each else 1.0 for each in likely]
         idle = [
             1 - share * float(holds[each].mean()) if each.any() else 0.0
@@ -220,11 +199,10 @@ class ColoursCover(PayloadsOnly):
         for header, writing, mine, some in zip(headers, writings, own, likely, strict=True):
             if writing.payload is not None:
                 rows, key = np.flatnonzero(free & mine), data_key(writing.static, header)
-                encrypted = encrypt_payload(key, writing.payload, bucket_bytes(header.bucket))
-                code, lattice = Fountain.of(8 * len(encrypted)), header.lattice
-                seeds = lattice.seeds(key, carriers[rows])
-                bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), seeds)
-                values[rows], chosen[rows] = lattice.write(key, carriers[rows], bits), some
+                encrypted = encrypt(key, writing.payload, ASSOCIATED, size=bucket_bytes(header.bucket))
+                code, words = Fountain.of(8 * len(encrypted)), seeds(key, "seeds", carriers.names[rows])
+                bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), words)
+                values[rows], chosen[rows] = write(key, carriers[rows], bits), some
         return self._with_colours(values, chosen, random)
 
     def _with_colours(
@@ -235,11 +213,11 @@ class ColoursCover(PayloadsOnly):
         `chosen` [C]: carriers that change only where the new colour is as likely as the old one.
         """
         before = self.room.numbers.colours
-        new, most = before.copy(), SPACING / 2
+        new = before.copy()
         for column in range(1, 3):
             changed = np.flatnonzero(values[:, column - 1] != before[:, column])
             rows = self.room.numbers.rows[changed]
-            new[changed, column] = self.room.quiet.fitted(rows, column, values[changed, column - 1], most)
+            new[changed, column] = self.room.quiet.fitted(rows, column, values[changed, column - 1])
         if chosen.any():
             base = np.where(chosen[:, None], before, new)
             new[:, 1:] = np.where(self.room.likeness.admitted(base, new, random), new[:, 1:], base[:, 1:])
@@ -253,8 +231,8 @@ class ColoursCover(PayloadsOnly):
 class _Writing:
     """What is written for one key."""
 
-    static: bytes  # what the key becomes without a salt of the file
-    secrets: tuple[bytes, ...]  # what it becomes with each
+    static: bytes  # the key without a salt of the file
+    secrets: tuple[bytes, ...]  # the key under each salt
     payload: bytes | None
 
     @property
@@ -263,5 +241,5 @@ class _Writing:
 
     @staticmethod
     def of_nobody(secret: bytes, index: int) -> _Writing:
-        every = [expand(secret, f"robust/nobody/{index}/{each}", MASTER_BYTES) for each in range(SALTS + 1)]
+        every = [expand(secret, f"colours/nobody/{index}/{each}", MASTER_BYTES) for each in range(SALTS + 1)]
         return _Writing(every[0], tuple(every[1:]), None)

@@ -1,20 +1,19 @@
 """Which changes of colour leave a model as training might have left it.
 
 Colours are not independent: neighbours in space, Gaussians that were split from one, and the channels of a
-grey one differ by little. Noise in them shows where they differ least. So a number is given its new value
-with the probability of Metropolis (1953), p(new) / p(old) where that is less than one, and keeps the old one
-else: what is written is as likely as what was there before, and leaves the distribution of all that p knows
-of as it was. Readers need not know: a number that kept its value reads as a lost one.
+grey one differ by little. Noise shows where they differ least. So a number gets its new value with the
+probability of Metropolis (1953), p(new) / p(old) if that is less than one, and keeps the old one otherwise:
+this leaves the distribution p as it was. Readers need not know: a number that kept its value reads as lost.
 
-The ratio p(new) / p(old) is learned from the model itself, without any other: by logistic regression on the
-difference of what is true and the same with a change (noise-contrastive estimation, Gutmann and Hyvärinen
-2010). Features are logarithms of distances in colour, softened at several sizes, which sum to the heavy tails
-that such differences have.
+The ratio p(new) / p(old) is learned from the model itself by logistic regression on the difference between
+the model and the same model with changes (noise-contrastive estimation, Gutmann and Hyvärinen 2010). Features
+are logarithms of distances in colour, softened at several sizes, which sum to the heavy tails of such
+differences.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -58,7 +57,7 @@ class _Pairs:
 
 @dataclass(frozen=True)
 class Likeness:
-    """What is usual in the colours [N, 3] of a model, as far as a kind of change is to be judged."""
+    """How likely changes of one kind are in the colours [N, 3] of a model."""
 
     pairs: tuple[_Pairs, ...]  # nearest in space, further ones, next in the file
     usual: Doubles  # [N] how much red, which is never written, differs from that of neighbours
@@ -68,7 +67,7 @@ class Likeness:
     def of(colours: Doubles, positions: Doubles, example: Doubles) -> Likeness:
         """`colours`, `positions` [N, 3], finite, N above 1.
 
-        `example` [N, 3]: the colours with a change of the kind that is to be judged in greens and blues.
+        `example` [N, 3]: the colours with changes of this kind in greens and blues.
         """
         count = len(colours)
         near = cKDTree(positions).query(positions, k=min(_NEIGHBOURS + 1, count))[1].reshape(count, -1)
@@ -76,16 +75,12 @@ class Likeness:
         nearest = _Pairs.of(row, near[:, 1], count)
         further = _Pairs.of(np.repeat(row, near.shape[1] - 2), near[:, 2:].ravel(), count)
         pairs = (nearest, further, _Pairs.of(row[1:], row[:-1], count))
-        none = np.zeros(0)
-        return Likeness(pairs, _usual(colours, pairs[:2]), (none, none)).learned(colours, example)
-
-    def learned(self, colours: Doubles, example: Doubles) -> Likeness:
-        """The same for another kind of change."""
-        green, blue = (self._learned(colours, column, example[:, column]) for column in (1, 2))
-        return replace(self, weights=(green, blue))
+        usual = _usual(colours, pairs[:2])
+        weights = [_learned(pairs, usual, colours, column, example[:, column]) for column in (1, 2)]
+        return Likeness(pairs, usual, (weights[0], weights[1]))
 
     def admitted(self, colours: Doubles, new: Doubles, random: np.random.Generator) -> Flags:
-        """[N, 2] which greens and blues get what `new` [N, 3] has, one after the other."""
+        """[N, 2] which greens and blues get the value in `new` [N, 3], one after the other."""
         colours, changed = colours.copy(), new != colours
         admitted = np.zeros((len(colours), 2), bool)
         batch = random.integers(0, _BATCHES, len(colours))
@@ -98,61 +93,57 @@ class Likeness:
                 admitted[fine, column - 1] = True
         return admitted
 
-    def drawn(
-        self, colours: Doubles, row: int, column: int, values: Doubles, random: np.random.Generator
-    ) -> float:
-        """One of the values for a number, each as often as it is likely."""
-        ratio = self._log_ratio(colours, np.full(len(values), row), column, values)
-        chance = np.exp(ratio - ratio.max())
-        return float(random.choice(values, p=chance / chance.sum()))
-
     def _log_ratio(self, colours: Doubles, rows: Rows, column: int, new: Doubles) -> Doubles:
         """[R] logarithm of p(new) / p(old) of one number of each row, where all others stay."""
         around = [pairs.around(rows) for pairs in self.pairs]
-        after = self._features(colours, rows, column, new, around)
-        before = self._features(colours, rows, column, colours[rows, column], around)
-        found: Doubles = (after - before) @ self.weights[column - 1]
-        return found
+        after = _features(self.usual, colours, rows, column, new, around)
+        before = _features(self.usual, colours, rows, column, colours[rows, column], around)
+        ratio: Doubles = (after - before) @ self.weights[column - 1]
+        return ratio
 
-    def _features(
-        self,
-        colours: Doubles,
-        rows: Rows,
-        column: int,
-        values: Doubles,
-        around: list[tuple[Rows, Rows]],
-    ) -> Doubles:
-        """[R, F] of rows whose number in this column is `values` [R]."""
-        another = 3 - column
-        found: list[Doubles] = []
-        for which, other in around:
-            apart = values[which] - colours[other, column]
-            own = rows[which]
-            red, third = (colours[own, each] - colours[other, each] for each in (0, another))
-            for each in (apart, apart - red, apart - third):
-                found += [_sums(which, _log(each, size), len(rows)) for size in _SIZES]
-            relative = apart / self.usual[own]
-            found += [_sums(which, _log(relative, size), len(rows)) for size in _RELATIVE]
-        for own_channel in (0, another):
-            inside = values - colours[rows, own_channel]
-            found += [_log(inside, size) for size in _SIZES]
-        return np.stack(found, axis=1)
 
-    def _learned(self, colours: Doubles, column: int, example: Doubles) -> Doubles:
-        """[F] weights that tell what is true from the example best."""
-        rows = np.random.default_rng(0).permutation(len(colours))[:_LEARNED_FROM]
-        around = [pairs.around(rows) for pairs in self.pairs]
-        true = self._features(colours, rows, column, colours[rows, column], around)
-        apart = true - self._features(colours, rows, column, example[rows], around)
-        spread = apart.std(axis=0) + 1e-9
-        apart /= spread
-        weights = np.zeros(apart.shape[1])
-        for _ in range(_STEPS):
-            doubt = 1 / (1 + np.exp((apart @ weights).clip(-50, 50)))
-            bent = (apart * (doubt * (1 - doubt))[:, None]).T @ apart + _RIDGE * np.eye(len(weights))
-            weights += np.linalg.solve(bent, apart.T @ doubt - _RIDGE * weights)
-        found: Doubles = weights / spread
-        return found
+def _features(
+    usual: Doubles,
+    colours: Doubles,
+    rows: Rows,
+    column: int,
+    values: Doubles,
+    around: list[tuple[Rows, Rows]],
+) -> Doubles:
+    """[R, F] of rows whose number in this column is `values` [R]."""
+    another = 3 - column
+    features: list[Doubles] = []
+    for which, other in around:
+        apart = values[which] - colours[other, column]
+        own = rows[which]
+        red, third = (colours[own, each] - colours[other, each] for each in (0, another))
+        for each in (apart, apart - red, apart - third):
+            features += [_sums(which, _log(each, size), len(rows)) for size in _SIZES]
+        relative = apart / usual[own]
+        features += [_sums(which, _log(relative, size), len(rows)) for size in _RELATIVE]
+    for own_channel in (0, another):
+        inside = values - colours[rows, own_channel]
+        features += [_log(inside, size) for size in _SIZES]
+    return np.stack(features, axis=1)
+
+
+def _learned(
+    every: tuple[_Pairs, ...], usual: Doubles, colours: Doubles, column: int, example: Doubles
+) -> Doubles:
+    """[F] weights of a logistic regression that tells the colours from the example."""
+    rows = np.random.default_rng(0).permutation(len(colours))[:_LEARNED_FROM]
+    around = [pairs.around(rows) for pairs in every]
+    true = _features(usual, colours, rows, column, colours[rows, column], around)
+    apart = true - _features(usual, colours, rows, column, example[rows], around)
+    spread = apart.std(axis=0) + 1e-9
+    apart /= spread
+    weights = np.zeros(apart.shape[1])
+    for _ in range(_STEPS):
+        doubt = 1 / (1 + np.exp((apart @ weights).clip(-50, 50)))
+        bent = (apart * (doubt * (1 - doubt))[:, None]).T @ apart + _RIDGE * np.eye(len(weights))
+        weights += np.linalg.solve(bent, apart.T @ doubt - _RIDGE * weights)
+    found: Doubles = weights / spread
+    return found
 
 
 def _usual(colours: Doubles, every: tuple[_Pairs, ...]) -> Doubles:

@@ -1,6 +1,6 @@
-"""Which Gaussians a writer leaves alone, and how what it writes looks like what was there.
+"""Which Gaussians a writer leaves alone, and which values look like those of the model.
 
-Readers need not know: a number that was left alone reads as a lost one.
+Readers need not know: a number that was left alone reads as lost.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from keyss.channels.colours.lattice import SPACING
 from keyss.core.gaussians import Gaussians
 
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
@@ -41,20 +42,18 @@ class Quiet:
         alone |= (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
         return alone
 
-    def fitted(
-        self, rows: npt.NDArray[np.int64], column: int, new: npt.NDArray[np.float64], most: float
-    ) -> Floats:
-        """[R] `new` values of a column as this model would have them; they move by at most `most`.
+    def fitted(self, rows: npt.NDArray[np.int64], column: int, new: npt.NDArray[np.float64]) -> Floats:
+        """[R] `new` values of a column as this model would have them.
 
-        Of a rounded model: values that it has. Of others: with the last bits that were there, for those
-        of trained numbers are not quite random ones.
+        In a rounded model: the nearest value that it has, if a reader reads the same from it. In others: with
+        the last bits of the old values, which are not quite random after training.
         """
         old, values = self._colours[rows, column], self._values[column]
         if self._rounded:
             above = np.searchsorted(values, new).clip(1, len(values) - 1) if len(values) > 1 else 0
             below = values[np.maximum(above - 1, 0)]
             nearest = np.where(new - below < values[above] - new, below, values[above])
-            close: Floats = np.where(np.abs(nearest - new) <= most, nearest, new).astype(np.float32)
+            close: Floats = np.where(np.abs(nearest - new) <= SPACING / 2, nearest, new).astype(np.float32)
             return close
         bits = new.astype(np.float32).view(np.uint32) & ~_LOW | old.view(np.uint32) & _LOW
         same: Floats = bits.view(np.float32)

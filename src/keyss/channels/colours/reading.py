@@ -25,18 +25,15 @@ from keyss.channels.colours.header import (
     header_agreement,
     read_header,
 )
-from keyss.channels.colours.lattice import LEVELS
-from keyss.channels.colours.payload import decrypt_payload
+from keyss.channels.colours.lattice import COLUMNS, dithers, read, seeds
 from keyss.channels.colours.salts import Salts
-from keyss.channels.packing import unpack_payload
+from keyss.channels.payloads import unpack_payload
+from keyss.channels.reed_solomon import LOST
 from keyss.core.errors import InputError, WrongKeyError
+from keyss.keys.encryption import decrypt
 
-_DAMAGED = (
-    "the key is right, but too much of the model was lost or changed since something was hidden in it: what "
-    "is left is not enough to read it"
-)
-# Shares of carriers that may hold something else, beside those that never did: in ordinary files, in merged
-# ones.
+ASSOCIATED = b"keyss/v1/colours"  # authenticated with a payload
+# Shares of the other carriers that may hold something else: in ordinary files, in merged ones.
 _CHANGED, _MERGED = 0.03, 0.5
 _ROUNDS = 60
 _MAX_RATE = 4.0  # data bits for each code bit; a writer stays below a half of one
@@ -45,8 +42,8 @@ _CELLS_SCALED = (0, 1, -1)  # in a model that was scaled
 _ALIGNMENTS = 7  # of borders of cells: in a model that was scaled names are wrong by a fifth at most
 _BEST = 3  # of all these, that are looked at more closely
 # What a key that opens nothing looks for.
-_NOTHING = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 1, 0, SHARES // 4 - 1, 64, 0)
-_REFINED = ((0.02, 0.004), (0.004, 0.001))  # where it is looked for once a header is found
+_NOTHING = Header(bytes(FILE_KEY_BYTES), bytes(2), 0, SHARES // 4 - 1, 64, 0)
+_REFINED = ((0.02, 0.004), (0.004, 0.001))  # where offsets are looked for once a header is found
 
 
 @dataclass(frozen=True)
@@ -56,43 +53,43 @@ class ColoursReader:
     numbers: Numbers
 
     def open(self, key: str) -> Payload:
-        """What `key` opens. Raises WrongKeyError where it opens nothing, InputError if it is damaged.
+        """See `keyss.channels.base.Reader`.
 
-        Takes about 0.1 s for each of thirteen salts, and as long for a key that opens nothing as for one that
-        does, unless the model was scaled.
+        Takes about 0.1 s for each of 17 salts, and as long for a key that opens nothing as for one that does,
+        unless the model was scaled.
         """
-        static, secrets = derived(key, Salts.of(self.numbers))
+        static, secrets = derived(key, Salts.of(self.numbers).salts)
         check = check_secret(static)
         promises = [(index.promise(secrets), offset) for offset, index in self._indices()]
         best = [offset for _, offset in sorted(promises, reverse=True)[:_BEST]]
         indices = [Index(self.numbers.carriers(offset)) for offset in best]
         attempts = [  # all, as a key that opens nothing does
-            read_header(secrets, check, index, kind, view) for index in indices for kind, view in VIEWS
+            read_header(secrets, check, index, view) for index in indices for view in VIEWS
         ]
-        found = list(dict.fromkeys(header for header in attempts if header is not None))
+        headers = list(dict.fromkeys(header for header in attempts if header is not None))
         agreements = [
             (header_agreement(header, check, secrets, index), header, offset)
-            for header in found or [_NOTHING]
+            for header in headers or [_NOTHING]
             for offset, index in zip(best, indices, strict=True)
         ]
-        if not found:  # about the work that there is where there is something
+        if not headers:  # about the work that there is where there is something
             _payload(_NOTHING, static, self.numbers.carriers(0.0), _CHANGED, _ROUNDS // 4)
             raise WrongKeyError()
-        # An attempt makes a header up by chance, 2^-16, and the right one can be read where names are wrong.
+        # One attempt in 2^16 makes a header up, and the right one can be read where names are wrong.
         _, header, offset = max(agreements, key=itemgetter(0))
         carriers = self._refined(header, check, secrets, offset)
         free = np.ones(len(carriers), bool)
         index = Index(carriers)
         for secret in secrets:
-            free[index.rows(index.places(secret, header.kind.places))] = False
+            free[index.rows(secret)] = False
         for changed in (_CHANGED, _MERGED):
             payload = _payload(header, static, carriers[free], changed)
             if payload is not None:
                 return unpack_payload(payload)
-        raise InputError(_DAMAGED)
+        raise InputError(LOST)
 
     def _indices(self) -> Iterator[tuple[float, Index]]:
-        """What the writer may have taken for a log scale of zero, and the carriers by their names then."""
+        """The log scales that the writer may have taken for zero, and the carriers by their names then."""
         if not len(self.numbers.rows):
             return
         whole = round(self.numbers.size / CELL) * CELL
@@ -103,7 +100,7 @@ class ColoursReader:
                 yield offset + cells * CELL, Index(carriers.shifted(cells))
 
     def _refined(self, header: Header, check: bytes, secrets: tuple[bytes, ...], offset: float) -> Carriers:
-        """The carriers; where the model was scaled, under the names that agree best with the header."""
+        """The carriers; in a model that was scaled, under the names that agree best with the header."""
         if offset % CELL:
             for reach, step in _REFINED:
                 offsets = offset + np.arange(-reach, reach + step / 2, step)
@@ -119,10 +116,13 @@ def _payload(
     """What the header's data key decrypts, or None."""
     own = carriers[header.own(carriers)]
     size, key = bucket_bytes(header.bucket), data_key(static, header)
-    if not len(own) or 8 * size > _MAX_RATE * header.lattice.bits(own).sum():
+    if not len(own) or 8 * size > _MAX_RATE * COLUMNS * len(own):
         return None
     garbage = min(0.9, header.idle * IDLE + changed)
     doubt = 1 - (1 - garbage) * (1 - own.doubt) / own.namesakes()
-    ratios = header.lattice.read(key, own, doubt)
-    bits, _ = Fountain.of(8 * size).decode(header.lattice.seeds(key, own), ratios, rounds)
-    return decrypt_payload(key, np.packbits(bits).tobytes())
+    ratios = read(dithers(key, own.names), own, doubt)
+    bits, _ = Fountain.of(8 * size).decode(seeds(key, "seeds", own.names), ratios, rounds)
+    try:
+        return decrypt(key, np.packbits(bits).tobytes(), ASSOCIATED)
+    except InputError:
+        return None

@@ -1,12 +1,13 @@
 """The Gaussians that serve as the salt of Argon2id: found in a rounded model, and new in every file.
 
-*Listed* are the Gaussians with the least public hashes of the cells in which their red coefficient, their
-opacity and the ratios of their scales lie, of those where these are in the inner part of their cells, from
-where no format moves them out: half of them faint ones, on which a new colour is hardly seen, and half
-others, which are still there when the faintest were removed. Writing changes none of these numbers. A salt
-is a hash of the cells of one listed Gaussian, green and blue included. To have new salts, a writer moves
-green and blue of the listed ones by whole cells, at random and by at most 0.4; with a `Likeness`, each to
-where it is as often as such a Gaussian's is. Where they lie inside of their cells stays as it is.
+*Listed* Gaussians have the least public hashes of the cells of red, opacity and the ratios of scales, among
+those whose numbers are so far inside of their cells that no format moves them out. Half of them are faint,
+so that a new colour is hardly visible; the others are still there when the faintest were removed. Writing
+changes none of these numbers.
+
+A salt is a hash of the cells of one listed Gaussian, green and blue included. A writer makes all salts new by
+moving green and blue of the listed ones by whole cells, each uniformly by -3 to 3: two files of one model
+share each salt with a chance of 1/49.
 """
 
 from __future__ import annotations
@@ -27,20 +28,19 @@ from keyss.channels.colours.carriers import (
     Numbers,
 )
 from keyss.channels.colours.lattice import rank
-from keyss.channels.colours.likeness import Likeness
 from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
 _ENOUGH = 12  # that rounding leaves: of fewer, too few are left after pruning for headers with gaps
 _BANDS = (0.08, 0.4, 1.01)  # of opacity, from each of which half of them are
-_MAX_MOVED = 3  # cells: with fewer, two files of one model would often share a salt
+_MAX_MOVED = 3  # cells
 _COLOUR_STEPS, _OPACITY_STEPS, _RATIO_STEPS = 5, 16, 8  # that make a cell
 # Rounding a number leaves it in its cell, whose borders are borders of rounding too; a ratio moves by a step.
 _NOISE = np.array([OPACITY_NOISE / OPACITY_STEP] + [1.0] * 2 + [COLOUR_NOISE / COLOUR_STEP] * 3)
 _STEPS = np.array([_OPACITY_STEPS] + [_RATIO_STEPS] * 2 + [_COLOUR_STEPS] * 3)
 _CELL = _COLOUR_STEPS * COLOUR_STEP
 _UNCHANGED = 4  # of these numbers: opacity, ratios and red
-_LABEL = b"keyss/v1/robust-salt"
+_LABEL = b"keyss/v1/colours-salt"
 _PUBLIC = hashlib.sha256(_LABEL).digest()
 
 
@@ -66,36 +66,16 @@ class Salts:
 
 
 def steady(numbers: Numbers) -> bool:
-    """Whether rounding alone leaves enough of the salts, so that a header can do without some numbers."""
+    """True if rounding leaves so many salts that a header can do without some numbers."""
     kept = set(Salts.of(numbers).salts) & set(Salts.of(numbers.rounded()).salts)
     return len(kept) >= _ENOUGH
 
 
-def renewed(numbers: Numbers, random: np.random.Generator, likeness: Likeness | None = None) -> Numbers:
-    """The numbers with another green and blue of listed Gaussians, so that all salts are new.
-
-    `likeness`, of C carriers and learned from `moved`: what makes some moves likelier than others.
-    """
-    rows = Salts.of(numbers).rows
-    if likeness is None:
-        return replace(numbers, colours=_moved(numbers.colours, rows, random))
-    colours = numbers.colours.copy()
-    for row in rows:
-        for column in (1, 2):
-            values = numbers.colours[row, column] + np.arange(-_MAX_MOVED, _MAX_MOVED + 1) * _CELL
-            colours[row, column] = likeness.drawn(colours, row, column, values, random)
-    return replace(numbers, colours=colours)
-
-
-def moved(colours: Doubles, random: np.random.Generator) -> Doubles:
-    """[C, 3] colours, all of them with such a move as salts are renewed by."""
-    return _moved(colours, np.arange(len(colours)), random)
-
-
-def _moved(colours: Doubles, rows: npt.NDArray[np.int64], random: np.random.Generator) -> Doubles:
-    colours = colours.copy()
+def renewed(numbers: Numbers, random: np.random.Generator) -> Numbers:
+    """The numbers with another green and blue of listed Gaussians, so that all salts are new."""
+    rows, colours = Salts.of(numbers).rows, numbers.colours.copy()
     colours[rows, 1:] += random.integers(-_MAX_MOVED, _MAX_MOVED + 1, (len(rows), 2)) * _CELL
-    return colours
+    return replace(numbers, colours=colours)
 
 
 def _salt(cells: npt.NDArray[np.int16]) -> bytes:

@@ -1,21 +1,21 @@
 """Cells: a few bytes of each Gaussian, recognisable with the key and noise without. All Gaussians at once.
 
-    tag (4 to 8 bytes), then encrypted: data
+    tag (4 bytes), then encrypted: data
 
 A synthetic initialisation vector, as in RFC 5297, for many short messages in one call of AES-256, which takes
-20 million blocks a second where a hash for each Gaussian takes a million:
+20 million blocks a second where hashes take a million Gaussians:
 
 - tag: the first bytes of the CBC-MAC of identity, slot and data. CBC-MAC is a pseudo-random function for
   messages of one length (Bellare, Kilian, Rogaway 2000), and a `CellCipher` takes no others.
 - key stream: AES of (seed xor counter), where the seed is AES under another key of (identity xor tag and
   slot). Equal key streams would need equal data in the same Gaussian, or a collision of 128 bits.
 
-Identities are public and differ between Gaussians (see `keyss.channels.low_bits.bits`). So one key may
-encrypt different data in one Gaussian, as happens when a model is embedded into twice; an observer notices
-nothing but a repetition of the very same bytes. A reader decrypts every cell and keeps those whose tag fits;
-with a tag of 4 bytes a foreign cell fits once in 2^32.
+Identities are public and differ between Gaussians (see `bits`). So one key may encrypt different data in one
+Gaussian, as happens when a model is embedded into twice; an observer notices nothing but a repetition of the
+very same bytes. A reader decrypts every cell and keeps those whose tag fits: one foreign cell in 2^32.
 
-Why by hand: no library encrypts a million messages of 70 bytes in one call; the primitive is the library's.
+The mode is written by hand because no library encrypts a million messages of 70 bytes in one call; the
+primitive is the library's.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from keyss.channels.mixing import encrypted_blocks
 from keyss.keys.derivation import expand
 from keyss.rendering.cpu.parallel import in_blocks
 
-TAG_BYTES = 4  # unless more are asked for
+TAG_BYTES = 4
 _BLOCK = 16
 _CELLS = 1 << 13  # at a time: what is made of them stays in the cache
 
@@ -38,9 +38,8 @@ Flags = npt.NDArray[np.bool_]
 class CellCipher:
     """Encrypts and decrypts cells of `size` bytes of data for one use of a uniformly random `secret`."""
 
-    def __init__(self, secret: bytes, label: str, size: int, tag_bytes: int = TAG_BYTES) -> None:
+    def __init__(self, secret: bytes, label: str, size: int) -> None:
         self.size = size
-        self._tag = tag_bytes
         self._tag_key = expand(secret, f"{label}/tag", 32)
         self._seed_key = expand(secret, f"{label}/seed", 32)
         self._stream_key = expand(secret, f"{label}/stream", 32)
@@ -48,12 +47,12 @@ class CellCipher:
     @property
     def cell_bytes(self) -> int:
         """Bytes of tag and data."""
-        return self._tag + self.size
+        return TAG_BYTES + self.size
 
     def encrypt(self, identities: Bytes, data: Bytes, slots: npt.NDArray[np.int64] | int = 0) -> Bytes:
         """[N, cell_bytes] cells of `data` [N, size] for identities [N, 16].
 
-        `slots` [N] or for all of them: which of a Gaussian's cells it is.
+        `slots` [N], or one for all: the number of the cell in its Gaussian.
         """
         if data.shape != (len(identities), self.size):
             raise ValueError(f"expected data of shape {(len(identities), self.size)}, got {data.shape}")
@@ -63,8 +62,8 @@ class CellCipher:
         def work(start: int, stop: int) -> None:
             names, own, which = identities[start:stop], data[start:stop], numbers[start:stop]
             tags = self._tags(names, own, which)
-            cells[start:stop, : self._tag] = tags
-            cells[start:stop, self._tag :] = own ^ self._stream(names, which, tags)
+            cells[start:stop, :TAG_BYTES] = tags
+            cells[start:stop, TAG_BYTES:] = own ^ self._stream(names, which, tags)
 
         in_blocks(work, len(data), _CELLS)
         return cells
@@ -75,8 +74,8 @@ class CellCipher:
 
         def work(start: int, stop: int) -> Bytes:
             names, own = identities[start:stop], cells[start:stop, : self.cell_bytes]
-            which, tags = np.full(len(names), slot, np.uint8), own[:, : self._tag]
-            data = own[:, self._tag :] ^ self._stream(names, which, tags)
+            which, tags = np.full(len(names), slot, np.uint8), own[:, :TAG_BYTES]
+            data = own[:, TAG_BYTES:] ^ self._stream(names, which, tags)
             fits[start:stop] = (self._tags(names, data, which) == tags).all(axis=1)
             return data[fits[start:stop]]
 
@@ -84,20 +83,20 @@ class CellCipher:
         return fits, np.concatenate([np.zeros((0, self.size), np.uint8), *every])
 
     def _tags(self, identities: Bytes, data: Bytes, slots: Bytes) -> Bytes:
-        """[N, tag bytes] of data [N, size] in the `slots` [N]."""
+        """[N, TAG_BYTES] of data [N, size] in the `slots` [N]."""
         messages = np.zeros((len(data), -(-(1 + self.size) // _BLOCK), _BLOCK), np.uint8)
         flat = messages.reshape(len(data), -1)
         flat[:, 0], flat[:, 1 : 1 + self.size] = slots, data
         states = encrypted_blocks(self._tag_key, identities)
         for block in range(messages.shape[1]):
             states = encrypted_blocks(self._tag_key, states ^ messages[:, block])
-        return states[:, : self._tag]
+        return states[:, :TAG_BYTES]
 
     def _stream(self, identities: Bytes, slots: Bytes, tags: Bytes) -> Bytes:
-        """[N, size] the key streams; `tags` [N, tag bytes]."""
+        """[N, size] the key streams; `tags` [N, TAG_BYTES]."""
         seeds = identities.copy()
-        seeds[:, : self._tag] ^= tags
-        seeds[:, self._tag] ^= slots
+        seeds[:, :TAG_BYTES] ^= tags
+        seeds[:, TAG_BYTES] ^= slots
         counted = np.repeat(encrypted_blocks(self._seed_key, seeds)[:, None], -(-self.size // _BLOCK), axis=1)
         counted[:, :, -1] ^= np.arange(counted.shape[1], dtype=np.uint8)
         return encrypted_blocks(self._stream_key, counted).reshape(len(seeds), -1)[:, : self.size]

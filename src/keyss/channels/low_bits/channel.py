@@ -1,21 +1,21 @@
 """Secrets in the low bits of a model, to be found again with nothing but the model and a key.
 
-There is nothing to be recognised: no magic number, no table, no order. What a key decrypts is found by trying
-every Gaussian's cell and keeping those whose tag fits.
+Nothing can be recognised: there is no magic number, no table, no order. A reader tries the cell of every
+Gaussian and keeps those whose tag fits.
 
 - The *salt* of Argon2id is a hash of one Gaussian that carries nothing else (see `salts`). Because it may be
   removed, there are key cells for each of SALTS.
-- *Key cells*, encrypted under what the key becomes with a salt, hold the secret's data key.
+- *Key cells*, encrypted under the key and a salt, hold the secret's data key.
 - *Parameter cells*, encrypted under the data key, tell how the rest is read (see `parameters`).
-- *Content cells* are encrypted under the data key too: the chunks of an encrypted payload (see `spread`), or
-  records. Records need no number: shuffling and cropping are harmless, and a removed carrier takes only its
-  own record with it. *Copies* of some records have another label; they count where the record is gone.
+- *Records* are encrypted under the data key too; the numbered chunks of an encrypted payload are records (see
+  `spread`). Other records need no number: shuffling and cropping are harmless, and a removed carrier takes
+  only its own record with it. *Copies* of some have another label; they count where the record is gone.
 
-Which carrier gets what is drawn at random (see `layout`), and every usable one gets new low bits, noise if
-nothing else: cells of other secrets and of none look alike. All randomness comes from `entropy`, which must
-be secret: if it followed from the cover and one secret, the holder of that secret's key could compute
-what the file would be without the others. No key stream is used twice: data keys depend on entropy and on all
-contents, and the key stream of a cell on the data in it (see `cells`).
+All of it lies in random carriers (see `layout`), and every usable one gets new low bits, noise if nothing
+else: cells of other secrets and of none look alike. All randomness comes from `entropy`, which must be
+secret: if it followed from the cover and one secret, the holder of that secret's key could compute the file
+without the others. No key stream is used twice: data keys depend on entropy and on all contents, and the key
+stream of a cell on the data in it (see `cells`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from keyss.channels.base import Bytes, Content, Payload, RecordPlan, RecordRequest, Records
+from keyss.channels.base import Bytes, Content, RecordPlan, RecordRequest
 from keyss.channels.low_bits.bits import (
     Flags,
     Layout,
@@ -39,16 +39,14 @@ from keyss.channels.low_bits.bits import (
     read_low_bits,
     write_low_bits,
 )
-from keyss.channels.low_bits.layout import Carriers
+from keyss.channels.low_bits.layout import LowBitsRoom
 from keyss.channels.low_bits.reading import LowBitsReader
 from keyss.channels.low_bits.salts import salt, salt_rows
-from keyss.channels.low_bits.spread import payload_capacity
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
 from keyss.channels.low_bits.writing import Writer, digest
-from keyss.channels.writing import check_keys, randomness
+from keyss.channels.payloads import check_keys, randomness
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation, stream
-from keyss.keys.encryption import SMALLEST_BUCKET
 from keyss.rendering.cpu.parallel import in_blocks
 
 
@@ -77,28 +75,11 @@ class LowBits:
     def room(self, gaussians: int, sh_degree: int) -> LowBitsRoom:
         return LowBitsRoom(gaussians, bytes_per_gaussian(sh_degree))
 
-    def largest_record(self, sh_degree: int) -> int:
-        return self.room(0, sh_degree).record_bytes(1)
-
-    def appended(self, size: int) -> int:
-        return 0
-
     def reader(self, stego: Gaussians) -> LowBitsReader:
         return LowBitsReader.of(stego)
 
 
 LOW_BITS = LowBits()
-
-
-@dataclass(frozen=True)
-class LowBitsRoom(Carriers):
-    """What fits into so many carriers; see `keyss.channels.base.Room`."""
-
-    overhead = SMALLEST_BUCKET
-
-    @property
-    def capacity(self) -> int:
-        return payload_capacity(self.carriers, 1, self.width)
 
 
 @dataclass(frozen=True)
@@ -140,17 +121,9 @@ class LowBitsCover:
 
     def _embed(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes) -> Gaussians:
         check_keys([keys[0].verifier() for keys, _ in contents])
-        payloads = [(keys, each) for keys, each in contents if isinstance(each, Payload)]
-        records = [(keys, each) for keys, each in contents if isinstance(each, Records)]
-        if payloads and records:
-            raise ValueError("expected payloads or records in one model, got both")
-        fresh, _ = self._salts(entropy)
-        room, names = self._room, self.names[self._rows]
-        writer = Writer(names, room.width, entropy)
-        if payloads:
-            writer.payloads(payloads, len(self.cover))
-        else:
-            writer.records(records)
+        fresh, salts = self._salts(entropy)
+        writer = Writer(self.names[self._rows], self.layout.width, entropy, bytes(each[0] for each in salts))
+        writer.write(contents)
         parts = [(self._fresh_rows, fresh), (self._rows[writer.order], writer.table)]
         return write_low_bits(self.cover, self.layout, parts)
 
@@ -191,5 +164,5 @@ def _versions(model: Gaussians) -> list[int]:
 
 
 def _derived(key: str, derivations: Sequence[KeyDerivation]) -> list[DerivedKey]:
-    """What `key` becomes under each, several at a time."""
+    """`key` under each derivation, several at a time."""
     return in_blocks(lambda index, _: DerivedKey(key, derivations[index]), len(derivations), 1)

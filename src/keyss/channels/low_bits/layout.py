@@ -1,40 +1,47 @@
-"""Where headers, payloads and records lie among the carriers, and how many records share one.
+"""How many cells each secret gets among the carriers, and how many cells divide one.
 
-Every secret has a *header* in a few whole carriers: its data key for each salt, and parameters that tell how
-the rest is read. Beside it come a payload's chunks, or records.
+Every secret has a *header* in a few whole carriers: its data key for each salt, and the parameters for
+reading the rest. Beside it come *records*, one in each cell; numbered chunks of a payload are records too.
 
-What a secret gets follows from its own size, so that its key does not tell whether there are others. There
-are size classes, in which several secrets fit beside each other as each would alone:
+A key must not tell whether there are other secrets: what a secret gets follows from its own size. There are
+size classes, in which several secrets fit beside each other as each would alone: a fifth of the carriers, for
+one record each; then a quarter, half and all of the cells that divide carriers into halves (or thirds,
+quarters).
 
-- A *payload* gets a quarter of the carriers if that is enough, else half. What it does not need becomes
-  redundancy, so that the number of its cells tells nothing.
-- *Records* have carriers of their own, one record each, if they take no more than a fifth. Those of a larger
-  secret divide carriers into halves (or thirds, quarters). Up to a quarter of the records, those whose loss
-  costs most, are embedded twice, if with them the secret keeps to the least of a quarter, a half and all of
-  the cells that has room for it: a copy of 10 % takes away half of what random pruning costs. Carriers for
-  the headers of four secrets are set aside, whether there are so many or not.
+- *Records* take as many cells of the first class that has room as there are. Up to a quarter of them, those
+  whose loss costs most, are embedded twice if the class has room for that: a copy of 10 % takes away half of
+  the cost of random pruning.
+- A *payload* fills its class with redundancy.
 
-Where secrets do not fit so (`Arrangement.as_alone`), all do without copies or get smaller cells, and the
-holder of one key can notice that there are others.
+Carriers for the headers of four secrets are set aside, whether there are so many or not. Secrets that do not
+fit like that get what there is, without copies or in smaller cells, and the holder of one key can notice the
+others.
 """
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from keyss.channels.base import RecordPlan, RecordRequest
+from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.cells import TAG_BYTES
+from keyss.channels.low_bits.spread import NUMBER_BYTES, codewords_for, largest_payload
+from keyss.channels.reed_solomon import Codewords
 from keyss.core.errors import UsageError
+from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
 
 DATA_KEY_BYTES = 16
 SALTS = 12  # Gaussians that may serve as the salt: random pruning of a quarter removes all with p = 6e-8
 KEY_COPIES = 12  # of the data key, for each salt
 PARAMETER_COPIES = 24  # of each part: all are removed with a quarter of the model with p = 4e-15
-PREFIX_BYTES = 40  # of the parameters before a method's own header (see `parameters`)
+PREFIX_BYTES = 34  # of the parameters before a method's own header (see `parameters`)
 MAX_CELLS = 4  # of a carrier
 MAX_COPIES = 0.25  # of a secret's records
 UNNOTICED = 4  # secrets that fit beside each other, if they are small enough, as each would alone
+TYPICAL_SHARE = 0.75  # Gaussians whose low bits are random, of a trained model; 0.58 to 0.94 were measured
 
 _TYPICAL_HEADER = 168  # bytes that the methods' own headers take at most
 _MAX_SET_ASIDE = 1 / 3  # of the carriers, for headers of secrets that there may not be
@@ -42,110 +49,174 @@ _DEVIATIONS = 6  # by which carriers that are left untouched may be fewer than e
 
 
 @dataclass(frozen=True)
-class Arrangement:
-    """How records are placed; see `Carriers.arrangement`."""
+class PayloadPlan:
+    """The cells of a payload."""
 
-    header_carriers: int  # set aside for all headers together
-    as_alone: bool  # whether each secret has what it would have if it were the only one
+    cells_per_carrier: int
+    cells: int
+    codewords: Codewords
 
 
 @dataclass(frozen=True)
-class Carriers:
-    """So many carriers, each of `width` bytes."""
+class LowBitsRoom:
+    """The room in carriers of `width` bytes each; see `keyss.channels.base.Room`."""
 
     carriers: int
     width: int
 
+    overhead = SMALLEST_BUCKET
     grows = False
+
+    @property
+    def capacity(self) -> int:
+        return self.payload_capacity(1)
 
     @property
     def part_bytes(self) -> int:
         """Bytes of parameters in one cell, beside its tag and its number; 0 where nothing fits at all."""
         return self.width - TAG_BYTES - 1 if self.width >= TAG_BYTES + DATA_KEY_BYTES else 0
 
+    def record_bytes(self, cells: int) -> int:
+        """Bytes of a record where `cells` of them divide a carrier; 0 where nothing fits."""
+        return max(0, self.width // cells - TAG_BYTES) if self.part_bytes else 0
+
     def header_carriers(self, header_bytes: int) -> int:
         """Carriers that a secret's header takes; `header_bytes`: what the method adds to the parameters."""
         parts = -(-(PREFIX_BYTES + header_bytes) // max(1, self.part_bytes))
         return SALTS * KEY_COPIES + parts * PARAMETER_COPIES
 
-    def record_bytes(self, cells: int) -> int:
-        """Bytes of a record where `cells` of them divide a carrier; 0 where nothing fits."""
-        return max(0, self.width // cells - TAG_BYTES) if self.part_bytes else 0
+    def set_aside(self, header_bytes: Sequence[int], as_alone: bool) -> int:
+        """Carriers for the headers of all secrets."""
+        if as_alone:
+            return UNNOTICED * self.header_carriers(_TYPICAL_HEADER)
+        return sum(self.header_carriers(each) for each in header_bytes)
 
     def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
         """A plan for each of the requests; those with more than one cell of a carrier have equally many.
 
         Raises UsageError with the number of records that fits.
         """
-        least, most = max(request.least_bytes for request in requests), self.record_bytes(1)
-        if least > most:
+        least, largest = max(request.least_bytes for request in requests), self.record_bytes(1)
+        if least > largest:
             raise UsageError(
-                f"a Gaussian of this cover has room for records of {most} bytes, and at least {least} are "
+                f"a Gaussian of this cover has room for records of {largest} bytes, and at least {least} are "
                 "needed"
             )
-        alone = [self._alone(request) for request in requests]
-        plans = [plan for plan in alone if plan is not None]
-        if len(plans) == len(requests) and self._fit_as_alone(plans, requests):
-            return plans
-        return self._tight(requests)
+        plans = [plan for plan in map(self._alone, requests) if plan is not None]
+        return plans if self.lie_as_alone(plans, requests) else self._tight(requests)
+
+    def lie_as_alone(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
+        """True if records so planned lie as each secret's would alone."""
+        if list(map(self._alone, requests)) != list(plans):
+            return False
+        counts = [request.count + plan.copies for plan, request in zip(plans, requests, strict=True)]
+        return self._fit([plan.cells_per_carrier for plan in plans], counts)
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         """Records of the smallest useful size that fit for all requests together; 0 if none."""
-        left = self.carriers - self._headers(requests)
-        least = max(request.least_bytes for request in requests)
-        cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least]
-        return max(0, left) * max(cells, default=0)
+        left = self.carriers - self.set_aside([each.header_bytes for each in requests], as_alone=False)
+        return max(0, left) * self._most_cells(max(request.least_bytes for request in requests))
 
     def unnoticed_records(self, least_bytes: int, secrets: int) -> int:
-        """Records that each of so many secrets may have so that all lie as each would alone; 0 if none may.
-
-        `least_bytes`: of a record.
-        """
-        cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least_bytes]
-        if not cells or secrets > UNNOTICED or self._set_aside > _MAX_SET_ASIDE * self.carriers:
+        """Records of `least_bytes` that each of so many secrets may have so that all lie as alone; or 0."""
+        if secrets > UNNOTICED or not self._classes():
             return 0
-        return cells[-1] * (self.carriers - self._set_aside) // (1 << (secrets - 1).bit_length())
+        cells = self._most_cells(least_bytes)
+        return cells * self._shared // (1 << (secrets - 1).bit_length())
 
-    def arrangement(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> Arrangement:
-        """How records so planned are placed."""
-        as_alone = [self._alone(request) for request in requests] == list(plans)
-        if as_alone and self._fit_as_alone(plans, requests):
-            return Arrangement(self._set_aside, as_alone=True)
-        return Arrangement(self._headers(requests), as_alone=len(requests) == 1)
+    def plan_payloads(self, sizes: Sequence[int]) -> tuple[list[PayloadPlan], bool]:
+        """A plan for each encrypted payload of so many bytes, and whether they lie as alone.
+
+        Raises UsageError with the number of carriers that would do.
+        """
+        plans = [plan for plan in map(self._payload_alone, sizes) if plan is not None]
+        if len(plans) == len(sizes) and self._fit(
+            [plan.cells_per_carrier for plan in plans], [plan.cells for plan in plans]
+        ):
+            return plans, True
+        cells, plans = self._payload_cells(len(sizes)), []
+        for size in sizes:
+            codewords = codewords_for(cells, self.record_bytes(1) - NUMBER_BYTES, size)
+            if codewords is None:
+                raise UsageError(self.too_small(self.carriers, "usable Gaussians", size, len(sizes)))
+            plans.append(PayloadPlan(1, cells, codewords))
+        return plans, False
+
+    def payload_capacity(self, secrets: int) -> int:
+        """Bytes of encrypted payload for each of `secrets`; may be 0."""
+        return largest_payload(self._payload_cells(secrets), self.record_bytes(1) - NUMBER_BYTES)
+
+    def too_small(self, count: int, what: str, size: int, secrets: int) -> str:
+        """The message for payloads of `size` bytes that do not fit; `count` and `what` describe the model."""
+        if self.record_bytes(1) <= NUMBER_BYTES:
+            return (
+                f"a model whose Gaussians hold {self.width} bytes has no room for anything in its low bits: "
+                "there are 8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
+            )
+        need = bisect_left(
+            range(1 << 30), size, key=lambda each: LowBitsRoom(each, self.width).payload_capacity(secrets)
+        )
+        need = math.ceil(need * count / max(1, self.carriers))
+        digits = max(0, len(str(need)) - 2)
+        rounded = math.ceil(need / 10**digits) * 10**digits
+        each = "" if secrets == 1 else f" for each of {secrets} secrets"
+        return (
+            f"a model of {count:,} {what} is too small to carry {size:,} bytes{each} in its low bits; "
+            f"{rounded:,} Gaussians would do"
+        )
 
     @property
-    def _set_aside(self) -> int:
-        return UNNOTICED * self.header_carriers(_TYPICAL_HEADER)
+    def _shared(self) -> int:
+        """Carriers that the headers leave where secrets lie as alone."""
+        return self.carriers - self.set_aside((), as_alone=True)
 
-    def _headers(self, requests: Sequence[RecordRequest]) -> int:
-        return sum(self.header_carriers(request.header_bytes) for request in requests)
+    def _classes(self) -> list[tuple[int, int]]:
+        """Cells of a carrier, and cells in all; none where headers take too much."""
+        shared = self._shared
+        if self.carriers - shared > _MAX_SET_ASIDE * self.carriers:
+            return []
+        divided = [(cells, cells * shared // part) for cells in range(2, MAX_CELLS + 1) for part in (4, 2, 1)]
+        return [(1, shared // 5), *divided]
+
+    def _most_cells(self, least_bytes: int) -> int:
+        """Into how many cells a carrier can be divided for records of so many bytes; 0 if they do not fit."""
+        cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least_bytes]
+        return max(cells, default=0)
 
     def _alone(self, request: RecordRequest) -> RecordPlan | None:
-        """What suits a secret for itself; None where it needs what is set aside for others."""
-        most = self.carriers - self._set_aside
-        if self._set_aside > _MAX_SET_ASIDE * self.carriers or request.header_bytes > _TYPICAL_HEADER:
+        """The plan of a secret for itself; None where it needs what is set aside for others."""
+        if request.header_bytes > _TYPICAL_HEADER:
             return None
-        for cells in range(1, MAX_CELLS + 1):
+        for cells, room in self._classes():
             size = self.record_bytes(cells)
-            classes = [most // 5] if cells == 1 else [cells * most // 4, cells * most // 2, cells * most]
-            enough = [each for each in classes if each >= request.count]
-            if enough and size >= request.least_bytes:
-                copies = min(int(MAX_COPIES * request.count), enough[0] - request.count)
+            if room >= request.count and size >= request.least_bytes:
+                copies = min(int(MAX_COPIES * request.count), room - request.count)
                 return RecordPlan(size, copies, cells)
         return None
 
-    def _fit_as_alone(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
-        """Records that divide carriers come first, anywhere; then the others on carriers left untouched."""
-        divided = [plan.cells_per_carrier for plan in plans if plan.cells_per_carrier > 1]
-        if len(requests) > UNNOTICED or len(set(divided)) > 1:
+    def _payload_alone(self, size: int) -> PayloadPlan | None:
+        for cells, room in self._classes():
+            codewords = codewords_for(room, self.record_bytes(cells) - NUMBER_BYTES, size)
+            if codewords is not None:
+                return PayloadPlan(cells, room, codewords)
+        return None
+
+    def _payload_cells(self, secrets: int) -> int:
+        """Whole carriers for each of so many payloads where they do not lie as alone."""
+        return (self.carriers - secrets * self.header_carriers(_TYPICAL_HEADER)) // secrets
+
+    def _fit(self, cells_per_carrier: Sequence[int], counts: Sequence[int]) -> bool:
+        """True if so many cells of each secret fit.
+
+        Cells that divide carriers come first, anywhere; then the others on carriers left untouched.
+        """
+        divided = {each for each in cells_per_carrier if each > 1}
+        if len(counts) > UNNOTICED or len(divided) > 1:
             return False
-        carriers, cells = self.carriers - self._set_aside, max(divided, default=1)
-        whole = shared = 0
-        for plan, request in zip(plans, requests, strict=True):
-            if plan.cells_per_carrier == 1:
-                whole += request.count + plan.copies
-            else:
-                shared += request.count + plan.copies
+        carriers, cells = self._shared, max(divided, default=1)
+        both = list(zip(cells_per_carrier, counts, strict=True))
+        whole = sum(count for each, count in both if each == 1)
+        shared = sum(count for each, count in both if each > 1)
         if shared > cells * carriers or not whole:
             return shared <= cells * carriers
         untouched = (1 - shared / (cells * carriers)) ** cells
@@ -154,34 +225,25 @@ class Carriers:
 
     def _tight(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
         """All that there is for these secrets: whole carriers, then fewer copies, then smaller cells."""
-        left = self.carriers - self._headers(requests)
-        for cells in range(1, MAX_CELLS + 1):
-            size = self.record_bytes(cells)
-            if size < max(request.least_bytes for request in requests):
-                break
-            count = sum(request.count for request in requests)
+        left = self.carriers - self.set_aside([each.header_bytes for each in requests], as_alone=False)
+        count = sum(request.count for request in requests)
+        least = max(request.least_bytes for request in requests)
+        for cells in range(1, self._most_cells(least) + 1):
             if count <= cells * left:
-                spare = (cells * left - count) / max(1, count)
-                copies = min(MAX_COPIES, spare)
-                return [RecordPlan(size, int(copies * request.count), cells) for request in requests]
+                copies = min(MAX_COPIES, (cells * left - count) / max(1, count))
+                return [
+                    RecordPlan(self.record_bytes(cells), int(copies * request.count), cells)
+                    for request in requests
+                ]
         raise UsageError(
-            f"{sum(request.count for request in requests):,} Gaussians are too many for this cover: "
-            f"{self.carriers:,} of its Gaussians can carry something, and "
-            f"{self.record_capacity(requests):,} would fit"
+            f"{count:,} Gaussians are too many for this cover: {self.carriers:,} of its Gaussians can carry "
+            f"something, and {self.record_capacity(requests):,} would fit"
         )
 
 
-def payload_parts(alone: Sequence[int]) -> tuple[list[int], bool]:
-    """Into how many parts the carriers are divided for each payload, and whether all is as if it were alone.
-
-    `alone`: for each what would be enough for it, 4 or 2 parts. Where that is too much for all of them, each
-    gets the same: the power of two from the number of payloads on, at least 2.
-    """
-    if sum(1 / parts for parts in alone) <= 1:
-        return list(alone), True
-    return [shares(len(alone))] * len(alone), False
-
-
-def shares(secrets: int) -> int:
-    """Into how many parts payloads divide the carriers at most."""
-    return max(2, 1 << (secrets - 1).bit_length())
+def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
+    """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained."""
+    size = encrypted_size(compressed)
+    room = LowBitsRoom(int(gaussians * TYPICAL_SHARE), bytes_per_gaussian(sh_degree))
+    if room.payload_capacity(secrets) < size:
+        raise UsageError(room.too_small(gaussians, "Gaussians", size, secrets))

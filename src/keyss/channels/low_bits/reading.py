@@ -1,9 +1,10 @@
-"""Reading what lies in the low bits of a model, with a key."""
+"""Reading the low bits of a model with a key."""
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -11,37 +12,42 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.base import Bytes, Content, Payload, RecordPlan, Records
+from keyss.channels.base import (
+    SALTS_TRIED,
+    Bytes,
+    Content,
+    Payload,
+    RecordPlan,
+    Records,
+    SaltedReader,
+)
 from keyss.channels.low_bits import parameters
 from keyss.channels.low_bits.bits import Flags, Layout, identities, read_low_bits
-from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
-from keyss.channels.low_bits.ciphers import (
-    ASSOCIATED,
-    chunk_cipher,
-    key_cipher,
-    parameter_cipher,
-    payload_key,
-)
-from keyss.channels.low_bits.layout import DATA_KEY_BYTES, Carriers
-from keyss.channels.low_bits.parameters import RecordParameters
+from keyss.channels.low_bits.cells import CellCipher
+from keyss.channels.low_bits.layout import DATA_KEY_BYTES, LowBitsRoom
+from keyss.channels.low_bits.parameters import Parameters, key_cipher, parameter_cipher
 from keyss.channels.low_bits.salts import salt, salt_rows
-from keyss.channels.low_bits.spread import chunk_bytes
+from keyss.channels.low_bits.spread import split_numbers
 from keyss.channels.low_bits.usable import repeated
-from keyss.core.errors import InputError, WrongKeyError
+from keyss.channels.low_bits.writing import ASSOCIATED, payload_key
+from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation
 from keyss.keys.encryption import decrypt
 
-SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
+_TWO_SECRETS = (
+    "this key opens two secrets, because the model was merged from two files: the first one comes out, and "
+    "the second one opens from its own file"
+)
 
 
 @dataclass(frozen=True)
-class LowBitsReader:
+class LowBitsReader(SaltedReader):
     """A stego model as a reader sees it; a Gaussian that occurs twice with equal low bits counts once."""
 
     identities: Bytes  # [N, 16]
     low: Bytes  # [N, B] low bits
-    salts: list[bytes]  # the likeliest first
+    salts: Sequence[bytes]
 
     @staticmethod
     def of(stego: Gaussians) -> LowBitsReader:
@@ -53,62 +59,70 @@ class LowBitsReader:
         salts = [salt(names[row], low[row]) for row in salt_rows(stego, names, low, layout)]
         return LowBitsReader(names, low, salts)
 
-    def keys(self, key: str, most: int = SALTS_TRIED) -> Iterator[DerivedKey]:
-        """What `key` becomes under each salt to be tried, the likeliest first; each takes 0.1 s."""
-        return (DerivedKey(key, KeyDerivation(salt=each)) for each in self.salts[:most])
-
     def open(self, key: str) -> Content:
-        """What `key` opens. Raises WrongKeyError and InputError.
-
-        If the first salt opens nothing others are tried, SALTS_TRIED in all: changed or added Gaussians may
-        have taken the first ones' places, and should not lock out the key.
-        """
+        """See `Reader`. Warns (KeyssWarning) if the key opens two secrets, as where two files were merged."""
         for derived in self.keys(key):
             with suppress(WrongKeyError):
-                return self.extract(derived)
+                data_key, found = self._parameters(derived)
+                content = self._content(data_key, found)
+                self._warn_of_another(key, data_key, found.salts)
+                return content
         raise WrongKeyError()
 
     def extract(self, key: DerivedKey) -> Content:
-        """The content under this key and its salt. Raises WrongKeyError and InputError.
+        """`open` after key derivation under one salt.
 
         A key that opens nothing makes the same passes over all cells, under a data key that fits nothing.
         """
-        if Carriers(0, self._width).part_bytes == 0:
+        return self._content(*self._parameters(key))
+
+    def _parameters(self, key: DerivedKey) -> tuple[bytes, Parameters]:
+        """The data key and the parameters."""
+        room = LowBitsRoom(0, self._width)
+        if room.part_bytes == 0:
             raise WrongKeyError()
-        found = self._decrypt(key_cipher(key))
-        votes = Counter(row.tobytes() for row in found).most_common(1)
+        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key))).most_common(1)
         data_key = votes[0][0] if votes else key.expand("low-bits/none", DATA_KEY_BYTES)
         parts = self._decrypt(parameter_cipher(data_key, self._width))
         if not len(parts):  # by chance the tag of a key cell fits once in 2^32
-            self._decrypt(chunk_cipher(data_key, self._width))
+            self._decrypt(CellCipher(data_key, "record", room.record_bytes(1)))
             raise WrongKeyError()
-        read = parameters.unpack(parts, chunk_bytes(self._width))
-        if isinstance(read, RecordParameters):
-            return self._records(read, data_key)
-        chunks = self._decrypt(chunk_cipher(data_key, self._width))
-        data = decrypt(payload_key(data_key), read.spread.decode(chunks, read.size), ASSOCIATED)
-        return Payload(read.method, data, read.spread.left(chunks))
+        return data_key, parameters.unpack(parts)
 
-    @property
-    def _width(self) -> int:
-        return int(self.low.shape[1])
-
-    def _records(self, found: RecordParameters, data_key: bytes) -> Records:
-        room = self._width // found.cells - TAG_BYTES
+    def _content(self, data_key: bytes, found: Parameters) -> Content:
+        room = LowBitsRoom(0, self._width).record_bytes(found.cells)
         if not 0 < found.record_bytes <= room:
             raise InputError("the hidden parameters are damaged: records larger than their cells")
-        records, copies = (
-            self._decrypt(CellCipher(data_key, label, found.record_bytes), found.cells)
-            for label in ("record", "copy")
-        )
+        records = self._decrypt(CellCipher(data_key, "record", found.record_bytes), found.cells)
+        if found.service == parameters.PAYLOAD:
+            size, codewords = parameters.unpack_codewords(found.header, found.record_bytes)
+            numbers, chunks = split_numbers(records)
+            encrypted = codewords.decode(numbers, chunks)[:size]
+            left = len(np.unique(numbers[numbers < codewords.chunks]))
+            data = decrypt(payload_key(data_key), encrypted, ASSOCIATED)
+            return Payload(found.method, data, (left, codewords.chunks))
+        copies = self._decrypt(CellCipher(data_key, "copy", found.record_bytes), found.cells)
         records = np.concatenate([records, copies[~_are_among(copies, records)]])
         if not len(records):
             raise InputError("the key is right, but nothing is left of what it opens")
         plan = RecordPlan(room, 0, found.cells)
         return Records(found.method, found.header, records, plan, np.zeros(0, np.int64))
 
+    def _warn_of_another(self, key: str, data_key: bytes, own: bytes) -> None:
+        """Try a few salts whose first bytes are none of this secret's `own`."""
+        foreign = [each for each in self.salts if each[0] not in own]
+        for each in foreign[:SALTS_TRIED]:
+            with suppress(WrongKeyError, InputError):
+                if self._parameters(DerivedKey(key, KeyDerivation(salt=each)))[0] != data_key:
+                    warnings.warn(_TWO_SECRETS, KeyssWarning, stacklevel=3)
+                    return
+
+    @property
+    def _width(self) -> int:
+        return int(self.low.shape[1])
+
     def _decrypt(self, cipher: CellCipher, cells: int = 1) -> Bytes:
-        """[M, size] what the cipher decrypts in any of the `cells` of each carrier, in order of carriers."""
+        """[M, size] the data that fit in any of the `cells` of each carrier, in the order of carriers."""
         size = self._width // cells
         found = [
             cipher.decrypt(self.identities, self.low[:, slot * size : (slot + 1) * size], slot)

@@ -1,153 +1,102 @@
-"""Filling the carriers of a cover, in random order: headers, contents, and noise in all the rest."""
+"""Filling the carriers of a cover, in random order: headers, records, and noise in all the rest."""
 
 from __future__ import annotations
 
 import hashlib
 import warnings
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import as_strided
 
-from keyss.channels.base import Bytes, Content, Payload, RecordRequest, Records
-from keyss.channels.low_bits import parameters, spread
+from keyss.channels.base import Bytes, Content, Payload, RecordPlan, RecordRequest, Records
 from keyss.channels.low_bits.cells import CellCipher
-from keyss.channels.low_bits.ciphers import (
-    ASSOCIATED,
-    chunk_cipher,
+from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, LowBitsRoom, PayloadPlan
+from keyss.channels.low_bits.parameters import (
+    PAYLOAD,
+    RECORDS,
+    Parameters,
     key_cipher,
+    pack_codewords,
     parameter_cipher,
-    payload_key,
 )
-from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, Carriers, payload_parts
-from keyss.channels.low_bits.parameters import PayloadParameters, RecordParameters
+from keyss.channels.low_bits.spread import numbered_chunks
 from keyss.channels.mixing import random_order
-from keyss.channels.writing import NOTICED
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.channels.payloads import NOTICED
+from keyss.core.errors import KeyssWarning
 from keyss.keys.derivation import DerivedKey, expand, fill
 from keyss.keys.encryption import compressed_size, encrypt, encrypted_size
 from keyss.rendering.cpu.parallel import in_blocks
 
+ASSOCIATED = b"keyss/v1/low-bits"  # authenticated with a payload
 _BLOCK = 1 << 13  # records at a time
+
+Rows = npt.NDArray[np.int64]
 
 
 class Writer:
     """The low bits of carriers with identities `names` [C, 16], each of `width` bytes.
 
-    `entropy`: 32 bytes that nobody else knows.
+    `entropy`: 32 bytes that nobody else knows. `salts`: the first byte of each salt.
     """
 
-    def __init__(self, names: Bytes, width: int, entropy: bytes) -> None:
-        self._entropy = entropy
-        self._room = Carriers(len(names), width)
-        self.order = random_order(
-            entropy, "low-bits/order", len(names)
-        )  # [C] carriers; what follows is in this order
+    def __init__(self, names: Bytes, width: int, entropy: bytes, salts: bytes = b"") -> None:
+        self._entropy, self._salts = entropy, salts
+        self._room = LowBitsRoom(len(names), width)
+        self.order = random_order(entropy, "low-bits/order", len(names))  # [C] carriers, as in all below
         self._names = names[self.order]
         self.table = np.empty((len(names), width), np.uint8)
         fill(entropy, "low-bits/noise", self.table)
         self._next = 0  # carrier that is not in use yet
 
-    def payloads(self, contents: Sequence[tuple[Sequence[DerivedKey], Payload]], gaussians: int) -> None:
-        """Every secret fills its share of the carriers. `gaussians`: of the model, for what is said of it."""
-        carriers, width = self._room.carriers, self._room.width
-        sizes = [encrypted_size(compressed_size(content.data)) for _, content in contents]
-        parts, as_alone = payload_parts([spread.parts_alone(carriers, width, size) for size in sizes])
-        start = 0
-        for index, (keys, content) in enumerate(contents):
-            # Spread as its own size asks: what a key shows must not depend on the sizes of other secrets.
-            plan = spread.plan_spread(carriers, parts[index], width, sizes[index])
-            if plan is None:
-                usable = carriers / gaussians
-                raise UsageError(spread.too_small(gaussians, usable, sizes[index], len(contents), width))
-            self._next, end = start, start + carriers // parts[index]
-            data_key = self._data_key(index)
-            packed = PayloadParameters(content.method, sizes[index], plan).pack()
-            self._header(keys, data_key, packed)
-            encrypted = encrypt(payload_key(data_key), content.data, ASSOCIATED, size=sizes[index])
-            self._whole(chunk_cipher(data_key, width), plan.encode(encrypted, end - self._next))
-            start = end
-        if not as_alone:
+    def write(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]]) -> None:
+        """Headers in the first carriers, records in the others. Raises UsageError for too large payloads.
+
+        Keys: of each secret one under each salt.
+        """
+        payloads = [each for _, each in contents if isinstance(each, Payload)]
+        records = [each for _, each in contents if isinstance(each, Records)]
+        if payloads and records:
+            raise ValueError("expected payloads or records in one model, got both")
+        if payloads:
+            sizes = [encrypted_size(compressed_size(each.data)) for each in payloads]
+            plans, as_alone = self._room.plan_payloads(sizes)
+            records = [
+                self._chunked(index, *each)
+                for index, each in enumerate(zip(payloads, plans, sizes, strict=True))
+            ]
+        else:
+            requests = [
+                RecordRequest(len(each.records), each.records.shape[1], len(each.header)) for each in records
+            ]
+            as_alone = self._room.lie_as_alone([each.plan for each in records], requests)
+        service = PAYLOAD if payloads else RECORDS
+        for index, ((keys, _), each) in enumerate(zip(contents, records, strict=True)):
+            self._header(index, keys, each, service)
+        self._place_all(records, self._room.set_aside([len(each.header) for each in records], as_alone))
+        if not as_alone and len(contents) > 1:
             warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
 
-    def records(self, contents: Sequence[tuple[Sequence[DerivedKey], Records]]) -> None:
-        """Headers in the first carriers, records in the others; see `layout`."""
-        requests = [
-            RecordRequest(len(content.records), content.records.shape[1], len(content.header))
-            for _, content in contents
-        ]
-        plans = [content.plan for _, content in contents]
-        arrangement = self._room.arrangement(plans, requests)
-        for index, (keys, content) in enumerate(contents):
-            cells, size = content.plan.cells_per_carrier, content.records.shape[1]
-            packed = RecordParameters(content.method, cells, size, content.header).pack()
-            self._header(keys, self._data_key(index), packed)
-        carriers = np.arange(arrangement.header_carriers, self._room.carriers)
-        divided = [i for i, plan in enumerate(plans) if plan.cells_per_carrier > 1]
-        whole = [i for i, plan in enumerate(plans) if plan.cells_per_carrier == 1]
-        # Those that divide carriers lie in random cells of all carriers, as each would alone; what they leave
-        # untouched is random too.
-        if divided:
-            cells = plans[divided[0]].cells_per_carrier
-            free = random_order(self._entropy, "low-bits/cells", cells * len(carriers))
-            touched = np.zeros(len(carriers), bool)
-            for index in divided:
-                count = len(contents[index][1].records) + len(contents[index][1].copied)
-                own, free = free[:count], free[count:]
-                order, slots = np.divmod(own, cells)
-                self._place(index, contents[index][1], carriers[order], slots)
-                touched[order] = True
-            carriers = carriers[~touched]
-        for index in whole:
-            count = len(contents[index][1].records) + len(contents[index][1].copied)
-            own, carriers = carriers[:count], carriers[count:]
-            self._place(index, contents[index][1], own, np.zeros(count, np.int64))
-        if not arrangement.as_alone:
-            warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
-
-    def _place(
-        self, index: int, content: Records, rows: npt.NDArray[np.int64], slots: npt.NDArray[np.int64]
-    ) -> None:
-        """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
-        count, width = content.plan.cells_per_carrier, self._room.width
-        cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
-        split = len(content.records)
-        every = np.arange(split)
-        for label, chosen, part in (
-            ("record", every, slice(split)),
-            ("copy", content.copied, slice(split, None)),
-        ):
-            cipher = CellCipher(self._data_key(index), label, content.records.shape[1])
-            place = partial(self._place_some, cipher, content.records, chosen, cells, rows[part], slots[part])
-            in_blocks(place, len(chosen), _BLOCK)
-
-    def _place_some(
-        self,
-        cipher: CellCipher,
-        records: Bytes,
-        chosen: npt.NDArray[np.int64],
-        cells: Bytes,
-        rows: npt.NDArray[np.int64],
-        slots: npt.NDArray[np.int64],
-        start: int,
-        stop: int,
-    ) -> None:
-        """From `start` to `stop` of the `chosen` [R] records, in `cells` [carriers, slots, bytes]."""
-        own, which = rows[start:stop], slots[start:stop]
-        encrypted = cipher.encrypt(self._names[own], records[chosen[start:stop]], which)
-        cells[own, which, : cipher.cell_bytes] = encrypted
+    def _chunked(self, index: int, payload: Payload, plan: PayloadPlan, size: int) -> Records:
+        """A payload as the records of its encrypted chunks."""
+        encrypted = encrypt(payload_key(self._data_key(index)), payload.data, ASSOCIATED, size=size)
+        chunks = numbered_chunks(plan.codewords, encrypted, plan.cells)
+        cells = RecordPlan(chunks.shape[1], 0, plan.cells_per_carrier)
+        header = pack_codewords(size, plan.codewords)
+        return Records(payload.method, header, chunks, cells, np.zeros(0, np.int64))
 
     def _data_key(self, index: int) -> bytes:
         return expand(self._entropy, f"low-bits/data-key/{index}", DATA_KEY_BYTES)
 
-    def _header(self, keys: Sequence[DerivedKey], data_key: bytes, packed: bytes) -> None:
+    def _header(self, index: int, keys: Sequence[DerivedKey], content: Records, service: int) -> None:
+        data_key, width = self._data_key(index), self._room.width
         for key in keys:
             copies = np.frombuffer(data_key * KEY_COPIES, np.uint8).reshape(KEY_COPIES, -1)
             self._whole(key_cipher(key), copies)
-        parts = parameters.parts_of(packed, self._room.width)
-        self._whole(parameter_cipher(data_key, self._room.width), parts)
+        cells, size = content.plan.cells_per_carrier, content.records.shape[1]
+        parameters = Parameters(service, content.method, self._salts, cells, size, content.header)
+        self._whole(parameter_cipher(data_key, width), parameters.parts(width))
 
     def _whole(self, cipher: CellCipher, data: Bytes) -> None:
         """A carrier for each row of `data`; what a cell does not need of it stays noise."""
@@ -155,9 +104,58 @@ class Writer:
         self.table[rows, : cipher.cell_bytes] = cipher.encrypt(self._names[rows], data)
         self._next += len(data)
 
+    def _place_all(self, contents: Sequence[Records], headers: int) -> None:
+        """Records that divide carriers in random cells of all carriers, as each secret's would alone.
+
+        The others in carriers that these leave untouched, which are random too.
+        """
+        carriers = np.arange(headers, self._room.carriers)
+        counts = [len(each.records) + len(each.copied) for each in contents]
+        divided = [i for i, each in enumerate(contents) if each.plan.cells_per_carrier > 1]
+        if divided:
+            cells = contents[divided[0]].plan.cells_per_carrier
+            free = random_order(self._entropy, "low-bits/cells", cells * len(carriers))
+            touched = np.zeros(len(carriers), bool)
+            for index in divided:
+                own, free = free[: counts[index]], free[counts[index] :]
+                order, slots = np.divmod(own, cells)
+                self._place(index, contents[index], carriers[order], slots)
+                touched[order] = True
+            carriers = carriers[~touched]
+        for index in (i for i in range(len(contents)) if i not in divided):
+            own, carriers = carriers[: counts[index]], carriers[counts[index] :]
+            self._place(index, contents[index], own, np.zeros(len(own), np.int64))
+
+    def _place(self, index: int, content: Records, rows: Rows, slots: Rows) -> None:
+        """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
+        count, width = content.plan.cells_per_carrier, self._room.width
+        cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
+        split = len(content.records)
+        self._place_some(index, "record", content.records, cells, rows[:split], slots[:split])
+        copies = content.records[content.copied]
+        self._place_some(index, "copy", copies, cells, rows[split:], slots[split:])
+
+    def _place_some(
+        self, index: int, label: str, records: Bytes, cells: Bytes, rows: Rows, slots: Rows
+    ) -> None:
+        """`records` [R, size] in `cells` [carriers, slots, bytes]."""
+        cipher = CellCipher(self._data_key(index), label, records.shape[1])
+
+        def place(start: int, stop: int) -> None:
+            own, which = rows[start:stop], slots[start:stop]
+            encrypted = cipher.encrypt(self._names[own], records[start:stop], which)
+            cells[own, which, : cipher.cell_bytes] = encrypted
+
+        in_blocks(place, len(records), _BLOCK)
+
+
+def payload_key(data_key: bytes) -> bytes:
+    """The key that encrypts a payload, before it is cut into chunks."""
+    return expand(data_key, "payload-key", 32)
+
 
 def digest(content: Content) -> bytes:
-    """32 bytes that say which content it is."""
+    """32 bytes that identify a content."""
     if isinstance(content, Payload):
         return hashlib.sha256(content.data).digest()
     state = hashlib.sha256(content.header)

@@ -7,9 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from keyss.channels import APPENDED, LOW_BITS, TYPICAL_SHARE, Channel, LowBitsCover, PreparedCover, Room
+from keyss.channels import (
+    APPENDED,
+    LOW_BITS,
+    TYPICAL_SHARE,
+    Channel,
+    LowBitsCover,
+    LowBitsRoom,
+    PreparedCover,
+    Room,
+)
 from keyss.channels.low_bits.bits import Layout
-from keyss.channels.low_bits.layout import Carriers
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
@@ -54,7 +62,7 @@ class RecordRoom:
 
     gaussians: int  # of the cover
     sh_degree: int  # of the cover
-    room: Carriers
+    room: LowBitsRoom
     prepared: LowBitsCover | None = None  # None: not fitted yet
     refit_share = 1.0  # of the Gaussians that fit before a refit
     more_room = _ANY
@@ -71,20 +79,20 @@ class RecordRoom:
         if cover is not None:
             cover = of_degree(cover, degree, entropy)
         layout = Layout(degree) if cover is None else Layout.of(cover)
-        if largest_degree(Carriers(0, layout.width).record_bytes(1)) is None:
+        if largest_degree(LowBitsRoom(0, layout.width).record_bytes(1)) is None:
             unit = "" if layout.quats else " with unit quaternions"
             raise UsageError(
                 f"a model of SH degree {degree}{unit} has no room for anything in its low bits; "
                 f"`sh_degree={1 if layout.quats else 2}` makes room, {_ANY}"
             )
         if cover is None:
-            return RecordRoom(count, degree, Carriers(int(TYPICAL_SHARE * count), layout.width))
+            return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
         try:
             prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
         except InputError as error:
             others = "" if options.dither else "`dither=True` may give it others, "
             raise InputError(f"{error}; {others}{_ANY}") from error
-        room = Carriers(prepared.carriers, prepared.layout.width)
+        room = LowBitsRoom(prepared.carriers, prepared.layout.width)
         return RecordRoom(len(cover), degree, room, prepared)
 
     @property

@@ -1,16 +1,15 @@
 /** Packets: 6 bytes, and which ones they are, in words of 84 bits; `keyss.channels.appended.packets` on the other side. */
 import { ecb } from '@noble/ciphers/aes.js';
 import { mostFrequent } from '../../core/bytes.ts';
-import { tooMuchLost } from '../../core/errors.ts';
 import { mixAt } from '../../core/words.ts';
-import { decodeCodeword } from '../reed_solomon.ts';
+import type { Codewords } from '../reed_solomon.ts';
 
 const PACKET_BYTES = 6;
 const NUMBER_BITS = 20;
-const LENGTH_BITS = 8; // of the packets of a block that hold data
-const MOST_DATA = 150; // packets of a block that hold data
+const DATA_BITS = 8; // of a header: packets of a codeword that hold data
+const MOST_DATA = 150;
 const MOST_CHUNKS = 255;
-const MOST_BLOCKS = Math.min(1 << (NUMBER_BITS - LENGTH_BITS), Math.floor((1 << NUMBER_BITS) / MOST_CHUNKS)) - 1;
+const MOST_CODEWORDS = Math.min(1 << (NUMBER_BITS - DATA_BITS), Math.floor((1 << NUMBER_BITS) / MOST_CHUNKS)) - 1;
 const [LEFT, DEVIATIONS] = [0.72, 4.5]; // of packets that may be relied upon
 const AGREEING_HEADERS = 3; // one or two may be there by chance
 
@@ -39,11 +38,10 @@ export function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: U
   return { count, blocks, tags };
 }
 
-/** Calls `found` with the number of each packet among the words and its row. */
-export function readPackets(
-  key: Uint8Array, { count, blocks, tags }: TaggedWords, found: (number: number, row: number) => void,
-): void {
-  if (!count) return;
+/** The number of each packet among the words, and its data. */
+export function readPackets(key: Uint8Array, { count, blocks, tags }: TaggedWords): [number, Uint8Array][] {
+  const found: [number, Uint8Array][] = [];
+  if (!count) return found;
   const encrypted = ecb(key, { disablePadding: true }).encrypt(blocks); // as a pseudorandom function
   const view = new DataView(encrypted.buffer, encrypted.byteOffset);
   const state = new Uint32Array(2);
@@ -53,54 +51,22 @@ export function readPackets(
     const number = (((tags[2 * row + 1] ^ (high >>> 28)) << 16) | (tag >>> 16)) >>> 0;
     [state[0], state[1]] = [number, 0];
     mixAt(state, 0);
-    if (state[1] >>> 16 === (tag & 0xffff)) found(number, row);
+    if (state[1] >>> 16 === (tag & 0xffff)) found.push([number, blocks.subarray(16 * row, 16 * row + PACKET_BYTES)]);
   }
+  return found;
 }
 
 /** The number that most headers tell; null where there are too few. */
 export function readHeader(key: Uint8Array, words: TaggedWords): number | null {
-  const numbers: number[] = [];
-  readPackets(key, words, (number) => numbers.push(number));
-  const [value, count] = mostFrequent(numbers) ?? [0, 0];
+  const [value, count] = mostFrequent(readPackets(key, words).map(([number]) => number)) ?? [0, 0];
   return count >= AGREEING_HEADERS ? value : null;
 }
 
-/** Packets of a payload in blocks of one size. */
-export class Blocks {
-  private constructor(readonly count: number, readonly data: number) {}
-
-  /** null where no writer would have written this header. */
-  static ofHeader(header: number): Blocks | null {
-    const [count, data] = [header >> LENGTH_BITS, header & ((1 << LENGTH_BITS) - 1)];
-    return count > 0 && count <= MOST_BLOCKS && data > 0 && data <= MOST_DATA ? new Blocks(count, data) : null;
-  }
-
-  /** Packets of a block. */
-  get length(): number {
-    let length = this.data;
-    while (length * LEFT - DEVIATIONS * Math.sqrt(length * LEFT * (1 - LEFT)) < this.data) length++;
-    return Math.min(length, MOST_CHUNKS);
-  }
-
-  /** The encrypted payload. Raises InputError where too few packets are left. */
-  decode(key: Uint8Array, words: TaggedWords): Uint8Array {
-    const { count, data, length } = this;
-    const rows = new Int32Array(count * length).fill(-1);
-    readPackets(key, words, (number, row) => {
-      // Two packets with one number: one is there by chance, and both are left out.
-      if (number < rows.length) rows[number] = rows[number] === -1 ? row : -2;
-    });
-    const found = new Uint8Array(count * data * PACKET_BYTES);
-    for (let block = 0; block < count; block++) {
-      const left = new Map<number, Uint8Array>();
-      for (let index = 0; index < length; index++) {
-        const row = rows[index * count + block];
-        if (row >= 0) left.set(index, words.blocks.subarray(16 * row, 16 * row + PACKET_BYTES));
-      }
-      const decoded = decodeCodeword(left, data, length);
-      if (decoded === null) throw tooMuchLost();
-      decoded.forEach((packet, index) => found.set(packet, (index * count + block) * PACKET_BYTES));
-    }
-    return found;
-  }
+/** The codewords of a payload; null where no writer would have written this header. */
+export function codewordsOf(header: number): Codewords | null {
+  const [count, k] = [header >> DATA_BITS, header & ((1 << DATA_BITS) - 1)];
+  if (!(count > 0 && count <= MOST_CODEWORDS && k > 0 && k <= MOST_DATA)) return null;
+  let n = k;
+  while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
+  return { count, n: Math.min(n, MOST_CHUNKS), k, width: PACKET_BYTES };
 }

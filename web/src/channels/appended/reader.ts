@@ -5,11 +5,12 @@ import { type Derive, expand } from '../../keys/derivation.ts';
 import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
 import type { Payload, Reader } from '../content.ts';
-import { unframedPayload } from '../packing.ts';
+import { unpackPayload } from '../packing.ts';
+import { decoded } from '../reed_solomon.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
 } from './lattice.ts';
-import { Blocks, readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
+import { codewordsOf, readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
 import { countPilots, type Found, LEAST, ONE_IN, readPilots } from './pilots.ts';
 
 // Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations more of
@@ -48,12 +49,9 @@ export class AppendedReader implements Reader {
     const secret = await derive(key, this.salt);
     const [headers, packets, data] = ['header', 'packets', 'data'].map((use) => expand(secret, `appended/${use}`, 32));
     const header = readHeader(headers, this.words);
-    const blocks = header === null ? null : Blocks.ofHeader(header);
-    if (blocks === null) {
-      readPackets(packets, this.words, () => undefined); // as a key that opens something does
-      return null;
-    }
-    return unframedPayload(await decrypted(data, blocks.decode(packets, this.words), ASSOCIATED));
+    const codewords = header === null ? null : codewordsOf(header);
+    const found = readPackets(packets, this.words); // also by a key that opens nothing
+    return codewords && unpackPayload(await decrypted(data, decoded(codewords, found), ASSOCIATED));
   }
 }
 

@@ -43,15 +43,14 @@ function sogExtent({ mins, maxs }: SogCodes, axis: number): number {
 }
 
 function spzFields(codes: SpzCodes): Field[] {
-  const { count, version, fractionalBits, scales, rotations } = codes;
+  const { count, version, fractionalBits, scales } = codes;
   const bits = Uint8Array.from({ length: count }, (_, row) => {
     const size = (middle(scales[3 * row], scales[3 * row + 1], scales[3 * row + 2]) / 16 - 10) * LOG2_E;
     return fitting(size + fractionalBits + SHARE);
   });
   const places = AXES.map((axis) => ({ levels: levels(count, (row) => positionCode(codes, row, axis)), bits }));
-  const part = (row: number, index: number): number =>
-    version === 2 ? rotations[3 * row + index] : rotationPart(rotationWord(codes, row), index);
-  return [...places, ...turns(count, version === 2 ? 1 : 3, part)];
+  if (version === 2) return places;
+  return [...places, ...turns(count, 3, (row, index) => rotationPart(rotationWord(codes, row), index))];
 }
 
 function sogFields(codes: SogCodes): Field[] {

@@ -10,7 +10,7 @@ import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
 import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
-import { unframedPayload } from '../packing.ts';
+import { unpackPayload } from '../packing.ts';
 import { lastBits } from './fields.ts';
 import { findHeader, order, Room, ZONE_RATE } from './layout.ts';
 import { BLOCK, bytesOf, matrix, products } from './syndromes.ts';
@@ -57,7 +57,7 @@ export class CodesReader implements Reader {
     const { rate, start, size } = header ?? { rate: USUAL_RATE, start: 0, size: most };
     const encrypted = bytesOf(this.held, rate, start, size);
     try {
-      return unframedPayload(await decrypted(expand(secret, 'codes/data', 32), encrypted, ASSOCIATED));
+      return unpackPayload(await decrypted(expand(secret, 'codes/data', 32), encrypted, ASSOCIATED));
     } catch (error) {
       if (header === null) return null;
       throw error;

@@ -5,44 +5,32 @@
 import { chacha20 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
-import { ascii } from '../../core/bytes.ts';
+import { ascii, viewOf } from '../../core/bytes.ts';
 import { mixAt, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
 import { type Carriers, chosen } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
-import { bitsOf, COLUMNS, dithers, type Lattice, LEVELS, rank, readBits, seedsOf } from './lattice.ts';
+import { COLUMNS, dithers, rank, readBits, seedsOf } from './lattice.ts';
 
 export const FILE_KEY_BYTES = 5;
 export const SHARES = 256; // parts of the carriers, of which a payload has some
 export const IDLE = 1 / 32; // unit of the share of carriers that were left alone
 const PARTITION_BYTES = 2;
 const CHECK_BYTES = 2;
-export const HEADER_BYTES = 14;
+export const HEADER_BYTES = 13;
 const ROUNDS = 20;
 const TRIES = 3; // to tell salts that were lost
 const [LEAST_TRUST, MOST_TRUST] = [0.02, 0.95];
 const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
-const MERGED = [0.4, 0.2];
+const PLACES = 64; // Gaussians of a header under each salt
 const PILOTS = 16; // numbers of each salt's part that are known beforehand
 const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
-const PUBLIC = sha256(ascii('keyss/v1/robust-places'));
+const PUBLIC = sha256(ascii('keyss/v1/colours-places'));
 const [PAD_LOW, PAD_HIGH] = [0x1e98df25, 0x9fb21c65];
 
-/** How headers are written: in how many Gaussians for each salt, and by a lattice that gives as many bits to all. */
-export interface Kind {
-  readonly places: number;
-  readonly lattice: Lattice;
-}
-
-const KINDS: readonly Kind[] = [
-  { places: 64, lattice: { level: LEVELS - 1, depth: 1 } },
-  { places: 96, lattice: { level: LEVELS - 1, depth: 2 } },
-];
-const USUAL = [0.65];
-/** How a header is looked at: of which kind, and how likely its places, and those after them, hold what was written. */
-export const VIEWS: readonly (readonly [Kind, readonly number[]])[] = [
-  [KINDS[0], USUAL], [KINDS[1], USUAL], [KINDS[1], MERGED],
-];
+// How likely a place, and the ones after it, hold what was written: in an ordinary model; in two merged ones.
+const [USUAL, MERGED] = [[0.65], [0.4, 0.2]];
+export const VIEWS: readonly (readonly number[])[] = [USUAL, MERGED];
 
 const fountain = new Fountain(8 * HEADER_BYTES, NOISY);
 
@@ -50,17 +38,11 @@ const fountain = new Fountain(8 * HEADER_BYTES, NOISY);
 export interface Header {
   readonly fileKey: Uint8Array;
   readonly partition: Uint8Array; // by which carriers are shared out
-  readonly lattice: Lattice;
   readonly first: number; // of SHARES that the payload has,
   readonly last: number; // this one included
   readonly bucket: number;
   readonly idle: number; // share of its carriers that hold nothing, in units of IDLE
   readonly bits: Uint8Array; // of all this, as they were read
-}
-
-/** Of what depth the header of a payload is. */
-export function kindOf(header: Header): Kind {
-  return KINDS[Math.min(KINDS.length, header.lattice.depth) - 1];
 }
 
 /** Rows of the carriers that the payload has. */
@@ -79,12 +61,12 @@ export function bucketBytes(bucket: number): number {
   return (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1);
 }
 
-/** The header of this kind whose parts lie under these secrets, if there is one. */
+/** The header whose parts lie under these secrets, if there is one. */
 export function readHeader(
-  secrets: readonly Uint8Array[], check: Uint8Array, index: Index, kind: Kind, view: readonly number[],
+  secrets: readonly Uint8Array[], check: Uint8Array, index: Index, view: readonly number[],
 ): Header | null {
   if (!index.size || !secrets.length) return null;
-  const parts = index.parts(secrets, kind, view, kind.places);
+  const parts = index.parts(secrets, view);
   const seeds = Uint32Array.from(parts.flatMap((part) => [...part.seeds]));
   const odds = oddsOf(parts, secrets.length);
   let trusts = odds.map(trust);
@@ -105,9 +87,8 @@ export function readHeader(
 /** How far what lies under these secrets agrees with the header: 0 by chance. */
 export function headerAgreement(header: Header, secrets: readonly Uint8Array[], index: Index): number {
   if (!index.size) return 0;
-  const kind = kindOf(header);
   const sum = (values: Float64Array): number => values.reduce((before, each) => before + each, 0);
-  return index.parts(secrets, kind, USUAL, kind.places).reduce((before, { seeds, hints, pilots }) => {
+  return index.parts(secrets, USUAL).reduce((before, { seeds, hints, pilots }) => {
     return before + sum(pilots) + sum(signed(hints, fountain.encode(header.bits, seeds)));
   }, 0);
 }
@@ -123,19 +104,17 @@ function unpackHeader(bits: Uint8Array, check: Uint8Array): Header | null {
   const plain = data.subarray(0, HEADER_BYTES - CHECK_BYTES);
   const tag = hmac(sha256, check, plain);
   if (data[HEADER_BYTES - 2] !== tag[0] || data[HEADER_BYTES - 1] !== tag[1]) return null;
-  const [a, b, c, d, e] = data.subarray(FILE_KEY_BYTES + PARTITION_BYTES);
+  const fields = viewOf(data).getUint32(FILE_KEY_BYTES + PARTITION_BYTES); // 3 bits are unused
   const found = {
     fileKey: data.slice(0, FILE_KEY_BYTES),
     partition: data.slice(FILE_KEY_BYTES, FILE_KEY_BYTES + PARTITION_BYTES),
-    // 6 bits of level, 2 unused, 3 of depth, 8 each of first, last and bucket, 5 of idle
-    lattice: { level: a >> 2, depth: b >> 5 },
-    first: ((b & 31) << 3) | (c >> 5),
-    last: ((c & 31) << 3) | (d >> 5),
-    bucket: ((d & 31) << 3) | (e >> 5),
-    idle: e & 31,
+    first: (fields >>> 21) & 255,
+    last: (fields >>> 13) & 255,
+    bucket: (fields >>> 5) & 255,
+    idle: fields & 31,
     bits: bits.slice(),
   };
-  return (a & 3) !== 0 || found.lattice.depth === 0 || found.last < found.first ? null : found;
+  return fields >>> 29 !== 0 || found.last < found.first ? null : found;
 }
 
 /** Bytes of bits, the highest first. */
@@ -164,10 +143,8 @@ export class Index {
   private readonly alike: Uint32Array; // [P] how many have it
 
   constructor(private readonly carriers: Carriers) {
-    const { lattice } = KINDS[KINDS.length - 1];
-    const bits = bitsOf(lattice, carriers);
     const hashes = rank(PUBLIC, 'places', carriers.names);
-    const order = sortingOrder(hashes).filter((row) => bits[row] === lattice.depth); // all but impossible sizes
+    const order = sortingOrder(hashes);
     const starts = runs(hashes, order);
     this.first = starts.slice(0, -1).map((start) => order[start]);
     this.alike = starts.slice(1).map((end, at) => end - starts[at]);
@@ -178,9 +155,9 @@ export class Index {
     return this.first.length;
   }
 
-  /** [count] names that this secret's header is in, or those so many behind. */
-  places(secret: Uint8Array, count: number, behind = 0): Uint32Array {
-    const key = expand(secret, 'robust/places', 32);
+  /** [count] places of the names that this secret's header is in, or those so many behind. */
+  private places(secret: Uint8Array, count: number, behind: number): Uint32Array {
+    const key = expand(secret, 'colours/places', 32);
     const points = wordsOf(chacha20(key, new Uint8Array(12), new Uint8Array(8 * count)));
     const found = new Uint32Array(count);
     for (let at = 0; at < count; at++) {
@@ -189,22 +166,20 @@ export class Index {
     return found;
   }
 
-  /** [...] a carrier with each name. */
-  rows(places: Uint32Array): Uint32Array {
-    return places.map((place) => this.first[place]);
+  /** [PLACES] a carrier with each name that this secret's header is in. */
+  rows(secret: Uint8Array): Uint32Array {
+    return this.places(secret, PLACES, 0).map((place) => this.first[place]);
   }
 
-  /** What the first `most` Gaussians of each salt hold, if it is one. */
-  parts(secrets: readonly Uint8Array[], { lattice }: Kind, view: readonly number[], most: number): Part[] {
-    const bits = COLUMNS * lattice.depth;
+  /** What the first `count` Gaussians of each salt hold, if it is one. */
+  parts(secrets: readonly Uint8Array[], view: readonly number[], count = PLACES): Part[] {
     return view.flatMap((sure, behind) => secrets.map((secret, salt) => {
-      const places = this.places(secret, most, behind);
-      const own = chosen(this.carriers, this.rows(places));
-      const words = seedsOf(rank(secret, 'header-seeds', own.names), new Uint8Array(most).fill(bits));
-      const full = new Uint8Array(most).fill(lattice.depth);
-      const read = readBits(lattice, dithers(secret, own.names), own, new Float64Array(most), full);
+      const places = this.places(secret, count, behind);
+      const own = chosen(this.carriers, places.map((place) => this.first[place]));
+      const words = seedsOf(rank(secret, 'header-seeds', own.names));
+      const read = readBits(dithers(secret, own.names), own, new Float64Array(count));
       const hints = Float64Array.from(read, (ratio, bit) => {
-        const at = Math.floor(bit / bits);
+        const at = Math.floor(bit / COLUMNS);
         const certain = (sure * (1 - own.doubt[at])) / this.alike[places[at]];
         return Math.tanh(ratio / 2) * certain * (isPadded(words, bit) ? -1 : 1);
       });
@@ -212,14 +187,11 @@ export class Index {
     }));
   }
 
-  /** How much likelier what is known beforehand is with a header than without: a logarithm. */
+  /** How much likelier the pilots are with a header than without: a logarithm. */
   promise(secrets: readonly Uint8Array[]): number {
     if (!this.size || !secrets.length) return -Infinity;
-    return Math.max(...KINDS.map((kind) => {
-      const parts = this.parts(secrets, kind, USUAL, PILOTS / (COLUMNS * kind.lattice.depth));
-      const odds = oddsOf(parts, secrets.length);
-      return odds.reduce((sum, each) => sum + Math.log1p(Math.exp(Math.max(-50, Math.min(50, each)))), 0);
-    }));
+    const odds = oddsOf(this.parts(secrets, USUAL, PILOTS / COLUMNS), secrets.length);
+    return odds.reduce((sum, each) => sum + Math.log1p(Math.exp(Math.max(-50, Math.min(50, each)))), 0);
   }
 
   /** The first place whose hash is at least this word; `size` where there is none. */

@@ -2,26 +2,27 @@
  * What a key opens in the colours of a model: bytes that survive other formats (docs/channels.md).
  * `keyss.channels.colours.reading` on the other side.
  */
-import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { sha256 } from '@noble/hashes/sha2.js';
-import { ascii, joined, viewOf } from '../../core/bytes.ts';
-import { tooMuchLost } from '../../core/errors.ts';
+import { ascii, joined } from '../../core/bytes.ts';
+import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { namesakes } from '../../core/words.ts';
 import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
+import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
 import type { Payload, Reader } from '../content.ts';
 import { unpackPayload } from '../packing.ts';
 import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
 import { Fountain } from './fountain.ts';
 import {
-  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, Index, kindOf, ownRows, packBits, readHeader,
-  SHARES, VIEWS,
+  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, Index, ownRows, packBits, readHeader, SHARES,
+  VIEWS,
 } from './header.ts';
-import { bitsOf, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf } from './lattice.ts';
+import { COLUMNS, dithers, rank, readBits, seedsOf } from './lattice.ts';
 import { saltsOf } from './salts.ts';
 
-const STATIC_SALT = sha256(ascii('keyss/v1/robust-static')).slice(0, SALT_BYTES);
+const ASSOCIATED = ascii('keyss/v1/colours');
+const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SALT_BYTES);
 // Shares of carriers that may hold something else: in ordinary files, in merged ones.
 const CHANGED = [0.03, 0.5];
 const ROUNDS = 60;
@@ -55,14 +56,14 @@ export class ColoursReader implements Reader {
   /** What `key` opens, null for nothing. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const masters = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
-    const fixed = expand(masters[0], 'robust/static', 32);
-    const secrets = masters.slice(1).map((each) => expand(each, 'robust/header', 32));
-    const data = this.read({ fixed, secrets, check: expand(fixed, 'robust/check', 32) });
+    const fixed = expand(masters[0], 'colours/static', 32);
+    const secrets = masters.slice(1).map((each) => expand(each, 'colours/header', 32));
+    const data = await this.read({ fixed, secrets, check: expand(fixed, 'colours/check', 32) });
     return data && unpackPayload(data);
   }
 
   /** The payload that a derived key opens; a key that opens nothing makes about the work of one that does. */
-  read(derived: Derived): Uint8Array | null {
+  async read(derived: Derived): Promise<Uint8Array | null> {
     const { secrets, check } = derived;
     const promises: { offset: number; promise: number }[] = [];
     for (const [offset, index] of this.indices()) promises.push({ offset, promise: index.promise(secrets) });
@@ -70,8 +71,8 @@ export class ColoursReader implements Reader {
     const best = promises.slice(0, BEST).map(({ offset }) => ({ offset, index: new Index(carriersOf(this.numbers, offset)) }));
     const found = new Map<string, Header>();
     for (const { index } of best) {
-      for (const [kind, view] of VIEWS) {
-        const header = readHeader(secrets, check, index, kind, view);
+      for (const view of VIEWS) {
+        const header = readHeader(secrets, check, index, view);
         if (header !== null) found.set(header.bits.join(''), header);
       }
     }
@@ -84,15 +85,15 @@ export class ColoursReader implements Reader {
       }
     }
     if (found.size === 0) {
-      payload(NOTHING, derived.fixed, carriersOf(this.numbers, 0), CHANGED[0], ROUNDS / 4);
+      await payload(NOTHING, derived.fixed, carriersOf(this.numbers, 0), CHANGED[0], ROUNDS / 4);
       return null;
     }
     const carriers = this.refined(header, secrets, offset);
     const index = new Index(carriers);
-    const taken = new Set(secrets.flatMap((each) => [...index.rows(index.places(each, kindOf(header).places))]));
+    const taken = new Set(secrets.flatMap((each) => [...index.rows(each)]));
     const free = chosen(carriers, Uint32Array.from({ length: carriers.count }, (_, row) => row).filter((row) => !taken.has(row)));
     for (const changed of CHANGED) {
-      const data = payload(header, derived.fixed, free, changed, ROUNDS);
+      const data = await payload(header, derived.fixed, free, changed, ROUNDS);
       if (data !== null) return data;
     }
     throw tooMuchLost();
@@ -132,7 +133,6 @@ export class ColoursReader implements Reader {
 const NOTHING: Header = {
   fileKey: new Uint8Array(FILE_KEY_BYTES),
   partition: new Uint8Array(2),
-  lattice: { level: LEVELS - 1, depth: 1 },
   first: 0,
   last: SHARES / 4 - 1,
   bucket: 64,
@@ -141,29 +141,21 @@ const NOTHING: Header = {
 };
 
 /** What the header's data key decrypts, or null. */
-function payload(
+async function payload(
   header: Header, fixed: Uint8Array, carriers: Carriers, changed: number, rounds: number,
-): Uint8Array | null {
+): Promise<Uint8Array | null> {
   const own = chosen(carriers, ownRows(header, carriers));
-  const [size, key] = [bucketBytes(header.bucket), expand(joined(fixed, header.fileKey), 'robust/data-key', 32)];
-  const bits = bitsOf(header.lattice, own);
-  if (!own.count || 8 * size > MOST_RATE * bits.reduce((sum, each) => sum + each, 0)) return null;
+  const [size, key] = [bucketBytes(header.bucket), expand(joined(fixed, header.fileKey), 'colours/data-key', 32)];
+  if (!own.count || 8 * size > MOST_RATE * COLUMNS * own.count) return null;
   const garbage = Math.min(0.9, header.idle * IDLE + changed);
   const alike = namesakes(rank(header.partition, 'partition', own.names));
   const doubt = own.doubt.map((each, row) => 1 - ((1 - garbage) * (1 - each)) / alike[row]);
-  const ratios = readBits(header.lattice, dithers(key, own.names), own, doubt, bits);
-  const seeds = seedsOf(rank(key, 'seeds', own.names), bits.map((each) => COLUMNS * each));
-  const code = new Fountain(8 * size);
-  return decrypted(key, packBits(code.likeliest(seeds, ratios, rounds).subarray(0, 8 * size)));
-}
-
-/** The payload; null where anything at all is not as it was. */
-function decrypted(dataKey: Uint8Array, encrypted: Uint8Array): Uint8Array | null {
+  const ratios = readBits(dithers(key, own.names), own, doubt);
+  const bits = new Fountain(8 * size).likeliest(seedsOf(rank(key, 'seeds', own.names)), ratios, rounds);
   try {
-    const plain = chacha20poly1305(expand(dataKey, 'robust/payload', 32), new Uint8Array(12)).decrypt(encrypted);
-    const length = viewOf(plain).getUint32(0, true);
-    return length <= plain.length - 4 ? plain.slice(4, 4 + length) : null;
-  } catch {
-    return null;
+    return await decrypted(key, packBits(bits.subarray(0, 8 * size)), ASSOCIATED);
+  } catch (error) {
+    if (error instanceof InputError) return null;
+    throw error;
   }
 }

@@ -15,7 +15,7 @@ const NOISE = [
 ];
 const UNCHANGED = 4; // of these numbers: opacity, ratios and red
 const MOST_CELLS = 30_000;
-const LABEL = ascii('keyss/v1/robust-salt');
+const LABEL = ascii('keyss/v1/colours-salt');
 const PUBLIC = sha256(LABEL);
 
 /** Up to 16 salts of 16 bytes. */

@@ -2,6 +2,7 @@
 import { ecb } from '@noble/ciphers/aes.js';
 import { expand } from '../../keys/derivation.ts';
 
+export const TAG_BYTES = 4;
 const BLOCK = 16; // of AES, and an identity
 const CELLS = 1 << 14; // at a time
 
@@ -18,8 +19,8 @@ export class CellCipher {
   private readonly seedKey: Uint8Array;
   private readonly streamKey: Uint8Array;
 
-  constructor(secret: Uint8Array, label: string, readonly size: number, private readonly tagBytes = 4) {
-    this.cellBytes = tagBytes + size;
+  constructor(secret: Uint8Array, label: string, readonly size: number) {
+    this.cellBytes = TAG_BYTES + size;
     [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) =>
       expand(secret, `${label}/${use}`, 32),
     );
@@ -39,14 +40,14 @@ export class CellCipher {
     found: Found, names: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number,
     start: number, end: number,
   ): void {
-    const { size, tagBytes } = this;
+    const { size } = this;
     const count = end - start;
     const from = (cell: number): number => (start + cell) * width + offset;
     const own = names.subarray(start * BLOCK, end * BLOCK);
     let seeds: Uint8Array = own.slice();
     for (let cell = 0; cell < count; cell++) {
-      for (let at = 0; at < tagBytes; at++) seeds[cell * BLOCK + at] ^= low[from(cell) + at];
-      seeds[cell * BLOCK + tagBytes] ^= slot;
+      for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= low[from(cell) + at];
+      seeds[cell * BLOCK + TAG_BYTES] ^= slot;
     }
     seeds = encrypted(this.seedKey, seeds);
     const stride = Math.ceil((1 + size) / BLOCK) * BLOCK;
@@ -58,7 +59,7 @@ export class CellCipher {
       for (let cell = 0; cell < count; cell++) {
         messages[cell * stride] = slot;
         for (let at = block * BLOCK; at < Math.min(size, (block + 1) * BLOCK); at++) {
-          messages[cell * stride + 1 + at] = low[from(cell) + tagBytes + at] ^ stream[cell * BLOCK + (at % BLOCK)];
+          messages[cell * stride + 1 + at] = low[from(cell) + TAG_BYTES + at] ^ stream[cell * BLOCK + (at % BLOCK)];
         }
       }
     }
@@ -69,7 +70,7 @@ export class CellCipher {
     }
     for (let cell = 0; cell < count; cell++) {
       let different = 0;
-      for (let at = 0; at < tagBytes; at++) different |= state[cell * BLOCK + at] ^ low[from(cell) + at];
+      for (let at = 0; at < TAG_BYTES; at++) different |= state[cell * BLOCK + at] ^ low[from(cell) + at];
       if (different !== 0) continue;
       found.rows.push(start + cell);
       found.data.push(messages.slice(cell * stride + 1, cell * stride + 1 + size));

@@ -1,56 +1,51 @@
 /** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
 import { bytesKey, joined, mostFrequent, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
+import type { Codewords } from '../reed_solomon.ts';
 
-const VERSION = 2;
-const PREFIX_BYTES = 40;
-const NUMBERS = 29; // where the numbers of the service begin
+const VERSION = 3;
+const PREFIX_BYTES = 34;
+const NUMBERS = 29; // where cells, bytes of a record and bytes of the header begin
 const MOST_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
 const MAX_CHUNKS = 255;
-const MAX_BLOCKS = Math.floor((1 << 24) / MAX_CHUNKS);
+const MAX_CODEWORDS = Math.floor((1 << 24) / MAX_CHUNKS);
+export const NUMBER_BYTES = 3; // of a chunk of a payload
 
-export interface RecordParameters {
-  readonly service: 'records';
+/** Of records, `cells` of which divide a carrier. */
+export interface Parameters {
+  readonly isPayload: boolean; // whose records are numbered chunks
   readonly method: string;
-  readonly cells: number; // of a carrier
+  readonly cells: number;
   readonly recordBytes: number;
   readonly header: Uint8Array;
 }
 
-export interface PayloadParameters {
-  readonly service: 'payload';
-  readonly method: string;
-  readonly size: number; // bytes of the encrypted payload
-  readonly codewords: number;
-  readonly n: number; // chunks of a codeword
-  readonly k: number; // of these data
-}
-
-export type Parameters = RecordParameters | PayloadParameters;
-
 /** From decrypted parts in any order; of parts with one number the most frequent counts. Raises InputError. */
-export function unpackParameters(parts: Uint8Array[], chunkBytes: number): Parameters {
+export function unpackParameters(parts: Uint8Array[]): Parameters {
   const best = new Map<number, Uint8Array>();
   for (const number of new Set(parts.map((part) => part[0]))) {
     best.set(number, mostFrequentOf(parts.filter((part) => part[0] === number))!.subarray(1));
   }
   const prefix = firstBytes(best, PREFIX_BYTES);
-  const view = viewOf(prefix);
-  if (prefix[0] !== VERSION) throw otherVersion();
+  const [version, service] = prefix;
+  if (version !== VERSION) throw otherVersion();
+  const [cells, view] = [prefix[NUMBERS], viewOf(prefix)];
+  const [recordBytes, length] = [view.getUint16(NUMBERS + 1, true), view.getUint16(NUMBERS + 3, true)];
+  if (service < 1 || service > 2 || cells < 1 || cells > MOST_CELLS || length > MAX_HEADER_BYTES) throw damaged();
   const method = bytesKey(prefix.subarray(2, 17)).replace(/\0+$/, '');
-  if (prefix[1] === 1) {
-    const [size, codewords] = [view.getUint32(NUMBERS, true), view.getUint32(NUMBERS + 4, true)];
-    const [n, k] = [prefix[NUMBERS + 8], prefix[NUMBERS + 9]];
-    const possible = codewords >= 1 && codewords <= MAX_BLOCKS && k >= 1 && k <= n && n <= MAX_CHUNKS;
-    if (!possible || size < 1 || size > codewords * k * chunkBytes) throw damaged();
-    return { service: 'payload', method, size, codewords, n, k };
-  }
-  const [cells, recordBytes] = [prefix[NUMBERS], view.getUint16(NUMBERS + 1, true)];
-  const length = view.getUint16(NUMBERS + 3, true);
-  if (prefix[1] !== 2 || cells < 1 || cells > MOST_CELLS || length > MAX_HEADER_BYTES) throw damaged();
   const header = firstBytes(best, PREFIX_BYTES + length).subarray(PREFIX_BYTES);
-  return { service: 'records', method, cells, recordBytes, header };
+  return { isPayload: service === 1, method, cells, recordBytes, header };
+}
+
+/** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */
+export function unpackCodewords({ header, recordBytes }: Parameters): [number, Codewords] {
+  if (header.length !== 10) throw damaged();
+  const [size, count] = [viewOf(header).getUint32(0, true), viewOf(header).getUint32(4, true)];
+  const [n, k, width] = [header[8], header[9], recordBytes - NUMBER_BYTES];
+  const possible = count >= 1 && count <= MAX_CODEWORDS && k >= 1 && k <= n;
+  if (!possible || size < 1 || size > count * k * width) throw damaged();
+  return [size, { count, n, k, width }];
 }
 
 /** Of equal byte strings those that occur most; the first of several. */

@@ -10,20 +10,15 @@ import { type Gaussians, selected } from '../../core/gaussians.ts';
 import { type Derive, expand } from '../../keys/derivation.ts';
 import { decrypted } from '../../keys/encryption.ts';
 import { here } from '../../keys/pool.ts';
-import type { Content, Payload, Reader, Records } from '../content.ts';
-import { decodeCodeword } from '../reed_solomon.ts';
+import type { Content, Reader } from '../content.ts';
+import { decoded } from '../reed_solomon.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
-import { CellCipher } from './cells.ts';
-import {
-  mostFrequentOf, type PayloadParameters, type RecordParameters, unpackParameters,
-} from './parameters.ts';
+import { CellCipher, TAG_BYTES } from './cells.ts';
+import { mostFrequentOf, NUMBER_BYTES, type Parameters, unpackCodewords, unpackParameters } from './parameters.ts';
 import { salts } from './salts.ts';
 
 const ASSOCIATED = ascii('keyss/v1/low-bits');
 const DATA_KEY_BYTES = 16;
-const TAG_BYTES = 4;
-const CHUNK_TAG_BYTES = 6;
-const NUMBER_BYTES = 3;
 const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
 
@@ -68,8 +63,7 @@ export class LowBitsReader implements Reader {
     for (const dataKey of dataKeys) {
       const parts = this.decrypted(this.parameterCipher(dataKey));
       if (!parts.length) continue;
-      const parameters = unpackParameters(parts, this.chunkBytes);
-      return parameters.service === 'records' ? this.records(dataKey, parameters) : this.payload(dataKey, parameters);
+      return this.content(dataKey, unpackParameters(parts));
     }
     if (room && dataKeys.length === 0) this.passesForNothing(secret);
     return null;
@@ -82,45 +76,28 @@ export class LowBitsReader implements Reader {
     for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), DUMMY_CELLS);
   }
 
-  private records(dataKey: Uint8Array, parameters: RecordParameters): Records {
-    const { cells, recordBytes, method, header } = parameters;
+  private async content(dataKey: Uint8Array, parameters: Parameters): Promise<Content> {
+    const { isPayload, cells, recordBytes, method, header } = parameters;
     if (recordBytes < 1 || recordBytes > Math.floor(this.width / cells) - TAG_BYTES) throw damaged();
     const [records, copies] = ['record', 'copy'].map((label) =>
       this.decrypted(new CellCipher(dataKey, label, recordBytes), cells),
     );
+    if (isPayload) {
+      const [size, codewords] = unpackCodewords(parameters);
+      const chunks = records.map((each): [number, Uint8Array] => [
+        each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
+      ]);
+      const encrypted = decoded(codewords, chunks).subarray(0, size);
+      return { service: 'payload', method, data: await decrypted(expand(dataKey, 'payload-key', 32), encrypted, ASSOCIATED) };
+    }
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
     if (!all.length) throw tooMuchLost();
     return { service: 'records', method, header, records: all };
   }
 
-  /** What lies in numbered chunks, a codeword each; see docs/format.md, "A payload". */
-  private async payload(dataKey: Uint8Array, { method, codewords, n, k, size }: PayloadParameters): Promise<Payload> {
-    const { chunkBytes } = this;
-    const cipher = new CellCipher(dataKey, 'chunk', NUMBER_BYTES + chunkBytes, CHUNK_TAG_BYTES);
-    const chunks = this.decrypted(cipher);
-    if (codewords * k > chunks.length) throw tooMuchLost();
-    const rows = Array.from({ length: codewords }, () => new Map<number, Uint8Array>());
-    for (const chunk of chunks) {
-      const number = chunk[0] | (chunk[1] << 8) | (chunk[2] << 16);
-      if (number < codewords * n) rows[Math.floor(number / n)].set(number % n, chunk.subarray(NUMBER_BYTES));
-    }
-    const encrypted = new Uint8Array(codewords * k * chunkBytes);
-    rows.forEach((each, codeword) => {
-      const data = decodeCodeword(each, k, n);
-      if (data === null) throw tooMuchLost();
-      data.forEach((row, index) => encrypted.set(row, (codeword * k + index) * chunkBytes));
-    });
-    const data = await decrypted(expand(dataKey, 'payload-key', 32), encrypted.subarray(0, size), ASSOCIATED);
-    return { service: 'payload', method, data };
-  }
-
   private parameterCipher(dataKey: Uint8Array): CellCipher {
     return new CellCipher(dataKey, 'parameters', this.width - TAG_BYTES);
-  }
-
-  private get chunkBytes(): number {
-    return Math.max(0, this.width - CHUNK_TAG_BYTES - NUMBER_BYTES);
   }
 
   /** What the cipher decrypts in any of the cells of each Gaussian, in the order of these. */
