@@ -1,4 +1,4 @@
-"""What processes that keyss starts are given."""
+"""Environment of processes that keyss starts, and available memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MEMINFO = Path("/proc/meminfo")
 
 
 def test_a_started_process_finds_keyss_and_no_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where a file of the folder that it is started in has the name of a module."""
+    """Files in the working folder with names of modules do not matter."""
     monkeypatch.setenv("KEYSS_KEY", "a key that nobody is to see")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "elsewhere"))
     (tmp_path / "signal.py").write_text("raise SystemExit(9)")
@@ -48,19 +48,21 @@ def test_folders_of_packages_do_not_come_before_the_standard_library(
 
 
 @pytest.mark.parametrize("name", ["/usr/bin/uwsgi", "", None])
-def test_what_is_no_interpreter_starts_nothing(monkeypatch: pytest.MonkeyPatch, name: str | None) -> None:
+def test_programs_other_than_python_start_no_processes(
+    monkeypatch: pytest.MonkeyPatch, name: str | None
+) -> None:
     monkeypatch.setattr(sys, "executable", name)
     assert not _processes.can_start()
 
 
-def test_a_frozen_app_starts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frozen_app_starts_no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "frozen", True, raising=False)
     assert not _processes.can_start()
 
 
 @pytest.mark.skipif(not MEMINFO.exists(), reason="this system has no /proc/meminfo")
-def test_memory_is_what_groups_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The least over a group and those around it; files that are only kept in memory are given back."""
+def test_available_memory_respects_control_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The minimum over the group and its parents; cached files count as available."""
     inside = Path("/proc/self/cgroup").read_text().split("::", 1)[-1].strip().lstrip("/")
     monkeypatch.setattr(_processes, "_CGROUPS", tmp_path)
     whole = _processes.available_memory()

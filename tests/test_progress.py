@@ -77,7 +77,7 @@ def test_plain_lines_of_a_resumed_run(timer: Timer) -> None:
     ]
 
 
-def test_the_time_left_is_of_the_recent_speed(timer: Timer) -> None:
+def test_the_remaining_time_follows_from_the_recent_speed(timer: Timer) -> None:
     log = console(False)
     lines = ProgressLines(log, 0.0, timer)
     lines.start("fit", 1000, 0)
@@ -103,8 +103,8 @@ def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> 
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_it_may_be_used_again(timer: Timer, terminal: bool) -> None:
-    """As for the models of several scenes in turn."""
+def test_a_reporter_can_be_used_again(timer: Timer, terminal: bool) -> None:
+    """For the models of several scenes in turn."""
     screen = console(terminal)
     lines = ProgressLines(screen, timer=timer)
     for title in ("cover", "secret"):
@@ -117,7 +117,7 @@ def test_it_may_be_used_again(timer: Timer, terminal: bool) -> None:
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_two_trainings_have_a_line_each(timer: Timer, terminal: bool) -> None:
-    """The one that begins first is above, and a line stays when its training is done."""
+    """The first training is above, and its line stays when it has ended."""
     screen = console(terminal)
     cover = ProgressLines(screen, timer=timer)
     secret = cover.beside()

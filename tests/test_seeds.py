@@ -1,4 +1,4 @@
-"""Randomness of training: the system's unless a seed is given, and on record either way."""
+"""Seeds of runs: random unless given, and recorded."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _hidden(options: MethodOptions) -> Gaussians:
 
 
 def _rotations(model: Gaussians) -> set[bytes]:
-    """Of all that training moved, without the low bits that hiding changes and what it appends."""
+    """Trained rotations, without appended Gaussians and the low bits that hiding changes."""
     bits = model[~is_appended(model)].quats.numpy().view(np.uint32) & ~np.uint32(0xFFF)
     start = np.array([1, 0, 0, 0], np.float32).view(np.uint32)
     return {row.tobytes() for row in bits if (row != start).any()}
@@ -49,8 +49,7 @@ def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: Meth
     assert not one & two
 
 
-def test_with_one_seed_they_have_all_in_common() -> None:
-    """On one machine it is every byte: see `test_the_same_run_gives_the_same_bytes`."""
+def test_hidings_with_one_seed_have_all_rotations_in_common() -> None:
     one, two = (_rotations(_hidden(METHODS[1].with_fit(seed=7))) for _ in range(2))
     assert one == two
 
@@ -71,7 +70,7 @@ def test_the_plain_models_of_one_hiding_have_seeds_of_their_own(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("given", [None, 7])
-def test_a_fit_goes_on_with_the_seed_that_it_began_with(tmp_path: Path, given: int | None) -> None:
+def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None:
     scene, run = tiny_scene(), tmp_path / "run"
     with pytest.raises(Interrupted):
         keyss.fit(scene, config=replace(FIT, seed=given), out=run, reporter=InterruptAt(10))
@@ -87,8 +86,8 @@ def test_a_fit_goes_on_with_the_seed_that_it_began_with(tmp_path: Path, given: i
 
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("stage", ["plain model", "hide"])
-def test_a_hiding_goes_on_with_the_seed_that_it_began_with(tmp_path: Path, stage: str) -> None:
-    """Interrupted while fitting a plain model, and while training all scenes together."""
+def test_a_resumed_hiding_keeps_its_seed(tmp_path: Path, stage: str) -> None:
+    """The files are equal to those of an uninterrupted run, to the byte."""
     joint = KeyssOptions(fit=FIT, hidden=(8, 8), branch=8)
     scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"
     with pytest.raises(Interrupted):

@@ -60,8 +60,7 @@ quick = settings(max_examples=25, deadline=None)
 
 @quick
 @given(seeds)
-def test_half_rings_come_back(seed: int) -> None:
-    """Whatever similarity moved a half ring, aligning undoes it."""
+def test_aligning_a_moved_half_ring_undoes_the_move(seed: int) -> None:
     cameras, moved_by = ring(seed, math.pi), random_similarity(seed)
     found = align([moved_by.apply_camera(camera) for camera in cameras], cameras)
     assert found.scale * moved_by.scale == pytest.approx(1, abs=1e-4)
@@ -93,7 +92,7 @@ def test_full_rings_are_not_turned() -> None:
 
 @pytest.mark.parametrize("turn", [1.5, math.pi, 2 * math.pi])
 def test_up_does_not_lean(turn: float) -> None:
-    """Although the mean of the cameras' own up vectors does on a part of a ring."""
+    """Unlike the mean of the cameras' up vectors on a part of a ring."""
     up = up_direction(ring(0, turn, height=1.0))
     assert up is not None
     assert up[2] > 0.999

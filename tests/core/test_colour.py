@@ -1,4 +1,4 @@
-"""Taking three values apart into a sum and two differences."""
+"""Opponent colours."""
 
 from __future__ import annotations
 

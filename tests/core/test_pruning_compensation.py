@@ -1,4 +1,4 @@
-"""Gaussians that make up for lost ones."""
+"""Compensation of lost Gaussians."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tiny_scenes import random_gaussians
 
 
 @pytest.mark.parametrize(("left", "count"), [(1000, 1000), (995, 1000), (10, 0)])
-def test_nothing_changes_where_next_to_nothing_was_lost(left: int, count: int) -> None:
+def test_small_losses_change_nothing(left: int, count: int) -> None:
     model = random_gaussians(left)
     assert compensate_pruning(model, count) is model
 

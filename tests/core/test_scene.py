@@ -1,4 +1,4 @@
-"""What a scene says of itself."""
+"""Extents of scenes."""
 
 from __future__ import annotations
 

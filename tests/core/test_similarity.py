@@ -1,4 +1,4 @@
-"""Similarity transforms: what moves together still looks the same."""
+"""Similarity transforms: moving everything together changes no image."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_is_differentiable() -> None:
         (1.0, torch.diag(torch.tensor([1.0, 1.0, math.nan]))),
     ],
 )
-def test_what_is_no_similarity_is_refused(scale: float, rotation: Tensor) -> None:
+def test_invalid_similarities_are_refused(scale: float, rotation: Tensor) -> None:
     with pytest.raises(ValueError, match="similarity: "):
         Similarity(scale, rotation.double())
 

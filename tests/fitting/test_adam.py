@@ -21,7 +21,7 @@ SCALE = torch.cat([torch.ones(1, 1), torch.full((15, 1), 0.05)])
 
 
 def _gradients(shape: tuple[int, ...], steps: int) -> Tensor:
-    """Of very different sizes, and some exactly zero, as those of Gaussians that are not seen."""
+    """Gradients of very different sizes; some are exactly zero, like those of invisible Gaussians."""
     generator = torch.Generator().manual_seed(1)
     values = torch.randn(steps, *shape, generator=generator)
     values *= 10 ** torch.randint(-12, 2, (1, *shape), generator=generator).double()
@@ -74,14 +74,14 @@ def test_one_thread_or_many_give_the_same_bits() -> None:
     assert torch.equal(results[0], results[2])
 
 
-def test_what_never_had_a_gradient_stays() -> None:
+def test_numbers_without_gradients_do_not_change() -> None:
     start, gradients = torch.rand(100, 16, 3), _gradients((100, 16, 3), 5)
     gradients[:, :, 4:] = 0
     after = _run(lambda p: RowAdam([p], lr=RATE, eps=EPS), start, gradients)
     assert torch.equal(after[:, 4:], start[:, 4:])
 
 
-def test_densification_edits_it_as_it_edits_torchs() -> None:
+def test_densification_edits_its_state_like_that_of_torchs_adam() -> None:
     config, gaussians = FitConfig(), random_gaussians(120)
 
     def run(parameters: Parameters, optimizers: Any) -> dict[str, Tensor]:
@@ -116,7 +116,7 @@ def test_densification_edits_it_as_it_edits_torchs() -> None:
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_it_is_the_same() -> None:
+def test_a_gpu_gives_the_same_result() -> None:
     try:
         device = resolve_device("cuda")
     except BackendError as error:
@@ -136,8 +136,7 @@ def test_on_a_gpu_it_is_the_same() -> None:
 
 
 def test_numbers_that_end_near_zero_have_uniform_low_bits() -> None:
-    """A step that is rounded before it is subtracted leaves the grid of the larger number that it came
-    from."""
+    """A step that is rounded before it is subtracted leaves trailing zeros in the smaller result."""
     generator = torch.Generator().manual_seed(3)
     parameter = torch.nn.Parameter(1e-3 * torch.randn(400_000, generator=generator))
     optimizer = RowAdam([{"params": [parameter], "lr_scale": torch.tensor(1.0)}], lr=1e-3, eps=EPS)

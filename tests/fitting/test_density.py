@@ -23,7 +23,7 @@ def _setup(max_gaussians: int) -> tuple[CappedStrategy, Parameters, Optimizers, 
     return strategy, parameters, optimizers, state
 
 
-def test_growth_stops_at_the_cap_and_takes_the_largest_gradients() -> None:
+def test_growth_stops_at_the_cap_and_prefers_the_largest_gradients() -> None:
     strategy, parameters, optimizers, state = _setup(COUNT + 10)
     before = parameters["means"].detach().clone()
     strategy._grow_gs(parameters, optimizers, state, step=1000)
@@ -33,13 +33,13 @@ def test_growth_stops_at_the_cap_and_takes_the_largest_gradients() -> None:
     assert kept[:-10].all()
 
 
-def test_without_a_cap_in_reach_all_that_ask_grow() -> None:
+def test_all_gaussians_above_the_threshold_grow_below_the_cap() -> None:
     strategy, parameters, optimizers, state = _setup(10 * COUNT)
     strategy._grow_gs(parameters, optimizers, state, step=1000)
     assert len(parameters["means"]) == 2 * COUNT - 1  # all but the first, whose gradient is 0
 
 
-def test_pruning_goes_on_at_the_cap_and_looks_at_the_opacity_it_is_given() -> None:
+def test_pruning_continues_at_the_cap_and_uses_the_given_opacity() -> None:
     strategy, parameters, optimizers, state = _setup(COUNT)
     opacities = torch.full((COUNT,), 0.5)
     opacities[:7] = 0.001
@@ -56,7 +56,7 @@ def test_never_prunes_everything() -> None:
 
 
 @pytest.mark.parametrize("cameras", [1, 3])
-def test_what_is_summed_up_from_step_to_step_is_what_gsplat_sums_up(cameras: int) -> None:
+def test_statistics_are_equal_to_those_of_gsplat(cameras: int) -> None:
     strategy, parameters, _, _ = _setup(COUNT)
     generator = torch.Generator().manual_seed(0)
     ours, theirs = strategy.initialize_state(1.0), strategy.initialize_state(1.0)

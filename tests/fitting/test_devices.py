@@ -1,4 +1,4 @@
-"""A checkpoint made on one device goes on on another."""
+"""A run resumes on another device."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from keyss.fitting import PlainRun, fit_scene, load_checkpoint
 from tiny_scenes import tiny_scene
 
 
-def test_what_a_checkpoint_is_for_does_not_depend_on_the_device(tmp_path: Path) -> None:
-    """ "cpu:0" is another name of the same device: a run that went by names would refuse it."""
+def test_a_checkpoint_does_not_depend_on_the_name_of_the_device(tmp_path: Path) -> None:
+    """ "cpu:0" is another name of the same device."""
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     with pytest.raises(Interrupted):
         fit_scene(scene, FIT, checkpoint=path, reporter=InterruptAt(25))
@@ -26,8 +26,8 @@ def test_what_a_checkpoint_is_for_does_not_depend_on_the_device(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("fused", [False, True])
-def test_everything_of_a_checkpoint_goes_to_the_device_of_the_run(tmp_path: Path, fused: bool) -> None:
-    """By the device "meta", which every build of torch has; CUDA's fused Adam counts its steps there."""
+def test_all_tensors_of_a_checkpoint_are_moved_to_the_device_of_the_run(tmp_path: Path, fused: bool) -> None:
+    """With the device "meta", which every build of torch has; fused Adam counts steps on the device."""
     path = tmp_path / "checkpoint.safetensors"
     made = trained("plain", FIT, checkpoint=path)
     tensors, meta = load_checkpoint(path)
@@ -47,8 +47,8 @@ def test_everything_of_a_checkpoint_goes_to_the_device_of_the_run(tmp_path: Path
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", RUNS)
-def test_a_run_goes_from_the_cpu_to_a_gpu_and_back(tmp_path: Path, name: str) -> None:
-    """It comes out about as well as one that stayed; sums on a GPU have another order every time."""
+def test_a_run_resumes_on_a_gpu_and_back_on_the_cpu(tmp_path: Path, name: str) -> None:
+    """The quality is near that of a run on the CPU; the order of sums on a GPU varies."""
     path, fit = tmp_path / "checkpoint.safetensors", replace(FIT, iterations=60)
     with pytest.raises(Interrupted):
         trained(name, fit, checkpoint=path, reporter=InterruptAt(25))

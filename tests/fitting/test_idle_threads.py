@@ -17,8 +17,8 @@ from tiny_scenes import tiny_scene
 @pytest.mark.parametrize(
     ("imports", "spinning"), [("torch, keyss", True), ("keyss, torch", False), ("torch", None)]
 )
-def test_it_is_known_whether_idle_threads_of_torch_spin(imports: str, spinning: bool | None) -> None:
-    """Where the user has chosen, nothing is said."""
+def test_spinning_idle_threads_of_torch_are_detected(imports: str, spinning: bool | None) -> None:
+    """A choice of the user is not reported."""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     if spinning is None:
         environment["OMP_WAIT_POLICY"] = "active"
@@ -27,7 +27,7 @@ def test_it_is_known_whether_idle_threads_of_torch_spin(imports: str, spinning: 
     assert found.stdout.strip() == str(bool(spinning))
 
 
-def test_training_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_warns_of_spinning_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_threads, "spinning", True)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     with pytest.warns(KeyssWarning, match="import keyss first"):

@@ -1,4 +1,4 @@
-"""PSNR against its definition, and which views are watched."""
+"""PSNR against its definition, and the choice of evaluated views."""
 
 from __future__ import annotations
 

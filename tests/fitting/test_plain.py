@@ -46,7 +46,7 @@ class InterruptAt(SilentReporter):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_fitting_gets_nearer_to_photos_it_has_not_seen() -> None:
+def test_fitting_improves_psnr_on_test_views() -> None:
     scene, config = tiny_scene(), replace(CONFIG, iterations=400)
     start = PlainRun(scene, config, torch.device("cpu")).gaussians()
     fitted = fit_scene(scene, config).gaussians
@@ -106,7 +106,7 @@ def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
         assert steps_done(path) == 0
 
 
-def test_how_many_steps_a_checkpoint_has(tmp_path: Path) -> None:
+def test_steps_of_a_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     assert steps_done(None) == steps_done(path) == 0
     for told, steps in (({"iteration": 7}, 7), ({"iteration": None}, 0), ({}, 0)):

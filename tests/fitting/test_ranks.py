@@ -39,14 +39,14 @@ def torchrun(folder: Path, device: str) -> None:
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What two processes came to, in a file for each run and rank."""
+    """Final states of two processes, in a file for each run and rank."""
     folder = tmp_path_factory.mktemp("ranks")
     torchrun(folder, "cpu")
     return folder
 
 
 def assert_near(found: State, expected: State) -> None:
-    """The same tensors but for the order of sums."""
+    """Assert equal tensors up to the order of sums."""
     assert found.keys() == expected.keys()
     for name, tensor in expected.items():
         assert found[name].shape == tensor.shape, name
@@ -58,7 +58,7 @@ def assert_near(found: State, expected: State) -> None:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_two_processes_train_what_one_does_with_twice_the_views(two: Path, name: str) -> None:
+def test_two_processes_train_like_one_with_twice_the_views(two: Path, name: str) -> None:
     begun = len(RUNS[name](TOGETHER, torch.device("cpu")))
     one = trained(name, TOGETHER)
     assert len(one) > begun  # it was densified
@@ -73,14 +73,14 @@ def test_all_processes_hold_the_same_to_the_bit(two: Path, name: str) -> None:
     assert (two / f"{name}-0").read_bytes() == (two / f"{name}-1").read_bytes()
 
 
-def test_two_views_are_not_one_twice() -> None:
-    """A step of two views goes by both."""
+def test_a_step_of_two_views_differs_from_two_steps() -> None:
+    """A step of two views uses both."""
     once, twice = trained("plain", FIT).state()[0], trained("plain", TOGETHER).state()[0]
     assert not torch.allclose(once["means"][:50], twice["means"][:50], atol=1e-4)
     assert len(once["order"]) != len(twice["order"])
 
 
-def test_a_view_each_unless_others_are_asked_for() -> None:
+def test_each_process_renders_one_view_by_default() -> None:
     second = Ranks(1, 3)
     assert second.views(None) == 3
     assert list(second.mine(range(6))) == [2, 3]
@@ -90,7 +90,7 @@ def test_a_view_each_unless_others_are_asked_for() -> None:
         FitConfig(views_per_step=0)
 
 
-def test_without_torchrun_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_torchrun_there_is_one_rank(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("RANK", "0"), ("WORLD_SIZE", "1"), ("MASTER_ADDR", "x"), ("MASTER_PORT", "1")):
         monkeypatch.setenv(name, value)
     with joined() as alone:
@@ -102,7 +102,7 @@ def test_without_torchrun_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Deserted(Ranks):
-    """Two ranks in this process, which draws the views of both, until the other one is gone."""
+    """Two ranks in this process, which renders the views of both until the other one ends."""
 
     steps = 0
 
@@ -123,7 +123,7 @@ class Deserted(Ranks):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_what_is_saved_when_another_process_is_gone_is_the_step_before(
+def test_the_state_before_the_step_is_saved_if_another_process_ends(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "checkpoint.safetensors"
@@ -139,7 +139,7 @@ def test_what_is_saved_when_another_process_is_gone_is_the_step_before(
 
 @pytest.mark.cuda
 def test_two_processes_train_together_on_gpus(tmp_path: Path) -> None:
-    """By NCCL, one GPU each; near what one process computes, whose sums have another order every time."""
+    """One GPU each, with NCCL; near the result of one process, whose order of sums varies."""
     if torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
     torchrun(tmp_path, "cuda")

@@ -31,7 +31,7 @@ CPU = torch.device("cpu")
 
 
 class Recorder(SilentReporter):
-    """Keeps what it is told; once, when all trainings have begun and one is at a step, it does something."""
+    """Records all calls, and acts once, when all trainings have begun and one has reached step `at`."""
 
     def __init__(self, at: int = -1, loss_every: int = 0, count: int = 2) -> None:
         self.at, self.loss_every, self.count = at, loss_every, count
@@ -78,7 +78,7 @@ def signalled(at: int, signum: int = signal.SIGINT) -> Recorder:
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes also for fits of a few steps, as if there were two threads and much memory."""
+    """Use processes for short fits too, as if there were two threads and much memory."""
     monkeypatch.setattr(side_by_side, "MIN_STEPS", 1)
     monkeypatch.setattr(side_by_side.torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(side_by_side._processes, "usable_cores", lambda: 2)
@@ -163,7 +163,7 @@ def test_a_signal_while_processes_load_ends_it_at_once() -> None:
 
 @pytest.mark.parametrize(("at", "order"), [(0, 1), (0, -1), (50, -1)])
 def test_a_signal_to_all_processes_interrupts(tmp_path: Path, at: int, order: int) -> None:
-    """As systems end a whole service, in any order."""
+    """In any order, as a system ends a service."""
 
     def to_all() -> None:
         for pid in [os.getpid(), *pids()][::order]:
@@ -176,7 +176,7 @@ def test_a_signal_to_all_processes_interrupts(tmp_path: Path, at: int, order: in
 
 
 def test_a_second_signal_ends_it_at_once(tmp_path: Path) -> None:
-    """When processes do not answer, for example."""
+    """For example if processes do not respond."""
 
     def twice() -> None:
         for pid in pids():
@@ -194,8 +194,8 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path) -> None:
     assert pids() == []
 
 
-def test_what_is_started_with_ctrl_c_ignored_goes_on() -> None:
-    """As by a script in its background: Ctrl-C comes to processes as well, and nothing comes of it."""
+def test_an_ignored_ctrl_c_stays_ignored() -> None:
+    """As in a background command of a script."""
 
     def to_all() -> None:
         for pid in [os.getpid(), *pids()]:
@@ -209,7 +209,7 @@ def test_what_is_started_with_ctrl_c_ignored_goes_on() -> None:
     assert len(models) == 2
 
 
-def test_an_error_of_one_comes_through_and_stops_the_others(tmp_path: Path) -> None:
+def test_an_error_of_one_fit_is_raised_and_stops_the_others(tmp_path: Path) -> None:
     fit_scenes(fits_of(tmp_path, replace(CONFIG, iterations=5), count=1))
     (tmp_path / "0.safetensors").rename(tmp_path / "1.safetensors")
     with pytest.raises(InputError, match=r"1\.safetensors: belongs to a run with other settings"):
@@ -218,7 +218,7 @@ def test_an_error_of_one_comes_through_and_stops_the_others(tmp_path: Path) -> N
 
 
 @pytest.mark.counted
-def test_errors_that_nobody_expects_are_those_of_a_fit_in_this_process() -> None:
+def test_unexpected_errors_are_equal_to_those_of_a_fit_in_this_process() -> None:
     good, bad = fits_of(None, ENDLESS)
     first = bad.scene.train[0]
     views = (replace(first, camera=replace(first.camera, K=torch.eye(2))), *bad.scene.train[1:])
@@ -232,7 +232,7 @@ def test_errors_that_nobody_expects_are_those_of_a_fit_in_this_process() -> None
     assert pids() == []
 
 
-def test_a_process_that_is_killed_is_told_and_the_others_save(tmp_path: Path) -> None:
+def test_a_killed_process_is_reported_and_the_others_save(tmp_path: Path) -> None:
     killing = acting(50, lambda: os.kill(pids()[0], signal.SIGKILL))
     with pytest.raises(OtherProcessError) as caught:
         fit_scenes(fits_of(tmp_path, ENDLESS, killing))
@@ -245,14 +245,14 @@ def test_a_process_that_is_killed_is_told_and_the_others_save(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == [f"{1 - int(killed[1])}.safetensors"]
 
 
-def test_a_signal_that_only_a_process_gets_interrupts_all(tmp_path: Path) -> None:
+def test_a_signal_to_one_process_interrupts_all(tmp_path: Path) -> None:
     with pytest.raises(Interrupted) as caught:
         fit_scenes(fits_of(tmp_path, ENDLESS, acting(50, lambda: os.kill(pids()[0], signal.SIGTERM))))
     assert caught.value.args == (signal.SIGTERM,)
     assert {path.name for path in tmp_path.iterdir()} == {"0.safetensors", "1.safetensors"}
 
 
-def test_processes_end_with_whoever_started_them_and_do_not_run_its_program(tmp_path: Path) -> None:
+def test_processes_end_with_their_parent_and_do_not_run_its_program(tmp_path: Path) -> None:
     (tmp_path / "driver.py").write_text(
         "from fitting.test_side_by_side import ENDLESS, fits_of, side_by_side\n"
         "print('once', flush=True)\n"
@@ -286,7 +286,7 @@ def test_processes_end_with_whoever_started_them_and_do_not_run_its_program(tmp_
 
 
 @pytest.mark.parametrize("program", ["/nowhere/python", "/bin/false"])
-def test_where_no_process_can_be_started_fits_are_one_after_the_other(
+def test_fits_run_one_after_the_other_if_no_process_can_be_started(
     monkeypatch: pytest.MonkeyPatch, program: str
 ) -> None:
     monkeypatch.setattr(sys, "executable", program)
@@ -299,10 +299,10 @@ def test_where_no_process_can_be_started_fits_are_one_after_the_other(
     assert starts.count("start") == starts.count("finish") >= 2
 
 
-def test_one_after_the_other_where_a_reporter_cannot_be_told_of_several(
+def test_fits_run_one_after_the_other_if_the_reporter_displays_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As with `--live`, whose page shows one training."""
+    """As with `--live`, whose page displays one training."""
     monkeypatch.setattr(side_by_side, "_fit_in_processes", None)
     models = fit_scenes([replace(fit, reporter=SilentReporter()) for fit in fits_of(None, CONFIG)])
     assert len(models) == 2

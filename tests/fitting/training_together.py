@@ -1,4 +1,4 @@
-"""Small trainings, and a program that torchrun starts twice to do them in two processes."""
+"""Small trainings, and a program that runs them in two processes of torchrun."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
 
 
 def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
-    """One of RUNS, at its end."""
+    """One of RUNS, trained to its end."""
     run: TrainingRun = RUNS[name](fit, torch.device(device))
-    train(run, name, fingerprint={}, seed=fit.known_seed, evaluate_every=0, **options)
+    train(run, name, fit, fingerprint={}, **options)
     return run
 
 
@@ -71,7 +71,7 @@ def _placed() -> list[PlacedScene]:
 
 
 def main(folder: Path, device: str) -> None:
-    """Each process writes what it has come to; others than the first begin with a seed of their own."""
+    """Each process writes its final state; the ranks start with different seeds."""
     with joined(device):
         for name in RUNS:
             rank = here().rank

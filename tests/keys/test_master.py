@@ -1,4 +1,4 @@
-"""Keys derived from a master key: written out with other means, and unrelated."""
+"""Keys derived from a master key: equal to an independent derivation, and unrelated."""
 
 from __future__ import annotations
 
@@ -38,6 +38,6 @@ def test_keys_are_unrelated_and_uniform() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "x" * 5000, "\udcff"])
-def test_what_is_no_name_is_refused(name: str) -> None:
+def test_invalid_names_are_refused(name: str) -> None:
     with pytest.raises(UsageError):
         MasterKey("a master key").key_of(name)

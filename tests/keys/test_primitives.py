@@ -1,4 +1,4 @@
-"""The primitives that are called agree with the documents that define them."""
+"""Cryptographic primitives of libraries, against published vectors."""
 
 from __future__ import annotations
 

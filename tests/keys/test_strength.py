@@ -1,4 +1,4 @@
-"""The estimate of a key's strength errs on the low side and lets generated keys pass."""
+"""The estimated strength of keys is low for weak keys and sufficient for generated ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from keyss.keys import ENOUGH_BITS, generate_key, key_strength_bits, length_for, weakness
 
 
-def test_generated_keys_are_worth_what_they_are() -> None:
+def test_generated_keys_have_their_full_strength() -> None:
     bits = [key_strength_bits(generate_key()) for _ in range(300)]
     assert statistics.median(bits) == pytest.approx(95, abs=1)
     assert sum(value < ENOUGH_BITS for value in bits) < 10
@@ -32,7 +32,7 @@ def test_generated_keys_are_worth_what_they_are() -> None:
         ("kS9#", 30),
     ],
 )
-def test_what_people_choose_is_weak(key: str, most: float) -> None:
+def test_keys_that_people_choose_are_weak(key: str, most: float) -> None:
     assert key_strength_bits(key) <= most
     assert weakness(key) is not None
     assert key not in (weakness(key) or "") or len(key) < 3

@@ -1,4 +1,4 @@
-"""What a hidden scene is compared with: plain 3DGS of as many Gaussians and as many training steps."""
+"""Bounds of hidden scenes: plain 3DGS of as many Gaussians and training steps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     return counts
 
 
-def test_the_bound_is_drawn_as_often_as_the_scene_was(
+def test_the_bound_has_as_many_steps_as_the_scene(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Counted where training happens, not where it is written down."""
@@ -66,7 +66,7 @@ def test_the_bound_is_drawn_as_often_as_the_scene_was(
     assert metrics.baseline.gaussians[1] == len(longer)
 
 
-def test_without_one_the_start_is_not_called_a_bound(
+def test_a_start_with_fewer_steps_is_not_called_a_bound(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts = drawn(monkeypatch)
@@ -89,7 +89,7 @@ def test_without_one_the_start_is_not_called_a_bound(
 
 
 @pytest.mark.parametrize("name", registry.METHODS)
-def test_what_methods_say_of_their_training(name: str) -> None:
+def test_bounds_follow_from_the_training_of_a_method(name: str) -> None:
     for options in map(registry.get(name).options.preset, PRESETS):
         trainings = options.training(2)
         assert len(trainings) == 2
@@ -126,7 +126,7 @@ def test_rates_settle_to_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sorted(rates, reverse=True) == rates
 
 
-def test_records_of_before_are_read(folders: tuple[Path, Path]) -> None:
+def test_older_records_are_read(folders: tuple[Path, Path]) -> None:
     metrics = keyss.hide(
         folders[0], [Secret(folders[1], KEY)], method=CarryOptions(fit=FIT, publish="any"), min_psnr=0
     ).metrics

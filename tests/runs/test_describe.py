@@ -1,4 +1,4 @@
-"""What `info` says of a model, in a table or unpacked."""
+"""`info` on models."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tiny_scenes import random_gaussians
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("suffix", ["ply", "PLY", "compressed.ply", "glb"])
-def test_it_says_what_reading_the_model_gives(tmp_path: Path, suffix: str, degree: int) -> None:
-    """A plain .ply is looked at without torch; others are read as by `read_model`, which is the oracle."""
+def test_info_agrees_with_the_model(tmp_path: Path, suffix: str, degree: int) -> None:
+    """A plain .ply is read without torch, other formats by `read_model`, which is the oracle."""
     path = tmp_path / f"model.{suffix}"
     made = random_gaussians(500, sh_degree=degree)
     logits = made.opacity_logits.clone()

@@ -1,4 +1,4 @@
-"""Folders of runs: all files or none, nothing of somebody else touched, and nothing stale left."""
+"""Folders of runs: all files or none, no changes to files of others, nothing stale."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from keyss.runs import MANIFEST, Manifest, RunFolder, clear, read_manifest, writ
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """What a person sees in it: all files but the manifest."""
+    """All files but the manifest."""
     files = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     return {name: data for name, data in files.items() if not name.endswith(MANIFEST)}
 
@@ -113,7 +113,7 @@ def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -
     assert read_manifest(tmp_path).files == {"hide": ("publish/stego.ply",)}
 
 
-def test_an_audit_leaves_what_was_hidden(tmp_path: Path) -> None:
+def test_an_audit_keeps_the_results_of_hiding(tmp_path: Path) -> None:
     make(tmp_path)
     for data in (b"first", b"second"):
         make(tmp_path, "audit", {"private/report.html": data}, onto=("hide",), overwrite=data == b"second")
@@ -123,7 +123,7 @@ def test_an_audit_leaves_what_was_hidden(tmp_path: Path) -> None:
         RunFolder(tmp_path, "audit", onto=("hide",))
 
 
-def test_somebody_elses_file_is_never_replaced(tmp_path: Path) -> None:
+def test_files_of_others_are_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "publish").mkdir()
     (tmp_path / "publish" / "stego.ply").write_bytes(b"mine")
     with pytest.raises(OutputError, match="in the way"):
@@ -134,7 +134,7 @@ def test_somebody_elses_file_is_never_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["checkpoint", "unfinished"])
-def test_somebody_elses_folder_is_not_taken_for_an_unfinished_run(tmp_path: Path, name: str) -> None:
+def test_folders_of_others_are_not_taken_for_unfinished_runs(tmp_path: Path, name: str) -> None:
     make(tmp_path)
     (tmp_path / "private" / name).mkdir()
     (tmp_path / "private" / name / "notes.txt").write_bytes(b"mine")
@@ -161,7 +161,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
         RunFolder(tmp_path, "hide", resume=True)
 
 
-def test_an_interrupted_run_is_continued_with_the_same_arguments_only(tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_with_the_same_arguments_only(tmp_path: Path) -> None:
     arguments: dict[str, object] = {"width": 200, "options": {"seed": 0, "fit": {"iterations": 10}}}
     interrupt(tmp_path, arguments)
     assert tree(tmp_path) == {"private/checkpoint/fit": b"state"}
@@ -182,7 +182,7 @@ def test_an_interrupted_run_is_continued_with_the_same_arguments_only(tmp_path: 
     assert tree(tmp_path) == {"publish/stego.ply": b"whole"}
 
 
-def test_a_run_that_was_killed_before_it_saved_anything_is_just_begun_again(tmp_path: Path) -> None:
+def test_a_run_that_was_killed_without_a_checkpoint_starts_anew(tmp_path: Path) -> None:
     interrupt(tmp_path, {"width": 1})
     (tmp_path / "private" / "checkpoint" / "fit").unlink()  # as a kill before the first checkpoint leaves it
     make(tmp_path)
@@ -190,7 +190,7 @@ def test_a_run_that_was_killed_before_it_saved_anything_is_just_begun_again(tmp_
     assert read_manifest(tmp_path).running is None
 
 
-def test_starting_anew_drops_checkpoints_and_keeps_results_until_there_are_new_ones(tmp_path: Path) -> None:
+def test_starting_anew_drops_checkpoints_and_keeps_results_until_the_end(tmp_path: Path) -> None:
     make(tmp_path)
     interrupt(tmp_path, {"width": 1}, overwrite=True)
     assert tree(tmp_path)["publish/stego.ply"] == b"1"
@@ -201,7 +201,7 @@ def test_starting_anew_drops_checkpoints_and_keeps_results_until_there_are_new_o
     assert tree(tmp_path) == {"publish/stego.ply": b"new"}
 
 
-def test_resuming_what_never_began_begins(tmp_path: Path) -> None:
+def test_resuming_a_run_that_never_began_starts_it(tmp_path: Path) -> None:
     for path in (tmp_path / "new", tmp_path / "empty"):
         path.name == "empty" and path.mkdir()
         make(path, resume=True)
@@ -217,7 +217,7 @@ def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
     assert (tmp_path / MANIFEST).exists()
 
 
-def test_a_file_written_again_is_known(tmp_path: Path) -> None:
+def test_a_replaced_file_stays_in_the_manifest(tmp_path: Path) -> None:
     make(tmp_path)
     write_again(tmp_path, "audit", "private/report.html", content(b"1"))
     write_again(tmp_path, "audit", "private/report.html", content(b"2"))
@@ -239,7 +239,7 @@ def test_a_forged_manifest_reaches_nothing_outside(tmp_path: Path, name: str) ->
         RunFolder(run, "hide", overwrite=True)
 
 
-def test_links_in_a_run_folder_lead_nowhere(tmp_path: Path) -> None:
+def test_links_in_a_run_folder_are_not_followed(tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "stego.ply").write_bytes(b"mine")
@@ -253,7 +253,7 @@ def test_links_in_a_run_folder_lead_nowhere(tmp_path: Path) -> None:
     assert (elsewhere / "stego.ply").read_bytes() == b"mine"
 
 
-def test_clearing_leaves_what_is_not_ours(tmp_path: Path) -> None:
+def test_clearing_keeps_files_of_others(tmp_path: Path) -> None:
     run = tmp_path / "run"
     make(run)
     (run / "notes.txt").write_bytes(b"mine")

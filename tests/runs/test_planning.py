@@ -1,4 +1,4 @@
-"""What is said of a run before it begins, held to what the run then is."""
+"""Plans of runs, compared with the runs."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
 @pytest.mark.alone
 @pytest.mark.argon2
 @pytest.mark.parametrize("given", [True, False])
-def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> None:
-    """Wide bounds: others use the machine, too."""
+def test_estimates_are_near_the_measured_run(given: bool, tmp_path: Path) -> None:
+    """With wide bounds, since the machine has other users."""
     if given:
         cover, secret = trained_like(20_000), Secret(trained_like(9000, 1), KEY)
         method = CarryOptions()
@@ -77,7 +77,7 @@ def test_estimates_are_near_what_a_run_takes(given: bool, tmp_path: Path) -> Non
     assert 1e8 < plan.memory_bytes < 2e10
 
 
-def test_capacity_is_what_fits(tmp_path: Path) -> None:
+def test_the_capacity_is_the_number_of_hidden_gaussians(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
     plan = keyss.hide(
         cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, dry_run=True
@@ -89,7 +89,7 @@ def test_capacity_is_what_fits(tmp_path: Path) -> None:
     assert [stage.steps for stage in plan.stages] == [0] * len(plan.stages)
 
 
-def test_a_disk_without_room_is_refused_before_anything_is_done(
+def test_a_full_disk_is_refused_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Path] = []
@@ -117,7 +117,7 @@ def test_only_methods_with_networks_take_longer() -> None:
     assert seconds["3dgs-sh"] < seconds["3dgs-decoder"] < seconds["gs-hider"]
 
 
-def test_networks_of_plans_are_as_large_as_those_that_are_trained() -> None:
+def test_plans_count_the_weights_of_the_networks() -> None:
     for channels in (3, 16):
         assert weights_of(channels) == _weights(Convolutions(channels))
     for design in get_args(DesignName):

@@ -1,4 +1,4 @@
-"""What lies beside the published model: of every method nothing that names or shows a secret."""
+"""Files beside the published model: with no method do they name or show a secret."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ METHODS = {
 
 @pytest.fixture(autouse=True)
 def umask() -> Iterator[None]:
-    """The usual one: what is not kept private can be read by everybody."""
+    """The usual umask, which lets everybody read files."""
     before = os.umask(0o022)
     yield
     os.umask(before)
 
 
 def _hide(folder: Path, options: MethodOptions, **how: object) -> Path:
-    """A hiding of models in files whose names tell what they are."""
+    """Hide models whose file names describe them."""
     names = {"of-a-meadow.ply": trained_like(1500, 0), "of-the-treasure.ply": trained_like(100, 1)}
     for name, model in names.items():
         keyss.write_model(folder / name, model)
@@ -65,7 +65,7 @@ def _modes(folder: Path) -> dict[str, int]:
 
 
 def _telling(run: Path, folder: Path) -> list[bytes]:
-    """What would show a reader who has a guess that it is right: names, the seed, hashes and numbers."""
+    """Data that would confirm a reader's guess: names, the seed, hashes and numbers."""
     config = json.loads((run / "private" / "config.json").read_text())
     models: list[Gaussians] = [keyss.read_model(folder / "of-the-treasure.ply")]
     models += [keyss.read_model(path) for path in (run / "private").glob("*.ply")]
@@ -78,7 +78,7 @@ def _telling(run: Path, folder: Path) -> list[bytes]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_only_what_is_needed_is_published_and_it_tells_of_no_secret(tmp_path: Path, method: str) -> None:
+def test_only_the_model_is_published_and_nothing_in_it_names_a_secret(tmp_path: Path, method: str) -> None:
     run = _hide(tmp_path, METHODS[method])
     assert {path.name for path in (run / "publish").iterdir()} == {"stego.ply"}
     assert {path.name for path in run.iterdir()} == {"publish", "private"}
@@ -98,7 +98,7 @@ def test_checkpoints_are_private_while_a_run_is_interrupted(tmp_path: Path) -> N
     assert {path.name for path in run.iterdir()} == {"private"}
 
 
-def test_what_is_opened_is_private_wherever_it_is_written(tmp_path: Path) -> None:
+def test_revealed_models_are_private_files(tmp_path: Path) -> None:
     run = _hide(tmp_path, METHODS["carry"])
     keyss.reveal(run / "publish" / "stego.ply", KEY, out=tmp_path / "revealed.ply")
     assert _modes(tmp_path / "revealed.ply") == {"revealed.ply": 0o600}
@@ -108,7 +108,7 @@ def test_what_is_opened_is_private_wherever_it_is_written(tmp_path: Path) -> Non
 
 
 def test_a_secret_has_another_name_in_every_run() -> None:
-    """Who sees the names of two runs cannot tell that they hide the same, nor look one up."""
+    """Names do not show that two runs hide the same secret, and cannot be looked up."""
     opened = CarriedSecret(trained_like(100), 100, 568)
     names = {seed: secret_ids(seed, [opened]) for seed in (1, 2)}
     assert names[1] == secret_ids(1, [opened])

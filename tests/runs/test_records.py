@@ -1,4 +1,4 @@
-"""Records in files: what comes back, and what is refused with the file's name."""
+"""Records in JSON files, and errors that name the file."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ class Record:
 RECORD = Record(name="Füchse 狐", scores={"a": Scores((1.5, 2.0), None), "b": Scores((), 0.1)})
 
 
-def test_what_was_written_comes_back(tmp_path: Path) -> None:
+def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     write_record(tmp_path / "record.json", RECORD)
     assert read_record(tmp_path / "record.json", Record) == RECORD
     assert json.loads((tmp_path / "record.json").read_text())["version"] == 3
 
 
-def test_names_of_files_that_are_no_text_are_written_all_the_same() -> None:
-    """As Python gives them: with a surrogate for every byte that the locale does not know."""
+def test_file_names_that_are_not_text_are_written() -> None:
+    """Python represents bytes outside the locale's encoding by surrogates."""
     name = "Füchse".encode().decode("ascii", "surrogateescape") + b"\xff".decode("utf-8", "surrogateescape")
     data = record_bytes(Record(name=name, scores={name: Scores((1.0,), None)}))
     assert list(json.loads(data)["scores"]) == [json.loads(data)["name"]] == ["Füchse\ufffd"]
 
 
-def test_numbers_that_json_does_not_have_become_null() -> None:
+def test_numbers_outside_json_become_null() -> None:
     data = json.loads(record_bytes(Scores((1.0,), math.nan)))
     assert data == {"values": [1.0], "best": None}
     assert json.loads(record_bytes(Scores((), math.inf)))["best"] is None
 
 
-def test_unknown_fields_are_passed_over_and_whole_numbers_are_numbers(tmp_path: Path) -> None:
+def test_unknown_fields_are_skipped_and_integers_are_floats(tmp_path: Path) -> None:
     path = tmp_path / "record.json"
     path.write_text('{"version": 3, "name": "n", "later": [1], "scores": {"a": {"values": [1], "best": 2}}}')
     assert read_record(path, Record).scores["a"] == Scores((1.0,), 2.0)

@@ -39,7 +39,6 @@ from .plain import (
     FitResult as FitResult,
     PlainRun as PlainRun,
     fit_scene as fit_scene,
-    refit_model as refit_model,
 )
 from .ranks import Ranks as Ranks, here as here, joined as joined
 from .reporting import Reporter as Reporter, SilentReporter as SilentReporter

@@ -17,6 +17,7 @@ from torch import Tensor
 from keyss import _threads
 from keyss.core.errors import InputError, Interrupted, KeyssWarning, OtherProcessError
 from keyss.fitting.checkpoint import State, load_checkpoint, pack_state, save_checkpoint, unpack_state
+from keyss.fitting.config import FitConfig
 from keyss.fitting.ranks import here
 from keyss.fitting.reporting import Modelled, ModelReporter, Reporter, SilentReporter
 from keyss.fitting.sampling import own_randomness
@@ -67,16 +68,14 @@ _SPINNING = (
 def train(
     run: TrainingRun,
     title: str,
+    config: FitConfig,
     *,
     fingerprint: dict[str, Any],
-    seed: int,
     checkpoint: Path | None = None,
     resume: bool = False,
-    checkpoint_seconds: float = 180.0,
-    evaluate_every: int = 500,
     reporter: Reporter | None = None,
 ) -> None:
-    """Take `run` to its last iteration.
+    """Take `run` to its last iteration, with the seed and the intervals of `config`.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds`, on Ctrl-C, SIGTERM and SIGHUP
     (raises Interrupted), and at the end; with `resume`, training continues from it if the file exists.
@@ -88,7 +87,7 @@ def train(
     state. A signal to one of them interrupts all. When one ends, the first saves, and all raise
     OtherProcessError.
     """
-    ranks = here()
+    ranks, evaluate_every = here(), config.evaluate_every
     if not ranks.first:
         checkpoint, reporter, evaluate_every = None, None, 0
     reporter = reporter or SilentReporter()
@@ -100,7 +99,7 @@ def train(
             save_checkpoint(checkpoint, state[0], state[1] | {"fingerprint": fingerprint})
 
     saves = checkpoint is not None or ranks.count > 1
-    with deferred(saves=saves) as interrupted, own_randomness(seed):
+    with deferred(saves=saves) as interrupted, own_randomness(config.known_seed):
         if checkpoint is not None and resume and checkpoint.exists():
             _resume(run, checkpoint, fingerprint)
         if ranks.count > 1:
@@ -126,7 +125,7 @@ def train(
                 if signum := ranks.agree(interrupted() or 0, len(run)):
                     save(_state(run))
                     raise Interrupted(checkpoint, run.iteration, signal.Signals(signum))
-                if time.monotonic() - saved > checkpoint_seconds:
+                if time.monotonic() - saved > config.checkpoint_seconds:
                     save(_state(run))
                     saved = time.monotonic()
             save(_state(run))

@@ -118,6 +118,8 @@ def fit_scene(
     scene: Scene,
     config: FitConfig | None = None,
     *,
+    model: Gaussians | None = None,
+    rate: float = 1.0,
     device: torch.device | str = "cpu",
     title: str = "fit",
     checkpoint: Path | None = None,
@@ -126,59 +128,22 @@ def fit_scene(
 ) -> FitResult:
     """Train plain 3DGS on the training views of `scene`; only a run with a seed can be resumed.
 
-    Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a checkpoint of another run.
+    A given `model` is trained further, without growing or pruning it, at the rates of `config` times `rate`;
+    the SH degree is its own. Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a
+    checkpoint of another run.
     """
-    config = (config or FitConfig()).seeded()
-    run = PlainRun(scene, config, torch.device(device))
-    _train(run, title, {"scene": scene.digest()}, checkpoint, resume, reporter)
-    return FitResult(without_faint(run.gaussians().to("cpu"), config.prune_opacity), config)
-
-
-def refit_model(
-    scene: Scene,
-    model: Gaussians,
-    config: FitConfig,
-    *,
-    rate: float = 1.0,
-    device: torch.device | str = "cpu",
-    title: str = "refit",
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    reporter: Reporter | None = None,
-) -> Gaussians:
-    """Train `model` further on the training views of `scene`, without growing or pruning it.
-
-    `rate`: a factor on all rates of `config`, whose SH degree and cap are ignored. Raises as `fit_scene`.
-    """
-    rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
-    config = replace(config.seeded(), sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
+    config, inputs = (config or FitConfig()).seeded(), {"scene": scene.digest()}
+    if model is not None:
+        rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
+        config = replace(config, sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
+        inputs["model"] = model.digest()
     run = PlainRun(scene, config, torch.device(device), model)
-    inputs = {"scene": scene.digest(), "model": model.digest()}
-    _train(run, title, inputs, checkpoint, resume, reporter)
-    return run.gaussians().to("cpu")
-
-
-def _train(
-    run: PlainRun,
-    title: str,
-    inputs: dict[str, str],
-    checkpoint: Path | None,
-    resume: bool,
-    reporter: Reporter | None,
-) -> None:
-    """See `train`. `inputs`: digests of the scene and of the given model."""
-    config = run.config
+    fingerprint = {**inputs, "config": asdict(config)}
     train(
-        run,
-        title,
-        fingerprint={**inputs, "config": asdict(config)},
-        seed=config.known_seed,
-        checkpoint=checkpoint,
-        resume=resume,
-        checkpoint_seconds=config.checkpoint_seconds,
-        evaluate_every=config.evaluate_every,
-        reporter=reporter,
+        run, title, config, fingerprint=fingerprint, checkpoint=checkpoint, resume=resume, reporter=reporter
     )
+    fitted = run.gaussians().to("cpu")
+    return FitResult(without_faint(fitted, config.prune_opacity) if run.grows else fitted, config)
 
 
 def without_faint(model: Gaussians, min_opacity: float) -> Gaussians:

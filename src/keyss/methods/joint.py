@@ -239,21 +239,18 @@ def train_jointly(
     run = begin(
         [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
     )
-    fit = run.options.fit
     train(
         run,
         "hide",
+        run.options.fit,
         fingerprint={
             "method": run.options.method,
             "scenes": [source.scene.digest() for source in sources],
             "models": [source.model.digest() for source in sources],
             "options": json.loads(json.dumps(asdict(run.options))),  # tuples as they are read back
         },
-        seed=fit.known_seed,
         checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,
         resume=context.resume,
-        checkpoint_seconds=fit.checkpoint_seconds,
-        evaluate_every=fit.evaluate_every,
         reporter=context.reporter,
     )
     return run

@@ -8,7 +8,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
-from keyss.fitting.plain import refit_model
+from keyss.fitting.plain import fit_scene
 from keyss.fitting.reporting import of_secret
 from keyss.methods.base import Context
 from keyss.rendering import contributions
@@ -32,11 +32,11 @@ def refitted(
 
     Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
     """
-    return refit_model(
+    return fit_scene(
         scene,
-        most_contributing(secret, scene, count),
         # A refit must not depend on the other secrets.
         replace(fit, seed=fit.seed_of(name)),
+        model=most_contributing(secret, scene, count),
         rate=1.0 if photos else _MODEL_RATE,
         device=context.device,
         title=f"refit of the {name}",
@@ -45,7 +45,7 @@ def refitted(
         else None,
         resume=context.resume,
         reporter=of_secret(context.reporter),
-    )
+    ).gaussians
 
 
 def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
