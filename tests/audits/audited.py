@@ -1,4 +1,4 @@
-"""A small run that was really hidden and audited, and changes of what the audit found."""
+"""A small run that was really hidden and audited, and changes of its record."""
 
 from __future__ import annotations
 

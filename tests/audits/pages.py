@@ -1,4 +1,4 @@
-"""What is in a page of HTML, by Python's own parser."""
+"""The content of an HTML page, by Python's own parser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures: the same on every day, part of the page, and drawn from whatever numbers an audit may hold."""
+"""Figures: always the same bytes, part of the page, and plotted from any numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An audit from files: what it writes, how it goes on, what it refuses."""
+"""An audit from files: what it writes, resumes and refuses."""
 
 from __future__ import annotations
 
@@ -129,9 +129,10 @@ def test_every_part_has_a_sentence_and_a_field_of_the_record() -> None:
 
 
 def test_the_command_runs_the_real_parts_and_writes_the_report(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All parts but robustness, whose changes have tests of their own and take longer."""
+    monkeypatch.setenv("COLUMNS", "200")  # no cell of the table wraps
     (tmp_path / "key").write_text(KEY)
     chosen = [name for name in parts.PARTS if name != "robustness"]
     flags = [word for name in chosen for word in ("--only", name)]

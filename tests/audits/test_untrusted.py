@@ -1,4 +1,4 @@
-"""Audits that are broken, hostile or from somewhere else."""
+"""Broken and hostile audits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which word each number gets, on both sides of each threshold."""
+"""The verdict on each number, on both sides of each limit."""
 
 from __future__ import annotations
 

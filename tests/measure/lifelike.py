@@ -1,4 +1,4 @@
-"""Models whose numbers are spread as after training, and changes to them that a measure should tell apart."""
+"""Models distributed as after training, and changes that measures should detect."""
 
 from __future__ import annotations
 

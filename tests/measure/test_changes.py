@@ -1,4 +1,4 @@
-"""Each change of a published model does what it says: known answers, and what formats promise."""
+"""Each change of a published model: known answers, and the precision that formats promise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Distances of attributes: each change moves what it changes, by known amounts, and chance is told apart."""
+"""Each change moves its own attribute, by known amounts, and chance is told apart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures of pictures, against their definitions and against other people's programs."""
+"""Measures of images against their definitions and other programs."""
 
 from __future__ import annotations
 

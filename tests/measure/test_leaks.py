@@ -1,4 +1,4 @@
-"""Looking for a secret: what is planted is found by what it is open to, and elsewhere nothing is."""
+"""Attacks find planted secrets by what sets them apart, and nothing in plain models."""
 
 from __future__ import annotations
 

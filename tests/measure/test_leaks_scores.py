@@ -1,4 +1,4 @@
-"""How much of a photo a picture shows: known answers."""
+"""Scores of leaks: known answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `keyss.measure` offers, and that asking for it loads nothing yet."""
+"""The names of `keyss.measure`, and that importing it loads nothing heavy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What changes of published models cost cover and secrets, and which of them breaks down first."""
+"""Losses of cover and secrets after changes of published models, and breakdown points."""
 
 from __future__ import annotations
 

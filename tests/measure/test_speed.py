@@ -1,4 +1,4 @@
-"""Times, sizes and other people's readers, with a clock that is known."""
+"""Times, sizes and third-party readers, with a known clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""StegExpose anew: equal to the original on its images, and to its description on any."""
+"""StegExpose: equal to the original on its images, and to its description on any."""
 
 from __future__ import annotations
 

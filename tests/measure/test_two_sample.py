@@ -1,4 +1,4 @@
-"""The classifier tells apart what differs, does not what is the same, and says how sure that is."""
+"""The classifier separates different models, not equal ones, and its interval is right."""
 
 from __future__ import annotations
 

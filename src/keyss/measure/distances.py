@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from statistics import fmean
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -149,6 +149,14 @@ def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -
         "harmonics": sh[:, 1:].reshape(len(sh), 45),
     }
     return {name: values.astype(np.float32) for name, values in columns.items()}
+
+
+def space_cells(positions: npt.NDArray[np.floating[Any]], per_axis: int) -> npt.NDArray[np.intp]:
+    """[N] index of the cell of each position [N, 3]; cells lie between quantiles of the coordinates."""
+    cuts = np.quantile(positions, np.arange(1, per_axis) / per_axis, axis=0)
+    index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
+    cells: npt.NDArray[np.intp] = np.ravel_multi_index(index, (per_axis,) * 3)
+    return cells
 
 
 def _directions(generator: np.random.Generator, size: int) -> Floats:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from keyss.core import Gaussians, UsageError, import_extra
 from keyss.measure.auc import Auc, delong
-from keyss.measure.distances import features
+from keyss.measure.distances import features, space_cells
 
 MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # of each model
 FOLDS = 5
@@ -52,10 +52,8 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
 
 
 def _folds(positions: npt.NDArray[np.float32], seed: int) -> Ints:
-    """[N] the fold of each Gaussian: cells between quantiles of the coordinates get random folds."""
-    cuts = np.quantile(positions, np.arange(1, _CELLS) / _CELLS, axis=0)
-    index = [np.searchsorted(cuts[:, axis], positions[:, axis], side="right") for axis in range(3)]
-    _, cell = np.unique(np.ravel_multi_index(index, (_CELLS,) * 3), return_inverse=True)
+    """[N] the fold of each Gaussian; each cell of space has a random one."""
+    _, cell = np.unique(space_cells(positions, _CELLS), return_inverse=True)
     folds: Ints = np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
     return folds
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.core.gaussians import Gaussians
+from keyss.measure.distances import space_cells
 from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
-from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Ints, Words, doubles
+from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Words, doubles
 
 _UNIT = 5e-7  # error of a length normalised in float32
 _MOVED, _AROUND = 2e-4, 2e-3  # how far embedding moves a length; the range that gives the smooth density
@@ -51,21 +52,15 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
             float(np.log10(np.median(error) + 1e-9))
         ),
     }
-    positions = doubles(model.means)
-    for name, part in (("space", _cells(positions)), ("rows", np.arange(len(unit)) * _BLOCKS // len(unit))):
+    for name, part in (
+        ("space", space_cells(doubles(model.means), _CELLS)),
+        ("rows", np.arange(len(unit)) * _BLOCKS // len(unit)),
+    ):
         count, hits = np.bincount(part), np.bincount(part, weights=unit)
         shares = (hits / np.maximum(count, 1))[count >= _MIN_GAUSSIANS]
         spread = float(shares.max() - shares.min()) if len(shares) else 0.0
         statistics[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
     return statistics
-
-
-def _cells(positions: Floats) -> Ints:
-    """[N] index of the cell between quantiles of each coordinate."""
-    cuts = np.quantile(positions, np.arange(1, _CELLS) / _CELLS, axis=0)
-    index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
-    cells: Ints = np.ravel_multi_index(index, (_CELLS,) * 3)
-    return cells
 
 
 def _repeated(values: Bits) -> int:
