@@ -33,8 +33,17 @@ BINARIES = ("cameras.bin", "images.bin", "points3D.bin")
 
 def as_text(binary: Path, text: Path) -> None:
     """COLMAP's own conversion of a model to .txt."""
-    text.mkdir(parents=True)
+    text.mkdir(parents=True, exist_ok=True)
     pycolmap.Reconstruction(binary).write_text(text)
+
+
+def text_scene(folder: Path) -> Path:
+    """The model's folder of a scene whose model is text."""
+    model = write_colmap(folder) / "sparse" / "0"
+    as_text(model, model)
+    for name in BINARIES:
+        (model / name).unlink()
+    return model
 
 
 @pytest.mark.parametrize("model", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
@@ -128,13 +137,9 @@ def test_no_points_and_no_observations(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
-    model = write_colmap(tmp_path / "scene") / "sparse" / "0"
-    if suffix == ".txt":
-        as_text(model, tmp_path / "text")
-        for name in BINARIES:
-            (model / name).unlink()
-        for path in (tmp_path / "text").iterdir():
-            path.rename(model / path.name)
+    write = text_scene if suffix == ".txt" else write_colmap
+    write(tmp_path / "scene")
+    model = tmp_path / "scene" / "sparse" / "0"
     (model / f"points3D{suffix}").unlink()
     with pytest.warns(KeyssWarning, match=rf"points3D\{suffix}: there are no points; .* random points"):
         scene = load_scene(tmp_path / "scene")
@@ -209,15 +214,10 @@ def test_truncated_points_of_a_real_scene(real_data: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 @pytest.mark.parametrize("kind", ["cameras", "images", "points3D"])
 def test_damage_gives_an_input_error_or_a_scene(tmp_path: Path, kind: str, suffix: str) -> None:
-    folder = write_colmap(tmp_path / "scene")
-    model = folder / "sparse" / "0"
-    if suffix == ".txt":
-        as_text(model, tmp_path / "text")
-        for name in BINARIES:
-            (model / name).unlink()
-        for path in (tmp_path / "text").iterdir():
-            path.rename(model / path.name)
-    path = model / (kind + suffix)
+    folder = tmp_path / "scene"
+    write = text_scene if suffix == ".txt" else write_colmap
+    write(folder)
+    path = folder / "sparse" / "0" / (kind + suffix)
     outcomes = set()
     for broken in mutations(path.read_bytes(), 150):
         path.write_bytes(broken)
@@ -317,13 +317,7 @@ def test_impossible_values_are_named(tmp_path: Path, replaced: dict[str, bytes],
     ],
 )
 def test_broken_text_names_the_line(tmp_path: Path, name: str, text: str, message: str) -> None:
-    model = write_colmap(tmp_path / "scene") / "sparse" / "0"
-    as_text(model, tmp_path / "text")
-    (tmp_path / "text" / name).write_text(text)
-    for path in BINARIES:
-        (model / path).unlink()
-    for path in (tmp_path / "text").iterdir():
-        path.rename(model / path.name)
+    (text_scene(tmp_path / "scene") / name).write_text(text)
     with pytest.raises(InputError, match=message):
         read_colmap(tmp_path / "scene")
 

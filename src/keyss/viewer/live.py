@@ -12,7 +12,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from io import BytesIO
 from types import TracebackType
 from typing import Any, BinaryIO, Literal, Self
@@ -21,7 +21,7 @@ from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import model_bytes
 from keyss.fitting.reporting import Reporter
-from keyss.viewer.page import page_live
+from keyss.viewer.page import served_page
 from keyss.viewer.serving import PageServer
 
 Side = Literal["published", "secret"]
@@ -37,7 +37,6 @@ class _Copy:
 
     version: int
     model: Gaussians
-    lock: threading.Lock = field(default_factory=threading.Lock)
     ply: bytes | None = None
 
 
@@ -50,7 +49,7 @@ class LiveTraining:
         for side in ("published", "secret"):
             contents[f"{_STATE}/{side}.ply"] = ("application/octet-stream", self._opens(side))
         folder = f"/{secrets.token_urlsafe(16)}/"
-        self._server = PageServer(page_live(_STATE, up), contents, folder=folder)
+        self._server = PageServer(served_page("keyss-live", _STATE, up), contents, folder=folder)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._timer = timer
         self._progress: dict[str, Any] = {}
@@ -120,12 +119,11 @@ class LiveTraining:
             copy = self._copies.get(side)
             if copy is None:
                 raise FileNotFoundError(side)
-            with copy.lock:
-                if copy.ply is None:
-                    try:
-                        copy.ply = model_bytes("model.ply", copy.model)
-                    except KeyssError as error:  # a diverged training
-                        raise OSError(str(error)) from error
+            if copy.ply is None:
+                try:
+                    copy.ply = model_bytes("model.ply", copy.model)
+                except KeyssError as error:  # a diverged training
+                    raise OSError(str(error)) from error
             return BytesIO(copy.ply)
 
         return opened

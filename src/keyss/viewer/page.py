@@ -31,14 +31,18 @@ def served_policy() -> str:
     return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
 
 
-def page_beside(model: str, up: str = "-y") -> bytes:
-    """The page for `model`, the URL of a file beside it; style and script are beside it too."""
-    return _served("keyss-model", model, up)
+def served_page(kind: str, url: str, up: str = "-y") -> bytes:
+    """The page with style and script beside it.
 
-
-def page_live(state: str, up: str = "-y") -> bytes:
-    """The page for a running training; `state` is the URL of the JSON that `LiveTraining` serves."""
-    return _served("keyss-live", state, up)
+    `url` is a model's for the kind "keyss-model", that of the JSON of `LiveTraining` for "keyss-live".
+    """
+    return _page(
+        policy=served_policy(),
+        style=f'<link rel="stylesheet" href="{STYLE}">',
+        model=f'<meta name="{kind}" content="{html.escape(url)}">',
+        script=f'<script src="{SCRIPT}"></script>',
+        up=up,
+    )
 
 
 def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
@@ -91,7 +95,7 @@ def export_html(
         check_not_an_input(out, [model])
         write_bytes(check_output_file(out, overwrite), page_with(data, file.name, up))
         return (out,)
-    contents = {INDEX: page_beside(quote(file.name), up), file.name: data}
+    contents = {INDEX: served_page("keyss-model", quote(file.name), up), file.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
     if len(contents) < 5:
         raise UsageError(f"{model} has the name of a file of the viewer: rename it")
@@ -110,16 +114,6 @@ def export_html(
 def asset(name: str) -> bytes:
     """A file of the built application."""
     return files("keyss.viewer").joinpath("assets", name).read_bytes()
-
-
-def _served(name: str, content: str, up: str) -> bytes:
-    return _page(
-        policy=served_policy(),
-        style=f'<link rel="stylesheet" href="{STYLE}">',
-        model=f'<meta name="{name}" content="{html.escape(content)}">',
-        script=f'<script src="{SCRIPT}"></script>',
-        up=up,
-    )
 
 
 def _page(*, policy: str, up: str, **parts: str) -> bytes:

@@ -13,7 +13,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
-from keyss.viewer.page import SCRIPT, STYLE, asset, page_beside, served_policy
+from keyss.viewer.page import SCRIPT, STYLE, asset, served_page, served_policy
 from keyss.viewer.showing import readable
 
 LOCALHOST = "127.0.0.1"
@@ -79,7 +79,7 @@ class ModelServer(PageServer):
         Raises InputError if `model` is not a model, OutputError if the port is in use.
         """
         file = readable(Path(model))
-        page = page_beside(f"model/{quote(file.name)}", up)
+        page = served_page("keyss-model", f"model/{quote(file.name)}", up)
         super().__init__(page, {f"model/{file.name}": ("application/octet-stream", file.open)}, host, port)
 
 
@@ -89,12 +89,6 @@ def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
         timeout = 30
 
         def do_GET(self) -> None:
-            self._answer(with_content=True)
-
-        def do_HEAD(self) -> None:
-            self._answer(with_content=False)
-
-        def _answer(self, *, with_content: bool) -> None:
             try:
                 host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
             except ValueError:
@@ -117,8 +111,7 @@ def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
                     for name, value in _headers(media_type, size).items():
                         self.send_header(name, value)
                     self.end_headers()
-                    if with_content:
-                        shutil.copyfileobj(file, self.wfile)
+                    shutil.copyfileobj(file, self.wfile)
             except OSError:  # the client has left, or the model is gone
                 self.close_connection = True
 
