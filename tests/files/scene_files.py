@@ -1,4 +1,4 @@
-"""Tiny valid scenes on disk, and the means to break them."""
+"""Tiny valid scenes on disk, and random damage."""
 
 from __future__ import annotations
 

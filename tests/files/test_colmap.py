@@ -1,4 +1,4 @@
-"""COLMAP scenes: pycolmap is the oracle for what is valid, and nothing broken gets through."""
+"""COLMAP scenes: agreement with pycolmap, and refusal of broken files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def as_text(binary: Path, text: Path) -> None:
 
 
 def text_scene(folder: Path) -> Path:
-    """The model's folder of a scene whose model is text."""
+    """Write a scene with a text model; returns the model's folder."""
     model = write_colmap(folder) / "sparse" / "0"
     as_text(model, model)
     for name in BINARIES:

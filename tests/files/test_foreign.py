@@ -1,4 +1,4 @@
-"""What people are told of files that keyss does not read, by name or by content."""
+"""Messages about files that keyss does not read, by name or content."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def test_strong_distortion_is_cut_down_to_where_it_is_unique() -> None:
     assert corner > 0.9 / np.sqrt(1.5)
 
 
-def test_hopeless_distortion_is_refused() -> None:
+def test_distortion_that_cannot_be_undone_is_refused() -> None:
     lens = make_lens("here", W, H, {"f": 5, "cx": 80, "cy": 60, "k1": -100})
     with pytest.raises(InputError, match=r"here: the lens distortion .* cannot be undone"):
         undistortion(lens, "here")

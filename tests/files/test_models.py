@@ -1,4 +1,4 @@
-"""The one door for models: which format is chosen, and that a format is one entry."""
+"""The choice of a model format, and new formats."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def read_toy(file: BinaryIO) -> Gaussians:
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second format, entered as a new one would be: by one more item of the list."""
+    """A new format: one more entry of the list."""
     entry = ModelFormat("toy", (".toy", ".toy.bin"), (b"TOY!",), read_toy, write_toy)
     monkeypatch.setattr(models, "FORMATS", [*models.FORMATS, entry])
 
@@ -80,7 +80,7 @@ def test_unknown_content_is_told_what_is_supported(tmp_path: Path, data: bytes, 
         read_model(tmp_path / "a.ply")
 
 
-def test_what_is_no_file(tmp_path: Path) -> None:
+def test_paths_that_are_not_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected a 3DGS model \(.*\), but there is no such file"):
         read_model(tmp_path / "missing.ply")
     (tmp_path / "folder.ply").mkdir()

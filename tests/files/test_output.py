@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, are their owner's only, and leave nothing beside them."""
+"""Writes are atomic and private, and leave no temporary files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ with lock(Path(sys.argv[1])):
 
 @contextmanager
 def child(program: str, path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that has said its first word; it is killed at the end."""
+    """A process that has printed its first line; it is killed at the end."""
     with subprocess.Popen(
         [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True
     ) as process:

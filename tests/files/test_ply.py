@@ -1,11 +1,9 @@
-"""The Inria PLY: exact round trips, other people's tools, hostile bytes."""
+"""The Inria PLY: exact round trips, other programs, hostile bytes."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import gsply
@@ -14,10 +12,11 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from keyss.core import Gaussians, InputError, OutputError
+from keyss.core import Gaussians, InputError, OutputError, same_bits
 from keyss.files import read_model, write_model
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
+Transform = Callable[..., Path]
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
@@ -30,12 +29,6 @@ def random_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
     return Gaussians(
         normal(n, 3), normal(n, 4), normal(n, 3) - 4, 2 * normal(n), 0.3 * normal(n, (degree + 1) ** 2, 3)
     )
-
-
-def assert_same_bits(a: Gaussians, b: Gaussians) -> None:
-    for name in FIELDS:
-        ours, theirs = getattr(a, name), getattr(b, name)
-        assert torch.equal(ours.view(torch.int32), theirs.view(torch.int32)), name
 
 
 def names_of(degree: int, *, normals: bool = True) -> list[str]:
@@ -137,7 +130,7 @@ def test_round_trip_is_bit_exact(tmp_path: Path, data: st.DataObject, n: int, de
     write_model(tmp_path / "a.ply", gaussians)
     back = read_model(tmp_path / "a.ply")
     assert back.sh_degree == degree
-    assert_same_bits(back, gaussians)
+    assert same_bits(back, gaussians)
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
@@ -153,13 +146,13 @@ def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
     kinds = {"red": "uchar", "label": "short", "confidence": "double", "x": "double", "f_dc_1": "double"}
     path = tmp_path / "a.ply"
     path.write_bytes(ply_bytes({name: columns[name] for name in names}, form=form, kinds=kinds))
-    assert_same_bits(read_model(path), gaussians)
+    assert same_bits(read_model(path), gaussians)
 
 
 def test_reads_what_is_longer_than_one_chunk(tmp_path: Path) -> None:
     gaussians = random_gaussians(12_345, 3)
     write_model(tmp_path / "a.ply", gaussians)
-    assert_same_bits(read_model(tmp_path / "a.ply"), gaussians)
+    assert same_bits(read_model(tmp_path / "a.ply"), gaussians)
 
 
 def test_ignores_comments_other_elements_and_trailing_bytes(model: Path) -> None:
@@ -169,7 +162,7 @@ def test_ignores_comments_other_elements_and_trailing_bytes(model: Path) -> None
     head += b"element face 3\nproperty list uchar int vertex_indices\ncomment\n"
     other = model.with_name("other.ply")
     other.write_bytes(head + b"end_header\n" + bytes(16) + body + b"anything")
-    assert_same_bits(read_model(other), read_model(model))
+    assert same_bits(read_model(other), read_model(model))
 
 
 def test_infinite_opacity_is_clamped(tmp_path: Path) -> None:
@@ -348,7 +341,7 @@ def test_real_models(real_data: Path, tmp_path: Path, name: str, count: int, deg
     assert np.array_equal(gaussians.means.numpy(), theirs.means)
     assert np.array_equal(gaussians.sh[:, 0].numpy(), theirs.sh0)
     write_model(tmp_path / "a.ply", gaussians)
-    assert_same_bits(read_model(tmp_path / "a.ply"), gaussians)
+    assert same_bits(read_model(tmp_path / "a.ply"), gaussians)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -377,47 +370,23 @@ def test_we_read_gsply(tmp_path: Path, degree: int) -> None:
         gaussians.sh[:, 0].numpy(),
         rest,
     )
-    assert_same_bits(read_model(tmp_path / "a.ply"), gaussians)
-
-
-@pytest.fixture(scope="session")
-def splat_transform() -> str:
-    """Path of the splat-transform program."""
-    local = Path(__file__).parents[2] / "node_modules" / ".bin" / "splat-transform"
-    named = os.environ.get("KEYSS_SPLAT_TRANSFORM")
-    tool = named or (str(local) if local.exists() else shutil.which("splat-transform"))
-    if not tool:
-        pytest.skip("splat-transform not found: npm install --no-save @playcanvas/splat-transform@2.7.1")
-    return tool
-
-
-def transform(tool: str, source: Path, target: Path) -> Path:
-    subprocess.run([tool, str(source), str(target)], check=True, capture_output=True, timeout=60)
-    return target
+    assert same_bits(read_model(tmp_path / "a.ply"), gaussians)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_splat_transform_copies_ours(splat_transform: str, tmp_path: Path, degree: int) -> None:
+def test_splat_transform_copies_ours(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
     gaussians = random_gaussians(40, degree)
     write_model(tmp_path / "in.ply", gaussians)
-    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
-    assert_same_bits(read_model(copy), gaussians)
+    copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
+    assert same_bits(read_model(copy), gaussians)
 
 
-def test_splat_transform_converts_ours(splat_transform: str, tmp_path: Path) -> None:
+def test_splat_transform_converts_ours(splat_transform: Transform, tmp_path: Path) -> None:
     gaussians = random_gaussians(40, 3)
     write_model(tmp_path / "in.ply", gaussians)
-    table = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.csv").read_text().splitlines()
+    table = splat_transform(tmp_path / "in.ply", tmp_path / "out.csv").read_text().splitlines()
     header, first = table[0].split(","), [float(cell) for cell in table[1].split(",")]
     expected = columns_of(gaussians)
     assert set(header) >= set(names_of(3, normals=False))
     for name, value in zip(header, first, strict=True):
         assert value == pytest.approx(float(expected[name][0]), abs=1e-5), name
-
-    packed = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.compressed.ply")
-    with pytest.raises(InputError, match="compressed"):
-        read_model(packed)
-    unpacked = read_model(transform(splat_transform, packed, tmp_path / "back.ply"))
-    lost = torch.cdist(unpacked.means, gaussians.means).amin(1)  # the format re-orders
-    assert unpacked.sh_degree == 3
-    assert float(lost.max()) < 0.01

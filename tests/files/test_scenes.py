@@ -1,4 +1,4 @@
-"""What holds for scenes of every layout: detection, photos, sizes, determinism."""
+"""Properties of scenes in every layout: detection, photos, sizes, determinism."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_shrinking_averages_areas(tmp_path: Path, width: int) -> None:
 
 
 def area_weights(old: int, new: int) -> np.ndarray:
-    """[new, old] share of each old cell in each new one."""
+    """[new, old] the share of each old cell in each new one."""
     edges = np.arange(new + 1) * old / new
     left, right = edges[:-1, None], edges[1:, None]
     cells = np.arange(old)[None]
@@ -189,7 +189,9 @@ def test_a_photo_that_only_its_exif_data_turn_is_explained(tmp_path: Path) -> No
     write_colmap(tmp_path, cameras=counted(camera_bytes(width=HEIGHT, height=WIDTH)))
     for path in (tmp_path / "images").iterdir():
         Image.fromarray(photo(1)).save(path, exif=exif)
-    with pytest.raises(InputError, match=r"camera, 8x12 .*found 12x8; its EXIF data say .* turn its pixels"):
+    with pytest.raises(
+        InputError, match=r"camera, 8x12 .*found 12x8; its EXIF orientation .* rotate its pixels"
+    ):
         load_scene(tmp_path)
 
 
@@ -223,7 +225,7 @@ def test_a_scene_without_any_photo_is_refused_in_any_case(tmp_path: Path, layout
     WRITERS[layout](tmp_path, count=7)
     for path in tmp_path.rglob("*.png"):
         path.unlink()
-    with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more; put"):
+    with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more; `skip"):
         load_scene(tmp_path)
     with pytest.raises(InputError, match="all of its 7 photos are missing"):
         load_scene(tmp_path, skip_missing=True)

@@ -1,4 +1,4 @@
-"""What tests run in processes of their own: importable there without pytest."""
+"""Code that tests run in child processes, importable without pytest."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rendering.scenes import Scene, random_scene
 
 
 def digest(scene: Scene) -> str:
-    """A hash of everything that drawing the scene and going back gives, bit by bit."""
+    """A hash of all bits of the results of forward and backward pass."""
     found = hashlib.sha256()
     for tensor in scene.results().values():
         found.update(tensor.contiguous().numpy().tobytes())
@@ -20,13 +20,13 @@ def digest(scene: Scene) -> str:
 
 
 def digest_on_threads(threads: int) -> str:
-    """That of one random scene."""
+    """The digest of a random scene on so many threads."""
     torch.set_num_threads(threads)
     return digest(random_scene(count=300, width=60, height=70))
 
 
 def check_on_generic_processor(names: Sequence[str]) -> str:
-    """Holds scenes to the dense reference; returns for which processor, without extras, the kernels are."""
+    """Check scenes against the dense reference; returns the processor that the kernels are compiled for."""
     from numba.core.registry import cpu_target
 
     from rendering.scenes import SCENES

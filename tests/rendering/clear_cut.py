@@ -1,4 +1,4 @@
-"""Makes scenes in which no decision is a close call.
+"""Changes scenes until no decision of the rasterizer is a close call.
 
 The rasterizer decides: whether an alpha is too faint, whether it is clamped, whether a pixel has stopped,
 what lies before the near plane, what comes first, where a colour is clamped at black. At a threshold the
@@ -29,7 +29,7 @@ ROUNDS = 60
 
 
 def margins(scene: Scene) -> Margins:
-    """The least distance [N] of each Gaussian to each threshold, over all cameras."""
+    """The minimum distance [N] of each Gaussian to each threshold, over all cameras."""
     least: Margins = {}
     leaves = scene.leaves(torch.float64)
     with torch.no_grad():
@@ -42,7 +42,7 @@ def margins(scene: Scene) -> Margins:
 
 
 def close_calls(scene: Scene) -> dict[str, Tensor]:
-    """Which Gaussians come too near to which thresholds."""
+    """The Gaussians that are too close to a threshold, by its name."""
     return {
         name: (values < REQUIRED[name]).nonzero()[:, 0]
         for name, values in margins(scene).items()
@@ -51,7 +51,7 @@ def close_calls(scene: Scene) -> dict[str, Tensor]:
 
 
 def clear_cut(scene: Scene) -> Scene:
-    """The scene after small changes to the Gaussians with close calls, until there are none."""
+    """The scene with small changes to Gaussians until there are no close calls."""
     generator = torch.Generator().manual_seed(12345)
 
     def normal(like: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Small scenes that between them reach every branch of the rasterizer."""
+"""Small scenes that together reach every branch of the rasterizer."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Scene:
         return rasterization(**{**cameras, **leaves, **self.settings(), **changes})
 
     def results(self, leaves: dict[str, Tensor] | None = None, **changes: Any) -> dict[str, Tensor]:
-        """Everything that comes out: images, alphas, meta and every gradient of a fixed, random loss."""
+        """All results: images, alphas, meta and the gradients of a fixed random loss."""
         leaves = self.leaves() if leaves is None else leaves
         images, alphas, meta = self.draw(leaves, **changes)
         meta["means2d"].retain_grad()
@@ -96,7 +96,7 @@ def random_scene(
     size: float = 0.1,
     seed: int = 0,
 ) -> Scene:
-    """Random Gaussians before slightly turned cameras whose principal points are off centre."""
+    """Random Gaussians seen by slightly rotated cameras with principal points off centre."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:

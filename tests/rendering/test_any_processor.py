@@ -1,4 +1,4 @@
-"""The kernels as they are compiled for processors without AVX2, whose vectors hold four numbers or two."""
+"""The kernels compiled for processors without AVX2, with vectors of two or four numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCENES = ("random", "three cameras, features")
 
 
 def test_images_and_gradients_without_avx2() -> None:
-    """In a process of its own, for a processor is chosen once; what it compiles is kept for the next time."""
+    """In a child process, since the processor is chosen once; the compiled kernels are cached."""
     cache = jit.cache_folder()
     assert cache is not None
     program = (

@@ -1,4 +1,4 @@
-"""The arguments are those of gsplat; wrong and unsupported ones are refused, each by name."""
+"""The arguments are those of gsplat; errors name wrong and unsupported ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Close calls are noticed and done away with; otherwise other tests would prove less than they seem to."""
+"""Close calls are found and removed, which other tests rely on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The conventions of 3DGS, each in numbers worked out by hand."""
+"""The conventions of 3DGS, each against numbers computed by hand."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Both backends draw the same picture and give the same gradients.
+"""Both backends give the same images and gradients.
 
-No decision in these scenes is a close call, so that rounding alone cannot make the pictures differ. gsplat's
+No decision in these scenes is a close call that rounding could change. gsplat's
 kernels compute in float32 with approximate exponentials and add up in any order: hence the tolerances.
 """
 

@@ -1,4 +1,4 @@
-"""Models whose pictures a network makes: drawn, moved, selected, written and read."""
+"""Models that a network decodes: rendering, moving, selecting, writing and reading."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_the_picture_is_what_the_layers_make_of_the_features(model: DecodedGauss
 
 
 def test_without_features_the_network_sees_the_colours_before_its_own_background() -> None:
-    """Whoever draws it says what lies behind *their* scene, which is not what the network learned with."""
+    """The caller's background is not the one that the network was trained with."""
     plain, camera = random_gaussians(50), ring_cameras()[0]
     identity = torch.zeros(3, 3, 3, 3)
     identity[range(3), range(3), 1, 1] = 1

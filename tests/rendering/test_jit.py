@@ -1,4 +1,4 @@
-"""The cache of compiled kernels: where it lies, and that nothing breaks where it cannot."""
+"""The cache of compiled kernels: its folder, and rendering without one."""
 
 from __future__ import annotations
 

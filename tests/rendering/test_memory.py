@@ -1,4 +1,4 @@
-"""Memory for the kernels is used again, never by two at once, and there is not too much of it."""
+"""Memory for the kernels is recycled, never shared, and bounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras around models, and the scenes made of what they show."""
+"""Cameras around models, and the scenes of their renders."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def test_cameras_stand_around_look_at_the_middle_and_hold_minus_y_up() -> None:
     assert (camera_positions(cameras) - middle).norm(dim=1).min() > radius
 
 
-def test_what_hardly_shows_moves_no_camera() -> None:
-    """Faint giants and a few far floaters are in most models."""
+def test_faint_and_distant_gaussians_move_no_camera() -> None:
+    """Most models have faint giants and a few distant floaters."""
     model = random_gaussians(500)
     middle, radius = middle_and_radius(model)
     far = replace(model[:20], means=model[:20].means * 1000 + 500)
@@ -53,7 +53,7 @@ def test_a_model_without_extent_still_makes_a_scene(model: Gaussians) -> None:
 
 
 def test_models_move_with_their_cameras() -> None:
-    """The same model elsewhere and larger is looked at in the same way."""
+    """A moved and scaled model has the same views."""
     model = random_gaussians(300)
     frame = Similarity(
         3.0, torch.eye(3, dtype=torch.float64), torch.tensor([5.0, 1, -2], dtype=torch.float64)

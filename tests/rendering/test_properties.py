@@ -1,7 +1,6 @@
-"""Any numbers, types and layouts give a finite picture or an error by name; what should not matter does not.
+"""Any numbers, types and layouts give finite results or an error that names the argument; invariances hold.
 
-Bad input is made up by hypothesis. Inputs lie within memory full of NaN, so that what a kernel read before
-or behind them would show.
+Hypothesis generates bad input. NaN around the inputs in memory would reveal reads out of bounds.
 """
 
 from __future__ import annotations
@@ -43,12 +42,12 @@ def guarded(tensor: Tensor) -> Tensor:
 
 
 def strided(tensor: Tensor) -> Tensor:
-    """A copy of which no two numbers are neighbours in memory, with NaN between them."""
+    """A copy with NaN between any two numbers in memory."""
     return torch.stack([tensor, torch.full_like(tensor, math.nan)], -1)[..., 0]
 
 
 def transposed(tensor: Tensor) -> Tensor:
-    """A copy whose dimensions lie in memory in reverse."""
+    """A copy with the dimensions in reverse order in memory."""
     reverse = tuple(reversed(range(tensor.dim())))
     return tensor.permute(reverse).contiguous().permute(reverse)
 

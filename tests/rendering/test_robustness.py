@@ -1,4 +1,4 @@
-"""Odd scenes, and inputs that have no part in the picture: each as it should be."""
+"""Odd scenes, and inputs that do not affect the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Importing compiles nothing, and drawing works whatever becomes of the cache of compiled kernels."""
+"""Importing compiles nothing, and rendering works in any state of the kernel cache."""
 
 from __future__ import annotations
 

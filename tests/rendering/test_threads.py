@@ -1,4 +1,4 @@
-"""The same input gives the same bits, whichever threads and processes draw; and no more threads than told."""
+"""Results do not depend on threads and processes, and torch's number of threads is respected."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PATIENCE = 120  # seconds until something hangs: far more than a busy machine ne
 
 @pytest.fixture(autouse=True)
 def _eight_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As many helper threads as torch is told to use, on any machine."""
+    """Allow as many helper threads as torch uses, on any machine."""
     monkeypatch.setattr(parallel, "_CORES", 8)
     threads = torch.get_num_threads()
     yield
@@ -113,7 +113,7 @@ def test_an_error_on_a_helper_thread_is_raised() -> None:
 
 
 def test_a_kernel_is_loaded_by_the_thread_that_calls_it() -> None:
-    """Else Ctrl-C, which comes to that thread, could leave a helper waiting for a lock for ever."""
+    """Otherwise Ctrl-C, which interrupts that thread, could leave a helper waiting for a lock forever."""
     seen: list[str] = []
 
     class Kernel:
@@ -158,7 +158,7 @@ def test_forked_processes_draw_the_same() -> None:
 
 
 def test_pieces_that_are_dealt_out_are_all_of_the_work() -> None:
-    """What the benchmark for more threads times one by one is what a drawing consists of."""
+    """The pieces that the benchmark times one by one make up a complete rendering."""
     scene = many()
     expected = scene.results()
     with rasterizer_threads.timed(4) as found:

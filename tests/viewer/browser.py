@@ -1,4 +1,4 @@
-"""The page in headless Chromium, and what our own renderer says the picture should be."""
+"""The page in headless Chromium, and our own renders for comparison."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ Picture = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def made(count: int, seed: int) -> Gaussians:
-    """A model that carries, of Gaussians that are seen and whose colours change much with direction."""
+    """A cover of visible Gaussians whose colours depend strongly on the direction."""
     model = trained_like(count, seed)
     sh = model.sh * torch.tensor([8.0, *[4.0] * 15])[None, :, None]
     return replace(model, log_scales=0.5 * model.log_scales, sh=sh)
 
 
 def camera_of(address: str) -> Camera:
-    """The camera that the page has at the pose in its address."""
+    """The page's camera at the pose in its URL."""
     found = parse_qs(address.partition("#")[2])
     eye, target = (torch.tensor([float(n) for n in found[name][0].split(",")]) for name in ("eye", "target"))
     forward = torch.nn.functional.normalize(target - eye, dim=0)
@@ -67,7 +67,7 @@ def psnr(a: Picture, b: Picture) -> float:
 
 @dataclass
 class Visit:
-    """One tab, and what went on in it."""
+    """A tab with its requests and messages."""
 
     page: Any
     complaints: list[str] = field(default_factory=list)  # errors on the console, and uncaught ones
@@ -122,7 +122,7 @@ class Visit:
 
 @contextmanager
 def visit(browser: Any) -> Iterator[Visit]:
-    """A new tab, which must not complain."""
+    """A new tab, which must not log errors."""
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     page.set_default_timeout(PATIENCE)
     found = Visit(page)

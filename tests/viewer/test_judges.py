@@ -1,4 +1,4 @@
-"""The readers of spark and PlayCanvas find in the files that keyss writes what keyss finds there."""
+"""spark and PlayCanvas read our files to the same values as keyss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`--live`: a training on a page, while it goes on."""
+"""`--live`: a page that shows a running training."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def state(training: LiveTraining) -> dict[str, Any]:
 
 
 class Copies:
-    """A model in training, and how often it was copied."""
+    """A model in training that counts its copies."""
 
     def __init__(self) -> None:
         self.model = random_gaussians(5)
@@ -79,7 +79,7 @@ def stepped(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]) 
     reporter.look(model)
 
 
-def test_a_model_is_copied_only_while_somebody_looks_and_now_and_then(
+def test_a_model_is_copied_only_while_somebody_watches_and_not_too_often(
     training: LiveTraining, clock: Clock
 ) -> None:
     model, reporter = Copies(), training.reporter(SilentReporter())
@@ -142,7 +142,7 @@ def test_nobody_gets_anything_without_the_address(training: LiveTraining) -> Non
             assert get(training, name, folder)[0] == 404, folder + name
 
 
-def test_a_training_that_went_wrong_has_no_file(training: LiveTraining) -> None:
+def test_a_diverged_training_has_no_file(training: LiveTraining) -> None:
     model, reporter = Copies(), training.reporter(SilentReporter())
     model.model = replace(model.model, means=model.model.means * float("nan"))
     reporter.start("fit", 1, 0)

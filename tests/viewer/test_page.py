@@ -1,4 +1,4 @@
-"""What `keyss export-html` writes and `keyss view` gives out, and that it is what `web/` builds."""
+"""The page that `keyss view` writes or serves, and its build from `web/`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frozen vectors that the page's reader is tested against are what this program reads."""
+"""This program reads the frozen vectors that the page's reader is tested with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models and codes to test formats with, and how models are compared."""
+"""Models and codes for tests of formats, and a comparison of models."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tiny_scenes import random_gaussians
 
 
 def model_of(count: int, degree: int, seed: int = 0) -> Gaussians:
-    """A model in a room of a few units, with opacities that bytes round to 0 and to 255."""
+    """A model a few units large, with opacities that bytes round to 0 and 255."""
     model = random_gaussians(count, seed, degree)
     opacity_logits = model.opacity_logits.clone()
     opacity_logits[:2] = torch.tensor([-12.0, 12.0])
@@ -23,7 +23,7 @@ def model_of(count: int, degree: int, seed: int = 0) -> Gaussians:
 
 
 def assert_close(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
-    """Values equal to rounding, quaternions as rotations, and opacities rather than their logits."""
+    """Assert that values agree up to rounding: quaternions as rotations, and opacities instead of logits."""
     assert (len(a), a.sh_degree) == (len(b), b.sh_degree)
     for name in ("means", "log_scales", "opacities", "sh"):
         ours, theirs = getattr(a, name).double(), getattr(b, name).double()

@@ -1,4 +1,4 @@
-"""Codes: what is parsed is what was serialised, and a model's codes are its nearest ones."""
+"""Parsing inverts serialising, and a model is quantised to the nearest codes."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def test_extensions_of_an_spz_are_kept() -> None:
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_an_spz_that_is_read_and_written_stays_what_it_is(version: int) -> None:
-    """What `dequantise` gives is in the middle of the codes that `quantise` chooses."""
+def test_reading_and_writing_an_spz_keeps_its_codes(version: int) -> None:
+    """`dequantise` returns the middle of the interval that `quantise` maps to a code."""
     codes = replace(spz.quantise(model_of(500, 3)), version=version)
     again = replace(spz.quantise(spz.dequantise(codes)), version=version)
     # Which of two parts of a rotation is the larger one may change after rounding, and so may the sign of 0.
@@ -79,7 +79,7 @@ def test_an_spz_that_is_read_and_written_stays_what_it_is(version: int) -> None:
     assert angle(spz.dequantise(again), spz.dequantise(codes)) < 0.2
 
 
-def test_a_compressed_ply_that_is_read_and_written_stays_what_it_is() -> None:
+def test_reading_and_writing_a_compressed_ply_keeps_its_codes() -> None:
     codes = compressed_ply.quantise(model_of(700, 2))
     again = compressed_ply.quantise(compressed_ply.dequantise(codes))
     for name in ("positions", "scales", "colors", "alphas", "sh"):
@@ -97,7 +97,7 @@ def angle(a: Gaussians, b: Gaussians) -> float:
 
 
 def rotation_bound(step: float) -> float:
-    """The largest angle in degrees that parts of a quaternion rounded to multiples of `step` can make.
+    """The largest angle in degrees from rounding components of a quaternion to multiples of `step`.
 
     Three errors of half a step and, where all parts are equal, the sum of them in the fourth.
     """
@@ -158,8 +158,8 @@ def test_errors_of_sog(degree: int) -> None:
         assert float((found_values - values).square().mean()) ** 0.5 <= step_of_256 / 12**0.5
 
 
-def test_a_model_keeps_its_pictures_in_spz() -> None:
-    """y and z change signs in the file: harmonics have to follow as they do when a model is turned."""
+def test_spz_rotates_harmonics_with_the_model() -> None:
+    """y and z change signs in the file, and the harmonics as for a rotated model."""
     model = model_of(50, 3)
     codes = spz.quantise(model)
     turned = Similarity(rotation=torch.diag(torch.tensor([1.0, -1.0, -1.0]))).apply_gaussians(model)
@@ -177,7 +177,7 @@ def test_spz_makes_room_for_large_models(reach: float) -> None:
     assert reach > 2048 or codes.fractional_bits == 12
 
 
-def test_spz_refuses_models_beyond_all_measure() -> None:
+def test_spz_refuses_models_that_are_too_large() -> None:
     model = model_of(3, 0)
     with pytest.raises(OutputError, match="up to 8,388,607 world units"):
         spz.quantise(replace(model, means=model.means * 1e9))

@@ -1,4 +1,4 @@
-"""Files from strangers: a model or an InputError, in time and memory that the file's own size bounds."""
+"""Hostile files give a model or an InputError, in time and memory bounded by the file size."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ MODEL = model_of(60, 1)
 MEGABYTE = 1 << 20
 
 
-def refused(name: str, data: bytes, words: str, *, most: int = 8 * MEGABYTE) -> None:
-    """That `data` end in an InputError with `words`, soon and without `most` bytes of memory."""
+def refused(name: str, data: bytes, words: str, *, limit: int = 8 * MEGABYTE) -> None:
+    """Assert that `data` raise an InputError with `words`, quickly and in less than `limit` bytes."""
     tracemalloc.start()
     start = time.process_time()  # others may keep the machine busy
     with pytest.raises(InputError, match=words):
@@ -38,7 +38,7 @@ def refused(name: str, data: bytes, words: str, *, most: int = 8 * MEGABYTE) -> 
     assert time.process_time() - start < 5
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < most, f"{peak:,} bytes"
+    assert peak < limit, f"{peak:,} bytes"
 
 
 @pytest.mark.parametrize("name", examples())
@@ -68,7 +68,7 @@ def legacy_spz(count: int, body: bytes = b"", *, version: int = 3, degree: int =
 
 
 @pytest.mark.parametrize("count", [2**31, 2**32 - 1, 10**6])
-def test_counts_beyond_all_measure(count: int) -> None:
+def test_counts_that_are_too_large(count: int) -> None:
     refused("a.spz", legacy_spz(count, bytes(5000)), f"it announces {count:,} Gaussians, more than")
     header = struct.pack("<4sIIBBBBI12s", b"NGSP", 4, count, 0, 12, 0, 5, 32, bytes(12))
     refused("a.spz", header + bytes(500), "it announces")
@@ -92,11 +92,11 @@ def test_no_gaussians_at_all() -> None:
 
 def test_a_gzip_bomb() -> None:
     bomb = legacy_spz(1000, bytes(200 * MEGABYTE))
-    refused("a.spz", bomb, "found more than was announced", most=20 * MEGABYTE)
+    refused("a.spz", bomb, "found more than was announced", limit=20 * MEGABYTE)
 
 
 def test_a_zstd_bomb() -> None:
-    """A stream that says and holds more than the header announces: only what is needed is unpacked."""
+    """Of a stream that is longer than the header announces, only the announced size is unpacked."""
     codes = replace(spz.quantise(MODEL), version=4)
     data = spz.serialise(codes)
     bomb = zstandard.ZstdCompressor().compress(bytes(200 * MEGABYTE))
@@ -123,7 +123,7 @@ def contents(data: bytes) -> dict[str, bytes]:
 
 
 def with_meta(change: Callable[[dict], object], **files: bytes) -> bytes:
-    """A .sog whose meta.json was changed, and files in it."""
+    """A .sog with a changed meta.json, and optionally with changed files."""
     inside = contents(model_bytes("a.sog", MODEL))
     meta = json.loads(inside["meta.json"])
     change(meta)
@@ -147,7 +147,7 @@ def webp(width: int, height: int) -> bytes:
 
 
 def test_a_webp_of_huge_size() -> None:
-    """Its header says so; 1 GB would be what its few bytes unpack to."""
+    """A few bytes whose header announces 1 GB."""
     small = bytearray(webp(16, 16))
     small[21:25] = struct.pack("<I", 16382 | 16382 << 14)
     for image in (bytes(small), webp(4000, 4000)):
@@ -180,7 +180,7 @@ def test_a_meta_json_that_lies(change: Callable[[dict], object], words: str) -> 
     refused("a.sog", with_meta(change), words)
 
 
-def test_a_folder_of_sog_is_not_left(tmp_path: Path) -> None:
+def test_a_sog_folder_refers_only_to_files_in_it(tmp_path: Path) -> None:
     for name, content in contents(model_bytes("a.sog", MODEL)).items():
         (tmp_path / name).write_bytes(content)
     assert len(read_model(tmp_path / "meta.json")) == len(MODEL)
@@ -206,7 +206,7 @@ def test_versions_that_are_not_read() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_none(value: float) -> None:
+def test_numbers_that_are_not_finite(value: float) -> None:
     splat = bytearray(model_bytes("a.splat", MODEL))
     splat[4:8] = struct.pack("<f", value)
     refused("a.splat", bytes(splat), "NaN or infinite values in means")
@@ -263,12 +263,12 @@ def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
     refused("a.glb", with_json(change), words)
 
 
-def test_a_gltf_that_shows_the_same_over_and_over() -> None:
+def test_a_gltf_that_repeats_its_gaussians() -> None:
     def change(gltf: dict) -> None:
         gltf["nodes"] = [{"mesh": 0}] * 20_000
         gltf["scenes"][0]["nodes"] = list(range(20_000))
 
-    refused("a.glb", with_json(change), "over and over", most=32 * MEGABYTE)
+    refused("a.glb", with_json(change), "over and over", limit=32 * MEGABYTE)
 
 
 def test_nodes_move_gaussians() -> None:
@@ -284,7 +284,7 @@ def test_nodes_move_gaussians() -> None:
 
 def test_deep_json_is_no_problem(tmp_path: Path) -> None:
     deep = b"[" * 100_000
-    refused("a.sog", archive({"meta.json": deep}), "cannot parse", most=32 * MEGABYTE)
+    refused("a.sog", archive({"meta.json": deep}), "cannot parse", limit=32 * MEGABYTE)
     with pytest.raises(InputError):
         model_of_bytes(
             "a.glb", struct.pack("<4sIII4s", b"glTF", 2, 20 + len(deep), len(deep), b"JSON") + deep
@@ -292,7 +292,7 @@ def test_deep_json_is_no_problem(tmp_path: Path) -> None:
 
 
 def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:
-    """Up to a quarter of a million equal Gaussians, whatever they pack to."""
+    """Up to 262,144 equal Gaussians may be compressed to any size."""
     model = MODEL[torch.zeros(100_000, dtype=torch.long)]
     write_model(tmp_path / "a.spz", replace(model))
     assert len(read_model(tmp_path / "a.spz")) == 100_000

@@ -1,4 +1,4 @@
-"""Other people's programs read what we write, and we read what they write, to the same values."""
+"""Other programs read our files, and we read theirs, to the same values."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_the_order_in_chunks_is_as_good_as_splat_transforms(
 
 @DEGREES
 def test_we_read_splat_transforms_glb(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
-    """It writes the values of a .ply turned by 180 degrees, and we bring them back."""
+    """It rotates the values of a .ply by 180 degrees, and we rotate them back."""
     model = model_of(200, degree)
     write_model(tmp_path / "in.ply", model)
     found = read_model(splat_transform(tmp_path / "in.ply", tmp_path / "a.glb"))
@@ -134,7 +134,7 @@ def test_a_folder_of_sog(splat_transform: Transform, tmp_path: Path) -> None:
 
 
 def of_gsply(data: gsply.GSData, *, turned: bool = False) -> Gaussians:
-    """A model of gsply's; `turned`: it does not turn .spz files into the frame of a .ply."""
+    """A model from gsply; `turned` rotates it from the frame of an .spz to that of a .ply."""
     n = len(data.means)
     rest = np.empty((n, 0, 3), np.float32) if data.shN is None else data.shN.reshape(n, -1, 3)
     means, quats = data.means.copy(), data.quats.copy()

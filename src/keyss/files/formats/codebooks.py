@@ -28,8 +28,7 @@ def codebook_of(values: Floats) -> Floats:
     ordered = np.sort(values, axis=None).astype(np.float64)
     distinct = np.unique(ordered)
     if len(distinct) <= SIZE:
-        padded: Floats = np.pad(distinct, (0, SIZE - len(distinct)), mode="edge").astype(np.float32)
-        return padded
+        return np.pad(distinct, (0, SIZE - len(distinct)), mode="edge").astype(np.float32)
     at = np.unique(np.linspace(0, len(ordered) - 1, _BINS + 1).astype(int))
     width = np.maximum(np.diff(ordered[at]), _MIN_WIDTH * (distinct[-1] - distinct[0]))
     density = np.diff(at) / width
@@ -47,15 +46,14 @@ def codebook_of(values: Floats) -> Floats:
         if np.array_equal(moved, numbers):
             break
         numbers = np.sort(moved)
-    found: Floats = numbers.astype(np.float32)
-    return found
+    codebook: Floats = numbers.astype(np.float32)
+    return codebook
 
 
 def nearest(codebook: Floats, values: Floats) -> Bytes:
     """Indices of the nearest numbers of an ascending codebook, in the shape of `values`."""
     middles = (codebook[1:].astype(np.float64) + codebook[:-1]) / 2
-    found: Bytes = np.searchsorted(middles, values).astype(np.uint8)
-    return found
+    return np.searchsorted(middles, values).astype(np.uint8)
 
 
 def palette_of(vectors: Floats, size: int) -> tuple[Floats, Shorts]:

@@ -137,8 +137,7 @@ def logits(opacities: npt.NDArray[Any]) -> Doubles:
     values = np.asarray(opacities, dtype=np.float64)
     with np.errstate(divide="ignore"):
         found: Doubles = np.log(values) - np.log1p(-values)
-    bounded: Doubles = found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
-    return bounded
+    return found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
 
 
 def opacities(opacity_logits: Floats) -> Doubles:
@@ -150,15 +149,14 @@ def opacities(opacity_logits: Floats) -> Doubles:
 
 def rounded(values: npt.NDArray[Any]) -> Doubles:
     """`values` rounded to integers, halves away from 0, like C's `round`."""
-    found: Doubles = np.copysign(np.floor(np.abs(values) + 0.5), values)
-    return found
+    integers: Doubles = np.copysign(np.floor(np.abs(values) + 0.5), values)
+    return integers
 
 
 def to_bytes(values: npt.NDArray[Any], maximum: int = 255) -> npt.NDArray[Any]:
     """`values` rounded and clipped to 0 to `maximum`, as uint8 or, above 255, uint16."""
     kind = np.uint8 if maximum < 256 else np.uint16
-    codes: npt.NDArray[Any] = rounded(values).clip(0, maximum).astype(kind)
-    return codes
+    return rounded(values).clip(0, maximum).astype(kind)
 
 
 def colour_bytes(f_dc: Floats) -> Bytes:
@@ -168,8 +166,7 @@ def colour_bytes(f_dc: Floats) -> Bytes:
 
 def f_dc_of(colors: npt.NDArray[Any]) -> Doubles:
     """f_dc of colours in [0, 1]."""
-    found: Doubles = (np.asarray(colors, dtype=np.float64) - 0.5) / SH_C0
-    return found
+    return (np.asarray(colors, dtype=np.float64) - 0.5) / SH_C0
 
 
 def log_scales_of(scales: npt.NDArray[Any]) -> Doubles:
@@ -182,8 +179,7 @@ def log_scales_of(scales: npt.NDArray[Any]) -> Doubles:
 
 def scales_of(log_scales: Floats) -> Floats:
     """Scales, clipped to the range of float32."""
-    found: Floats = np.exp(log_scales.astype(np.float64)).clip(0, np.finfo(np.float32).max).astype(np.float32)
-    return found
+    return np.exp(log_scales.astype(np.float64)).clip(0, np.finfo(np.float32).max).astype(np.float32)
 
 
 def unit(quats: npt.NDArray[Any]) -> Doubles:

@@ -183,23 +183,21 @@ def _harmonics(table: npt.NDArray[np.void] | None, n: int) -> Bytes:
         raise InputError(f"expected 9, 24 or 45 properties f_rest_0, f_rest_1, ..., found {len(names)}")
     if len(table) != n or not _has(table, names, "u1"):
         raise InputError(f"expected one byte for each harmonic of {n:,} Gaussians, found something else")
-    found: Bytes = np.ascontiguousarray(table).view(np.uint8).reshape(n, 3, -1).transpose(0, 2, 1).copy()
-    return found
+    return np.ascontiguousarray(table).view(np.uint8).reshape(n, 3, -1).transpose(0, 2, 1).copy()
 
 
 def _fields(packed: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray[np.uint32]:
     """[N, 3] three bit fields of `packed` [N]; the last field has the lowest bits."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
     masks = np.array([2**each - 1 for each in bits], dtype=np.uint32)
-    found: npt.NDArray[np.uint32] = packed[:, None] >> shifts & masks
-    return found
+    return packed[:, None] >> shifts & masks
 
 
 def _joined(values: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray[np.uint32]:
     """[N] integers from their bit fields, the inverse of `_fields`."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
-    found: npt.NDArray[np.uint32] = np.bitwise_or.reduce(values.astype(np.uint32) << shifts, axis=1)
-    return found
+    fields: npt.NDArray[np.uint32] = np.bitwise_or.reduce(values.astype(np.uint32) << shifts, axis=1)
+    return fields
 
 
 def _between(ends: Doubles, share: Doubles) -> Doubles:
@@ -219,5 +217,4 @@ def _share(ends: Doubles, values: Doubles) -> Doubles:
     extent = ends[:, 1] - ends[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(extent < _MIN_RANGE, 0.0, (values - ends[:, 0]) / extent)
-    found: Doubles = share.clip(0, 1)
-    return found
+    return share.clip(0, 1)

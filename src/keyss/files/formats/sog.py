@@ -250,8 +250,7 @@ def _codebook(values: list[float]) -> Floats:
 
 def _joined(low: Bytes, high: Bytes) -> Shorts:
     """16-bit integers from their low and high bytes."""
-    found: Shorts = low.astype(np.uint16) | (high.astype(np.uint16) << np.uint16(8))
-    return found
+    return low.astype(np.uint16) | (high.astype(np.uint16) << np.uint16(8))
 
 
 def _rgba(colors: npt.NDArray[Any], alpha: Bytes | None = None) -> Bytes:

@@ -178,5 +178,5 @@ def _quantised_harmonics(rest: Floats) -> Bytes:
     signed = rest * _SH_SIGNS[: rest.shape[1], None]
     codes = rounded(signed.astype(np.float64) * 128) + 128
     step = _SH_STEPS[: rest.shape[1], None]
-    found: Bytes = (np.floor((codes + step // 2) / step) * step).clip(0, 255).astype(np.uint8)
-    return found
+    multiples: Bytes = (np.floor((codes + step // 2) / step) * step).clip(0, 255).astype(np.uint8)
+    return multiples

@@ -1,4 +1,4 @@
-"""Other people's programs, which judge what is written and write what is read."""
+"""Other programs that read and write the formats."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import pytest
 from keyss.core import BackendError
 from keyss.measure import find_splat_transform, transform
 
-NEWER = Path(__file__).parents[3] / "web" / "node_modules" / ".bin" / "splat-transform"
+NEWER = Path(__file__).parents[2] / "web" / "node_modules" / ".bin" / "splat-transform"
 
 
 @pytest.fixture(scope="session")
 def splat_transform() -> Callable[..., Path]:
-    """(source, target) -> target, converted by splat-transform, or a skip where it is not installed."""
+    """Converts (source, target) -> target by splat-transform; skips if it is not installed."""
     try:
         find_splat_transform()
     except BackendError as error:
@@ -25,7 +25,7 @@ def splat_transform() -> Callable[..., Path]:
 
 @pytest.fixture
 def splat_transform_3(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """The same by its version 3, which the viewer's tests bring along."""
+    """The same by version 3, which the viewer's tests install."""
     if not NEWER.exists():
         pytest.skip("no web/node_modules: `make test-web` installs splat-transform 3")
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(NEWER))
