@@ -17,7 +17,7 @@ FOCAL_LENGTH_MIN = 1e-6  # pixels
 
 # Arguments of gsplat that only say how it computes.
 IGNORED = frozenset(("packed", "tile_size", "channel_chunk", "segmented"))
-# Arguments of gsplat of which only the default is supported.
+# Arguments of gsplat that must have their default.
 ONLY_VALUES: dict[str, Any] = {
     "radius_clip": 0.0,
     "render_mode": "RGB",

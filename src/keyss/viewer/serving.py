@@ -1,4 +1,4 @@
-"""Serves the page over HTTP, on this machine only unless told otherwise."""
+"""Serves the page over HTTP, by default on this machine only."""
 
 from __future__ import annotations
 

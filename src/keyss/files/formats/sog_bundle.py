@@ -187,7 +187,7 @@ def webp(values: Bytes, width: int, height: int) -> bytes:
 def _size(data: bytes) -> tuple[int, int]:
     """Width and height in pixels from the header of a lossless WebP.
 
-    https://developers.google.com/speed/webp/docs/riff_container. Pillow is not asked, since it allocates a
+    https://developers.google.com/speed/webp/docs/riff_container. Pillow would allocate a
     canvas when it opens a file.
     """
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":

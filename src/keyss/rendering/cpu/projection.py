@@ -215,8 +215,8 @@ def project(counter, gaussians, camera, settings, projected):
                 for ahead in range(k + PREFETCH, min(k + PREFETCH + 8, visible)):
                     prefetch_coefficients(colors, sh_count, at(seen, ahead))
                 red, green, blue = shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
-                drawn = (maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO))
-                scatter(footprints, seen, k, PACKED, RED, drawn)
+                clamped = (maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO))
+                scatter(footprints, seen, k, PACKED, RED, clamped)
                 # Written so that a NaN counts too.
                 size_of_color = absolute(red) + absolute(green) + absolute(blue)
                 if any_gt(select_gt(CHANNEL_MAX, size_of_color, ZERO, ONE), ZERO):

@@ -68,16 +68,16 @@ def project_backward(
         piece = fetch_add(counter, 0, 1)
         if piece * CHUNK >= count:
             break
-        drawn = _find_drawn(
+        listed = _find_listed(
             piece * CHUNK, min((piece + 1) * CHUNK, count), sh_count, slot_counts, first_camera, need_colors,
             ids, gradients, means2d_gradient,
         )  # fmt: skip
-        for k in range(drawn, drawn + 8):
-            ids[k] = ids[max(drawn - 1, 0)]
-        for start in range(0, drawn, 8):
-            size = min(8, drawn - start)
+        for k in range(listed, listed + 8):
+            ids[k] = ids[max(listed - 1, 0)]
+        for start in range(0, listed, 8):
+            size = min(8, listed - start)
             if sh_count > 1:
-                for ahead in range(start + PREFETCH, min(start + PREFETCH + 8, drawn)):
+                for ahead in range(start + PREFETCH, min(start + PREFETCH + 8, listed)):
                     prefetch_coefficients(colors, sh_count, at(ids, ahead))
             _sum_pairs(
                 ids, start, size, first_slots, slot_counts, moments, extras, channels, first_camera,
@@ -109,19 +109,19 @@ def project_backward(
 
 
 @inlined
-def _find_drawn(
+def _find_listed(
     start, end, sh_count, slot_counts, first_camera, need_colors, ids, gradients, means2d_gradient,
 ):  # fmt: skip
     """Fill `ids` with the Gaussians that have pairs; returns their number. Zeros the other gradients."""
     means_gradient, quats_gradient, scales_gradient, opacities_gradient, colors_gradient = gradients
     channels = colors_gradient.shape[2]
     stride = colors_gradient.shape[1] * channels
-    drawn = 0
+    listed = 0
     for i in range(start, end):
         used = 0  # colour gradients that will be overwritten
         if at(slot_counts, i) > 0:
-            put(ids, drawn, i)
-            drawn += 1
+            put(ids, listed, i)
+            listed += 1
             used = max(sh_count, 1) * channels
         else:
             for k in range(2 * i, 2 * i + 2):
@@ -136,7 +136,7 @@ def _find_drawn(
         if first_camera and need_colors:
             for k in range(i * stride + used, (i + 1) * stride):
                 put(colors_gradient, k, ZERO)
-    return drawn
+    return listed
 
 
 @inlined
