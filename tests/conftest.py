@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -48,3 +49,16 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real scenes in {folder} (set KEYSS_TEST_DATA to their folder)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def splat_transform() -> Callable[..., Path]:
+    """Converts (source, target) -> target by splat-transform; skips if it is not installed."""
+    from keyss.core import BackendError
+    from keyss.measure import find_splat_transform, transform
+
+    try:
+        find_splat_transform()
+    except BackendError as error:
+        pytest.skip(str(error))
+    return transform

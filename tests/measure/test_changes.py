@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import trained_like
-from files.test_ply import splat_transform
 from keyss.core import BackendError, Gaussians, Scene, UsageError
 from keyss.fitting import mean_psnr
 from keyss.measure import (
@@ -32,8 +31,6 @@ from keyss.measure import (
 from keyss.methods import choose_anchors
 from measure.opened import Whole
 from tiny_scenes import random_gaussians, tiny_scene
-
-__all__ = ["splat_transform"]  # a fixture
 
 NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harmonics")
 
@@ -237,8 +234,7 @@ def test_gsply_compresses_in_chunks_of_their_own_range() -> None:
 
 
 @pytest.mark.parametrize("format", ["compressed .ply", ".spz", ".splat", ".sog"])
-def test_splat_transform_converts(format: str, splat_transform: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", splat_transform)
+def test_splat_transform_converts(format: str, splat_transform: Callable[..., Path]) -> None:
     model = random_gaussians(60)
     back = by(format, "splat-transform")(model)
     assert len(back) == 60

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import trained_like
-from files.test_ply import splat_transform
 from keyss.core import Gaussians, Scene
 from keyss.files import write_model
 from keyss.measure import ReaderResult, measure_speed, readers, render_time, reveal_seconds, speed as module
@@ -20,8 +19,6 @@ from keyss.methods import Opened, open_model
 from measure.opened import Whole
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians, tiny_scene
-
-__all__ = ["splat_transform"]  # a fixture
 
 KEY = "the right key"
 
@@ -103,10 +100,7 @@ def test_what_has_no_exact_numbers_is_not_held_against_other_readers(tmp_path: P
         }
 
 
-def test_splat_transform_finds_our_values(
-    tmp_path: Path, splat_transform: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", splat_transform)
+def test_splat_transform_finds_our_values(tmp_path: Path, splat_transform: Callable[..., Path]) -> None:
     write_model(tmp_path / "a.ply", random_gaussians(40))
     assert readers(tmp_path / "a.ply")[2] == ReaderResult("splat-transform", "a.ply", True, 40)
 

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import keys, trained_like
-from files.test_ply import assert_same_bits
 from keyss.channels import LOW_BITS, LowBitsReader
-from keyss.core import Gaussians, InputError
+from keyss.core import Gaussians, InputError, same_bits
 from keyss.methods import dither_model
 from keyss.rendering import psnr_between
 from methods.carry.carried import embed_derived, extract_derived
@@ -66,10 +65,10 @@ def test_an_added_offset_is_noticed_and_dithered(model: Gaussians) -> None:
 
 
 def test_trained_models_and_properties_of_one_value_stay_as_they_are(model: Gaussians) -> None:
-    assert_same_bits(dither_model(model, ENTROPY), model)
+    assert same_bits(dither_model(model, ENTROPY), model)
     flat = model.map(torch.clone)
     flat.sh[:, 9:] = 0
-    assert_same_bits(dither_model(flat, ENTROPY), flat)
+    assert same_bits(dither_model(flat, ENTROPY), flat)
 
 
 def test_the_cost_is_what_pictures_show(model: Gaussians) -> None:

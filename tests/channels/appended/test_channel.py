@@ -13,7 +13,6 @@ import torch
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from files.formats.conftest import splat_transform as splat_transform  # a fixture
 from keyss.channels import APPENDED, AppendedReader, Payload
 from keyss.core import (
     DRAWN_OPACITY,

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from channels.codes.published import FORMATS, model_of
-from files.formats.conftest import splat_transform  # noqa: F401
 from keyss.channels import SUFFIXES, Payload, channel_for
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model, write_model
@@ -67,7 +66,7 @@ def test_gsply_reads_it(name: str, tmp_path: Path) -> None:
 
 @EVERY
 def test_splat_transform_reads_it(
-    splat_transform: Callable[..., Path],  # noqa: F811
+    splat_transform: Callable[..., Path],
     name: str,
     tmp_path: Path,
 ) -> None:

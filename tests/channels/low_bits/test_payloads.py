@@ -16,7 +16,7 @@ from argon2.low_level import Type, hash_secret_raw
 
 from channels.low_bits.payloads import embed, embed_derived, extract, extract_derived
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
-from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
+from files.test_ply import columns_of, ply_bytes
 from keyss.channels import (
     LOW_BITS,
     LowBitsReader,
@@ -29,14 +29,12 @@ from keyss.channels import (
 )
 from keyss.channels.low_bits import cells
 from keyss.channels.low_bits.parameters import key_cipher
-from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
+from keyss.core import Gaussians, InputError, UsageError, WrongKeyError, same_bits
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey, generate_key
 from keyss.keys.generation import ALPHABET
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
-
-__all__ = ["splat_transform"]  # a fixture
 
 PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
 KEY = "the right key"
@@ -74,7 +72,7 @@ def test_round_trip_of_lower_degrees(degree: int) -> None:
 def test_the_same_entropy_gives_the_same_bits_and_other_payloads_others(plain: Gaussians) -> None:
     own, entropy = keys(), bytes(32)
     stego = embed_derived(plain, [(own, PAYLOAD)], entropy)
-    assert_same_bits(embed_derived(plain, [(own, PAYLOAD)], entropy), stego)
+    assert same_bits(embed_derived(plain, [(own, PAYLOAD)], entropy), stego)
     for other in (
         embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")], entropy),
         embed_derived(plain, [(own, PAYLOAD)]),
@@ -139,7 +137,7 @@ def _without_normals(columns: Columns) -> Columns:
 def test_survives_other_files(stego: Gaussians, tmp_path: Path, name: str) -> None:
     (tmp_path / "a.ply").write_bytes(OTHER_FILES[name](columns_of(stego)))
     again = read_model(tmp_path / "a.ply")
-    assert_same_bits(again, stego)
+    assert same_bits(again, stego)
     assert extract(again, KEY) == PAYLOAD
 
 
@@ -162,9 +160,11 @@ def test_survives_being_saved_again(stego: Gaussians, tmp_path: Path, name: str)
     assert extract(read_model(tmp_path / "out.ply"), KEY) == PAYLOAD
 
 
-def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
+def test_survives_splat_transform(
+    splat_transform: Callable[..., Path], stego: Gaussians, tmp_path: Path
+) -> None:
     write_model(tmp_path / "in.ply", stego)
-    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
+    copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
     assert extract(read_model(copy), KEY) == PAYLOAD
 
 
@@ -327,7 +327,7 @@ def test_values_that_are_not_random_stay_as_they_are() -> None:
     assert not usable[-10:].any()
     assert usable[310:1500].mean() > 0.95
     stego = embed_derived(twice, [(keys(), b"x")])
-    assert_same_bits(stego[torch.from_numpy(~usable)], twice[torch.from_numpy(~usable)])
+    assert same_bits(stego[torch.from_numpy(~usable)], twice[torch.from_numpy(~usable)])
 
 
 def test_values_that_are_nearly_equal_stay_as_they_are() -> None:
@@ -341,7 +341,7 @@ def test_values_that_are_nearly_equal_stay_as_they_are() -> None:
     assert usable[600:].mean() > 0.95
     stego = embed_derived(model, [(keys(), b"x")])
     assert np.array_equal(usable_carriers(stego)[:600], usable[:600])
-    assert_same_bits(model[:600], stego[:600])
+    assert same_bits(model[:600], stego[:600])
 
 
 def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:

@@ -10,12 +10,11 @@ import torch
 
 from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys, trained_like
-from files.test_ply import assert_same_bits
 from keyss.channels import LOW_BITS, LowBitsReader, chance_of_bits, read_low_bits, usable_carriers
 from keyss.channels.low_bits.bits import Layout, used_words, write_low_bits
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.low_bits.usable import GIVEN_AWAY, check_usable
-from keyss.core import Gaussians, InputError
+from keyss.core import Gaussians, InputError, same_bits
 
 STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
 MODELS = 16
@@ -143,7 +142,7 @@ def test_quaternions_of_unit_length_stay_so() -> None:
     half = replace(model, quats=torch.where(torch.arange(4000)[:, None] < 1500, unit.quats, model.quats))
     assert Layout.of(half).quats
     stego = embed_derived(half, [(own, b"secret")])
-    assert_same_bits(stego[:1500], half[:1500])
+    assert same_bits(stego[:1500], half[:1500])
     assert usable_carriers(half)[1500:].mean() > 0.92
 
 

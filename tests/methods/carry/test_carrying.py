@@ -13,18 +13,16 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
-from files.test_ply import assert_same_bits, columns_of, ply_bytes, splat_transform, transform
+from files.test_ply import columns_of, ply_bytes
 from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
 from keyss.channels.low_bits.parameters import key_cipher
-from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
 from keyss.methods import RecordRoom, SecretSize, Table, encode_all, record_request
 from keyss.rendering import render
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 from tiny_scenes import ring_cameras
-
-__all__ = ["splat_transform"]  # a fixture
 
 KEY = "the right key"
 ENTROPY = bytes(32)
@@ -143,7 +141,7 @@ def test_a_secret_as_large_as_the_cover_and_three_that_share(cover: Gaussians) -
 def test_every_random_draw_depends_on_the_entropy_only(cover: Gaussians, secret: Gaussians) -> None:
     own = keys()
     same = [embed_derived(cover, [(own, secret)], entropy=ENTROPY) for _ in range(2)]
-    assert_same_bits(*same)
+    assert same_bits(*same)
     other = embed_derived(cover, [(own, secret)])
     written = usable_carriers(cover)
     equal = read_low_bits(other)[written] == read_low_bits(same[0])[written]
@@ -256,7 +254,7 @@ def test_survives_files_without_normals_with_more_properties_and_in_other_orders
     for index, data in enumerate((ply_bytes(bare), ply_bytes(more))):
         path = tmp_path / f"{index}.ply"
         path.write_bytes(data)
-        assert_same_bits(read_model(path), stego)
+        assert same_bits(read_model(path), stego)
 
 
 @pytest.mark.parametrize("tool", ["gsply", "plyfile"])
@@ -270,9 +268,11 @@ def test_survives_other_writers(tool: str, stego: Gaussians, tmp_path: Path) -> 
     assert len(extract(read_model(theirs), KEY).gaussians) == 1200
 
 
-def test_survives_splat_transform(splat_transform: str, stego: Gaussians, tmp_path: Path) -> None:
+def test_survives_splat_transform(
+    splat_transform: Callable[..., Path], stego: Gaussians, tmp_path: Path
+) -> None:
     write_model(tmp_path / "in.ply", stego)
-    copy = transform(splat_transform, tmp_path / "in.ply", tmp_path / "out.ply")
+    copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
     assert len(extract(read_model(copy), KEY).gaussians) == 1200
 
 
@@ -356,7 +356,7 @@ def test_values_that_are_not_random_stay_as_they_are(cover: Gaussians) -> None:
     model.opacity_logits[200:230] = 0.1234567
     usable = usable_carriers(model)
     stego = embed_derived(model, [(keys(), trained_like(500))])
-    assert_same_bits(stego[torch.from_numpy(~usable)], model[torch.from_numpy(~usable)])
+    assert same_bits(stego[torch.from_numpy(~usable)], model[torch.from_numpy(~usable)])
     assert not usable[:230].any()
 
 
