@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
-from files.test_ply import columns_of, ply_bytes
 from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
 from keyss.channels.low_bits.parameters import key_cipher
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
@@ -243,18 +242,6 @@ def test_neighbours_of_the_key_open_nothing(stego: Gaussians) -> None:
     for wrong in (KEY[:-1], KEY + "x", KEY.replace("r", "s", 1)):
         with pytest.raises(WrongKeyError):
             extract(stego, wrong)
-
-
-def test_survives_files_without_normals_with_more_properties_and_in_other_orders(
-    stego: Gaussians, tmp_path: Path
-) -> None:
-    columns = columns_of(stego)
-    bare = {name: values for name, values in columns.items() if name not in ("nx", "ny", "nz")}
-    more = {"label": np.ones(len(stego), np.float32)} | dict(reversed(columns.items()))
-    for index, data in enumerate((ply_bytes(bare), ply_bytes(more))):
-        path = tmp_path / f"{index}.ply"
-        path.write_bytes(data)
-        assert same_bits(read_model(path), stego)
 
 
 @pytest.mark.parametrize("tool", ["gsply", "plyfile"])

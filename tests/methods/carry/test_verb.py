@@ -21,6 +21,7 @@ from keyss.methods import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
+HIDE = ("hide", "--width", 48, "--key-file", "key")
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +54,7 @@ def run(
 
 
 def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
-    hide = ("hide", "--method", "carry", "--width", 48, "--cover", "cover.ply", "--key-file", "key")
-    status, out, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out")
+    status, out, err = run(*HIDE, "--cover", "cover.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "900" in out
     assert "carriers: " in out
@@ -86,8 +86,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
 def test_too_large_secrets_are_refused_or_pruned(
     run: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
-    hide = ("hide", "--method", "carry", "--width", 48, "--cover", "cover.ply", "--key-file", "key")
-    hide = (*hide, "--secret", "large.ply")
+    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out", "--refit", "never")
     assert status == 2
     cover = LOW_BITS.prepare(read_model("cover.ply"))
@@ -106,9 +105,9 @@ def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
     run: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     write_model(tmp_path / "tiny.ply", trained_like(100))
-    hide = ("hide", "--method", "carry", "--cover", tmp_path / "tiny.ply", "--key-file", "key")
     for flags in ((), ("--prune-to-fit",), ("--refit=never",)):
-        status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", *flags)
+        scenes = ("--cover", tmp_path / "tiny.ply", "--secret", "secret.ply")
+        status, _, err = run(*HIDE, *scenes, "-o", tmp_path / "out", *flags)
         assert status == 2
         assert "--publish any" in err
         assert "there is room" not in err
@@ -150,21 +149,11 @@ def test_dithering_says_what_it_costs(
     run: Callable[..., tuple[int, str, str]], files: Path, tmp_path: Path
 ) -> None:
     write_model(tmp_path / "coarse.ply", read_model(files / "cover.ply").map(lambda v: (v * 64).round() / 64))
-    hide = (
-        "hide",
-        "--method",
-        "carry",
-        "--width",
-        48,
-        "--cover",
-        tmp_path / "coarse.ply",
-        "--key-file",
-        "key",
-    )
-    status, _, err = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out")
+    hide = (*HIDE, "--cover", tmp_path / "coarse.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
+    status, _, err = run(*hide)
     assert status == 4
     assert "--dither may give it others" in err
-    status, out, _ = run(*hide, "--secret", "secret.ply", "-o", tmp_path / "out", "--dither")
+    status, out, _ = run(*hide, "--dither")
     assert status == 0
     assert "PSNR to the plain models: cover " in out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,17 @@ import pytest
 import torch
 
 from channels.codes.published import model_of
-from keyss.core import InputError, Scene, UsageError, View
+from keyss.core import Camera, InputError, Scene, UsageError, View
 from keyss.core.colour import OPPONENT
 from keyss.methods import Table, fitted, good_enough, pruned
 from keyss.methods.records import whole
 from keyss.rendering import Viewpoints, psnr_between
 from keyss.rendering.orbit import orbit
+
+
+def _scene(cameras: Sequence[Camera]) -> Scene:
+    views = tuple(View(camera, torch.zeros(0, 0, 3)) for camera in cameras)
+    return Scene("scene", views, (), torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))
 
 
 def test_a_whole_model_comes_back_as_its_records_would() -> None:
@@ -80,10 +86,7 @@ def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() ->
 
 def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     model = model_of(1500, sh_degree=2)
-    cameras = orbit(model, 64, 12)
-    views = tuple(View(camera, torch.zeros(64, 64, 3, dtype=torch.uint8)) for camera in cameras)
-    scene = Scene("scene", views, (), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8), torch.ones(3))
-    viewpoints = Viewpoints.of(scene)
+    viewpoints = Viewpoints.of(_scene(orbit(model, 64, 12)))
     assert 4 <= len(viewpoints.cameras) <= 8
     assert torch.equal(viewpoints.background, torch.ones(3))
     found = good_enough(model, viewpoints)
@@ -95,15 +98,7 @@ def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
 def test_large_pictures_are_compared_at_a_smaller_size() -> None:
     model = model_of(50)
     camera = orbit(model, 1000, 1)[0]
-    scene = Scene(
-        "scene",
-        (View(camera, torch.zeros(0, 0, 3)),),
-        (),
-        torch.zeros(0, 3),
-        torch.zeros(0, 3),
-        torch.zeros(3),
-    )
-    (small,) = Viewpoints.of(scene).cameras
+    (small,) = Viewpoints.of(_scene([camera])).cameras
     assert (small.width, small.height) == (256, 256)
     assert torch.allclose(small.K[:2] / 256, camera.K[:2] / 1000)
 
