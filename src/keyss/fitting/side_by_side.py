@@ -126,7 +126,8 @@ def _fit_in_processes(fits: Sequence[Fit], size: int, resume: bool) -> list[Gaus
                     continue
                 ready = wait([workers[index].connection for index in running], POLL)
                 for index in running:
-                    if workers[index].connection in ready and (model := workers[index].receive()):
+                    worker = workers[index]
+                    if worker.connection in ready and (model := worker.receive()) is not None:
                         models[index] = model
                 if signum := interrupted():
                     raise Interrupted(None, None, signum)

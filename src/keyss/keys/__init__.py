@@ -1,4 +1,4 @@
-"""Keys: from what a person types to derived keys, and authenticated encryption under them."""
+"""Keys: generation, strength, derivation, files, and authenticated encryption."""
 
 import lazy_loader
 

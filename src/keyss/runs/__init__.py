@@ -1,4 +1,4 @@
-"""The folder of a run: what is written to it, and opening it again."""
+"""Folders of runs: records, resuming, plans, and opening them again."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The verb `info`: what is in a file or a folder.
+"""The verb `info`: descriptions of files and folders.
 
 Libraries are imported where they are used: loading all of them takes seconds.
 """

@@ -1,4 +1,4 @@
-"""What a run takes, before it begins: room, disk, memory, and a rough time.
+"""Plans of runs: room, disk, memory, and a rough time.
 
 Sizes follow from the models and the options. Times come from constants.
 """
