@@ -88,7 +88,7 @@ def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None
 @pytest.mark.parametrize("stage", ["plain model", "hide"])
 def test_a_resumed_hiding_keeps_its_seed(tmp_path: Path, stage: str) -> None:
     """The files are equal to those of an uninterrupted run, to the byte."""
-    joint = KeyssOptions(fit=FIT, hidden=(8, 8), branch=8)
+    joint = KeyssOptions(design="mlp", fit=FIT, hidden=(8, 8), branch=8)
     scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"
     with pytest.raises(Interrupted):
         keyss.hide(*scenes, method=joint, min_psnr=0, out=run, reporter=InterruptAt(10, stage))

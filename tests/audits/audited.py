@@ -23,7 +23,7 @@ from tiny_scenes import random_gaussians, tiny_scene
 
 KEYS = ("the key of a treasure", "the key of a map")
 # There are decoders then, and so there is something to be measured of wrong keys.
-JOINT = KeyssOptions(fit=CONFIG.fit, hidden=(8, 8), branch=8)
+JOINT = KeyssOptions(design="mlp", fit=CONFIG.fit, hidden=(8, 8), branch=8)
 
 
 def audited_run(root: Path) -> None:

@@ -311,7 +311,7 @@ def test_fits_run_one_after_the_other_if_the_reporter_displays_one(
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_hiding_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Plain models and bounds of both scenes."""
-    options = KeyssOptions(fit=replace(CONFIG, iterations=60), hidden=(8, 8), branch=8)
+    options = KeyssOptions(design="mlp", fit=replace(CONFIG, iterations=60), hidden=(8, 8), branch=8)
     found = []
     for least in (1, 10**6):
         monkeypatch.setattr(side_by_side, "MIN_STEPS", least)

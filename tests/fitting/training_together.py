@@ -14,7 +14,7 @@ import keyss  # noqa: F401  before anything imports torch
 from keyss.core import Similarity
 from keyss.fitting import FitConfig, PlainRun, TrainingRun, here, joined, save_checkpoint, train
 from keyss.keys import random_embeddings
-from keyss.methods import JointTraining, KeyssOptions, KeyssTraining, PlacedScene, registry
+from keyss.methods import JointTraining, KeyssOptions, PlacedScene, registry
 from tiny_scenes import random_gaussians, tiny_scene
 
 SEED = 3
@@ -28,9 +28,10 @@ def plain(fit: FitConfig, device: torch.device) -> PlainRun:
     return PlainRun(tiny_scene(), fit, device)
 
 
-def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
+def joint(fit: FitConfig, device: torch.device) -> JointTraining:
     """With wrong keys, poses of both scenes, and all attributes decoded."""
     options = KeyssOptions(
+        design="mlp",
         fit=fit,
         mask=("op", "ro", "sc", "xyz", "sh"),
         conditioning="bias",
@@ -38,9 +39,9 @@ def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
         hidden=(16, 16),
         branch=8,
     )
-    return KeyssTraining(
-        _placed(), list(random_embeddings(1, torch.Generator().manual_seed(0))), options, device
-    )
+    embeddings = list(random_embeddings(1, torch.Generator().manual_seed(0)))
+    run: JointTraining = options.settings.training(_placed(), embeddings, options, device)
+    return run
 
 
 def watergs(fit: FitConfig, device: torch.device) -> JointTraining:

@@ -29,7 +29,7 @@ Usage = namedtuple("Usage", "total used free")
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
-    options = KeyssOptions(fit=FIT, hidden=(8, 8), branch=8)
+    options = KeyssOptions(design="mlp", fit=FIT, hidden=(8, 8), branch=8)
     plan = keyss.hide(tiny_scene(0), secrets, method=options, out=tmp_path / "run", dry_run=True).plan
     fits = [stage for stage in plan.stages if stage.name.startswith("plain model")]
     assert [stage.name.removeprefix("plain model of the ") for stage in fits] == [
@@ -121,7 +121,9 @@ def test_plans_count_the_weights_of_the_networks() -> None:
     for channels in (3, 16):
         assert weights_of(channels) == _weights(Convolutions(channels))
     for design in get_args(DesignName):
-        shape = KeyssOptions(design=design).decoder_shape
+        if design == "carriers":
+            continue
+        shape = KeyssOptions(design=design).settings.shape(3)
         key = 64 * shape.hidden[0] if shape.conditioning == "bias" else 0
         assert shape.weights == _weights(Decoder(shape)) - key
 

@@ -73,13 +73,17 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             (loss / len(views)).backward()
             losses.append(loss.detach() / len(views))
             renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        total, info = torch.stack(losses).sum(), combine_densification(renders, count)
+        total, info = torch.stack(losses).sum(), self.combined(renders, count)
         if ranks.count == 1:
             return total, info
         statistics: dict[str, Any] = dict.fromkeys(_STATISTICS)
         self._update_state(params, statistics, info)
         total, *sums = ranks.sum(trained, [total, *statistics.values()])
         return total, dict(zip(_STATISTICS, sums, strict=True))
+
+    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+        """The info of a step's renders of `count` Gaussians."""
+        return combine_densification(renders, count)
 
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False

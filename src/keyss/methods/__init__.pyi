@@ -20,9 +20,11 @@ from .keyss.decoder import (
     DecoderShape as DecoderShape,
     parse_mask as parse_mask,
 )
-from .keyss.options import DESIGNS as DESIGNS, DesignName as DesignName, KeyssOptions as KeyssOptions
+from .keyss.designs.base import DesignName as DesignName
+from .keyss.designs.carriers import CarriersTraining as CarriersTraining
+from .keyss.options import KeyssOptions as KeyssOptions
+from .keyss.rows import RowSecret as RowSecret
 from .keyss.secret import HiddenSecret as HiddenSecret, choose_anchors as choose_anchors
-from .keyss.training import KeyssTraining as KeyssTraining
 from .opened import (
     Frame as Frame,
     HiddenFile as HiddenFile,

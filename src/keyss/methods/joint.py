@@ -93,8 +93,7 @@ class JointTraining(ABC):
         ]
         self.extent = scenes[0].scene.extent
 
-        starting = [scenes[index].scene for index in chosen_scenes(options.points, len(scenes))]
-        start = combined_points(starting, fit, self.generator)
+        start = self.start()
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, fit, self.extent)
         self.networks = torch.nn.ModuleList()
@@ -104,8 +103,19 @@ class JointTraining(ABC):
         # Without networks, the optimiser still needs a parameter.
         weights = list(self.networks.parameters()) or [torch.nn.Parameter(torch.zeros(1))]
         self.network_optimizer = torch.optim.AdamW(weights, lr=network_rate, weight_decay=weight_decay)
-        self.strategy = CappedStrategy(fit, self.opacity_for_pruning, freeze=freeze)
+        self.strategy = self.density_control(freeze)
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
+
+    def start(self) -> Gaussians:
+        """The Gaussians that training starts with: the sparse points of the scenes that options name."""
+        chosen = chosen_scenes(self.options.points, len(self.scenes))
+        return combined_points(
+            [self.scenes[index].scene for index in chosen], self.options.fit, self.generator
+        )
+
+    def density_control(self, freeze: bool) -> CappedStrategy:
+        """What clones, splits and prunes; `freeze`: at the cap nothing is pruned."""
+        return CappedStrategy(self.options.fit, self.opacity_for_pruning, freeze=freeze)
 
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:

@@ -14,7 +14,7 @@ from keyss.methods import ATTRIBUTES, Decoder, DecoderShape, HiddenSecret, choos
 
 FIT = FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0)
 SMALL: dict[str, Any] = {"hidden": (16, 16), "branch": 8}  # a decoder of few bytes
-OPTIONS = KeyssOptions(fit=FIT, mask=ATTRIBUTES, decoder_rate=1e-2, **SMALL)
+OPTIONS = KeyssOptions(design="mlp", fit=FIT, mask=ATTRIBUTES, decoder_rate=1e-2, **SMALL)
 # The paper's, but small and with inputs that learn in few steps.
 PUBLISHED = KeyssOptions(
     fit=replace(FIT, iterations=60), design="published", inputs="standardised", decoder_rate=3e-3, **SMALL

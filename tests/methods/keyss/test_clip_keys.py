@@ -117,7 +117,7 @@ def test_hiding_encrypts_what_clip_gives(
     monkeypatch.setattr(ClipKeys, "__init__", counted)
     fit = FitConfig(iterations=10, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)
     clip: dict[str, Any] = {"key_encoder": "clip", "clip_model": str(folder)}
-    config = KeyssOptions(fit=fit, hidden=(8, 8), branch=8, **clip)
+    config = KeyssOptions(design="mlp", fit=fit, hidden=(8, 8), branch=8, **clip)
     scenes, models = (
         [tiny_scene(seed) for seed in range(3)],
         [random_gaussians(seed=seed) for seed in range(3)],

@@ -16,9 +16,9 @@ from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.core.similarity import Similarity
 from keyss.fitting.density import combine_densification
 from keyss.keys import random_embeddings
-from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
+from keyss.methods import CombinedPoses, PlacedScene, Source, registry
 from keyss.methods.keyss import method
-from keyss.methods.keyss.training import possibly_seen
+from keyss.methods.keyss.designs.network import possibly_seen
 from keyss.rendering import render, render_with_meta
 from keyss.rendering.orbit import orbit
 from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, same, three_scenes
@@ -146,7 +146,8 @@ def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -
         PlacedScene.of(scene, model, Similarity.identity())
         for scene, model in zip(scenes, models, strict=True)
     ]
-    run = KeyssTraining(placed, list(random_embeddings(2, torch.Generator())), config, torch.device("cpu"))
+    embeddings = list(random_embeddings(2, torch.Generator()))
+    run = config.settings.training(placed, embeddings, config, torch.device("cpu"))
     owners = {pose[0] for _ in range(30) for pose in run._draw_poses()}
     assert owners == ({0} if which == "cover" else {1, 2})
     run.step()
@@ -162,17 +163,20 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match="bit for bit"):
         KeyssOptions(publish="any")
     with pytest.raises(UsageError, match="incorrect_every"):
-        KeyssOptions(incorrect_every=0)
+        KeyssOptions(design="mlp", incorrect_every=0)
     with pytest.raises(UsageError, match="common_poses"):
-        KeyssOptions(poses="cover")
+        KeyssOptions(design="mlp", poses="cover")
     KeyssOptions(poses="cover", design="published")
 
 
 def test_options_override_the_design() -> None:
     options = KeyssOptions(design="published", mask=("op",), common_poses=0.5)
-    assert options.settings == replace(DESIGNS["published"], mask=("op",), common_poses=0.5)
-    assert replace(options, design="mlp").settings == replace(DESIGNS["mlp"], mask=("op",), common_poses=0.5)
-    assert options.decoder_shape.hidden == (64, 128)
+    for name in ("published", "mlp"):
+        chosen = KeyssOptions(design=name).settings
+        assert replace(options, design=name).settings == replace(chosen, mask=("op",), common_poses=0.5)
+    assert options.settings.shape(3).hidden == (64, 128)
+    with pytest.raises(UsageError, match="`mask` is for designs with a network"):
+        replace(options, design="carriers")
 
 
 @pytest.mark.parametrize("design", ["published", "released"])
@@ -202,7 +206,7 @@ def test_decoders_are_appended_rather_than_lost(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(method, "LOW_BITS", Unusable())
     scenes = [tiny_scene(seed) for seed in range(2)]
     fit = FitConfig(iterations=2, max_gaussians=6000)
-    options = KeyssOptions(hidden=(8, 8), branch=8, fit=fit)
+    options = KeyssOptions(design="mlp", hidden=(8, 8), branch=8, fit=fit)
     plains = [random_gaussians(seed=seed) for seed in range(2)]
     hidden = hide_scenes(scenes, KEYS[:1], options, plains=plains)
     assert is_appended(hidden.stego).any()

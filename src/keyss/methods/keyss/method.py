@@ -20,19 +20,18 @@ from torch import Tensor
 
 from keyss.channels import APPENDED, LOW_BITS, check_payload_fits
 from keyss.core.errors import KeyssError, KeyssWarning, UsageError
-from keyss.core.gaussians import DRAWN_OPACITY
+from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.core.similarity import Similarity
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES, stream
 from keyss.methods.base import Capabilities, Context, Source, Stego
 from keyss.methods.joint import train_jointly
 from keyss.methods.keyss.clip_keys import MODEL, ClipKeys
-from keyss.methods.keyss.decoder import Decoder
+from keyss.methods.keyss.designs.base import DesignTraining, Secret
 from keyss.methods.keyss.options import KeyssOptions
-from keyss.methods.keyss.secret import ANCHORS, HiddenSecret, choose_anchors
-from keyss.methods.keyss.training import KeyssTraining
+from keyss.methods.keyss.secret import unpack
 from keyss.methods.plan import Plan
+from keyss.methods.poses import PlacedScene
 
 _APPENDED = "the secrets lie in appended Gaussians instead, and everybody can see that they are there"
 
@@ -49,26 +48,30 @@ class KeyssMethod:
     options = KeyssOptions
 
     def prepare(self, sources: Sequence[Source], options: KeyssOptions) -> KeyssOptions:
-        """Sets the design's loss. Warns (KeyssWarning) of models too small for the decoders' low bits."""
+        """Sets the design's loss. Warns (KeyssWarning) of models too small for the payloads' low bits.
+
+        Raises UsageError for more secrets than the design can hide.
+        """
         options = replace(options, fit=options.joint_fit)
         encoder_of(options)  # raises where CLIP is missing
-        fit = options.fit
+        fit, secrets = options.fit, len(sources) - 1
+        size = options.settings.payload_bytes(fit.sh_degree, secrets)
         try:
-            check_payload_fits(_largest_payload(options), fit.max_gaussians, len(sources) - 1, fit.sh_degree)
+            check_payload_fits(size, fit.max_gaussians, secrets, fit.sh_degree)
         except UsageError as error:
             warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
         return options
 
     def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
         """As many Gaussians as a plain model has show all scenes."""
-        settings, secrets = options.settings, len(sources) - 1
-        decodings = secrets + (1 / settings.incorrect_every if settings.conditioning == "bias" else 0.0)
-        return options.joint_plan(secrets, gaussian_weights=decodings * options.decoder_shape.weights)
+        secrets = len(sources) - 1
+        weights = options.settings.weights(options.fit.sh_degree, secrets)
+        return options.joint_plan(secrets, gaussian_weights=weights)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context
     ) -> Stego:
-        """Train the cover and the secrets together, and encrypt the decoders.
+        """Train the cover and the secrets together, and encrypt what reveals each.
 
         Raises Interrupted on Ctrl-C, and InputError for a checkpoint of another run.
         """
@@ -79,27 +82,33 @@ class KeyssMethod:
             embeddings = [DerivedKey(key, derivation).embedding() for key in keys]
         else:
             embeddings = [encoder(key) for key in keys]
-        run = train_jointly(
-            lambda placed: KeyssTraining(placed, embeddings, options, context.device), cover, secrets, context
-        )
-        return _published(run, keys, context.entropy or os.urandom(32))
+        design = options.settings
+
+        def begin(placed: Sequence[PlacedScene]) -> DesignTraining:
+            training: DesignTraining = design.training(placed, embeddings, options, context.device)
+            return training
+
+        run = train_jointly(begin, cover, secrets, context)
+        return _embedded(run, keys, context.entropy or os.urandom(32))
 
 
-def _published(run: KeyssTraining, keys: Sequence[str], entropy: bytes) -> Stego:
-    """All Gaussians in a random order, and in their low bits for each key the decoder of its secret.
+def published(run: DesignTraining, entropy: bytes) -> tuple[Gaussians, Sequence[Secret]]:
+    """All Gaussians in a random order, before anything is in their low bits, and what reveals each secret.
 
-    In training, the cover's points come first and the secrets' after them. Warns (KeyssWarning) where the low
-    bits have no room, in which case the decoders are in appended Gaussians.
+    In training, an order can tell the scenes apart.
     """
-    stego = run.gaussians().to("cpu")
+    stego, secrets = run.publish(entropy)
     numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
-    stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
-    anchors = choose_anchors(stego, torch.Generator().manual_seed(run.options.fit.known_seed))
-    payloads = []
-    for decoder, placed in zip(run.decoders, run.scenes[1:], strict=True):
-        secret = HiddenSecret(decoder.to("cpu").requires_grad_(False), placed.frame, anchors)
-        drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
-        payloads.append(replace(secret, count=int(drawn.sum())).payload())
+    return stego[torch.from_numpy(numbers.argsort(kind="stable"))], secrets
+
+
+def _embedded(run: DesignTraining, keys: Sequence[str], entropy: bytes) -> Stego:
+    """The published model with the payload of each secret under its key.
+
+    Warns (KeyssWarning) where the low bits have no room, in which case payloads are in appended Gaussians.
+    """
+    stego, secrets = published(run, entropy)
+    payloads = [secret.payload() for secret in secrets]
     keyed = list(zip(keys, payloads, strict=True))
     details: dict[str, Any] = {}
     try:
@@ -108,7 +117,7 @@ def _published(run: KeyssTraining, keys: Sequence[str], entropy: bytes) -> Stego
         found = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
         warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
         details["appended_because"] = str(error)
-    return Stego(found, tuple(map(HiddenSecret.of, payloads)), run.iterations, details)
+    return Stego(found, tuple(map(unpack, payloads)), run.iterations, details)
 
 
 def encoder_of(options: KeyssOptions) -> Callable[[str], Tensor] | None:
@@ -116,12 +125,6 @@ def encoder_of(options: KeyssOptions) -> Callable[[str], Tensor] | None:
     if options.key_encoder == "argon2":
         return None
     return _clip_keys(options.clip_model or MODEL)
-
-
-def _largest_payload(options: KeyssOptions) -> int:
-    """Bytes of a secret whose decoder cannot be compressed."""
-    decoder = Decoder(options.decoder_shape)
-    return len(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3)).payload().data)
 
 
 def training_salt(cover: Scene, seed: int) -> bytes:

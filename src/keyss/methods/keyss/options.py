@@ -4,62 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from keyss.core.errors import UsageError
 from keyss.fitting.config import FitConfig
-from keyss.methods.base import CommandLineOption, check_above_zero
+from keyss.methods.base import CommandLineOption
 from keyss.methods.joint_options import JointOptions
-from keyss.methods.keyss.decoder import DecoderShape, Mask, parse_mask
+from keyss.methods.keyss.decoder import Mask, parse_mask
+from keyss.methods.keyss.designs.base import DesignName, design
 
-DesignName = Literal["mlp", "published", "released"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Design:
-    """Everything that a design sets, and that an option of the same name overrides."""
-
-    # The decoder, see `DecoderShape`.
-    mask: Mask = ("op",)
-    conditioning: Literal["gate", "bias"] = "gate"
-    hidden: tuple[int, int] = (64, 64)
-    branch: int = 32
-    frequencies: int = 6
-    inputs: Literal["standardised", "normalised"] = "standardised"
-    residuals: Literal["signed", "one-sided"] = "signed"
-    decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
-    # Share of the steps that render all scenes from one pose, against a photo or the plain model's render. In
-    # the others each scene has a pose and a photo of its own.
-    common_poses: float = 0.1
-    incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
-    incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
-    ssim_weight: float | None = None  # of the loss, also for plain models; None: that of `fit`
-    # At the cap, Gaussians that ask for growth wait until others are pruned; "freeze": none are.
-    at_cap: Literal["wait", "freeze"] = "wait"
-    prune_by: Literal["all", "cover"] = "all"  # scenes in which an opaque Gaussian is spared
-
-
-_PUBLISHED = Design(
-    mask=("op", "ro", "sc", "xyz"),
-    conditioning="bias",
-    hidden=(64, 128),
-    branch=64,
-    frequencies=0,
-    inputs="normalised",
-    decoder_rate=5e-5,
-    common_poses=1.0,
-    incorrect_weight=0.01,
-    incorrect_every=1,
-    ssim_weight=0.5,
-)
-
-DESIGNS: dict[DesignName, Design] = {
-    "mlp": Design(),
-    "published": _PUBLISHED,
-    "released": replace(
-        _PUBLISHED, residuals="one-sided", ssim_weight=None, at_cap="freeze", prune_by="cover"
-    ),
-}
+_OTHERS = ("clip_model",)  # options that are None by default and no setting of a design
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +29,10 @@ class KeyssOptions(JointOptions):
     design: Annotated[
         DesignName,
         CommandLineOption(
-            "mlp: the paper's architecture with inputs, rates and poses that work; published: the paper's "
-            "text; released: the authors' program."
+            "carriers: rows that are a Gaussian of each scene; mlp: the paper's architecture with inputs, "
+            "rates and poses that work; published: the paper's text; released: the authors' program."
         ),
-    ] = "mlp"
+    ] = "carriers"
     mask: Annotated[  # theta
         Mask | None,
         CommandLineOption(
@@ -97,8 +51,7 @@ class KeyssOptions(JointOptions):
         CommandLineOption("CLIP for --key-encoder clip.", metavar="FOLDER", default="ViT-L/14 in the cache"),
     ] = None
 
-    weight_decay: float = 1e-4  # of the decoders
-
+    weight_decay: float | None = None
     conditioning: Literal["gate", "bias"] | None = None
     hidden: tuple[int, int] | None = None
     branch: int | None = None
@@ -116,33 +69,33 @@ class KeyssOptions(JointOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         settings = self.settings
-        check_above_zero(settings, "decoder_rate")
-        if settings.incorrect_every < 1:
-            raise UsageError(f"`incorrect_every`: expected at least 1, got {settings.incorrect_every}")
         if self.clip_model is not None and self.key_encoder != "clip":
             raise UsageError(
                 '`clip_model` is for the key encoder clip: leave it out or set `key_encoder="clip"`'
             )
         self.check_poses(settings.common_poses)
+        if (self.points, self.densification) != ("both", "both") and not hasattr(settings, "mask"):
+            raise UsageError(
+                f"`points` and `densification`: in the design {self.design} each scene has its own"
+            )
 
     @property
-    def settings(self) -> Design:
-        """The design with what these options override."""
-        values = {each.name: getattr(self, each.name) for each in fields(Design)}
-        given = {name: value for name, value in values.items() if value is not None}
-        return replace(DESIGNS[self.design], **given)
+    def settings(self) -> Any:
+        """The `Design` with what these options override. Raises UsageError for what it does not have."""
+        chosen = design(self.design)
+        own = [each.name for each in fields(self) if each.default is None and each.name not in _OTHERS]
+        given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}
+        if foreign := [name for name in given if not hasattr(chosen, name)]:
+            raise UsageError(
+                f"`{foreign[0]}` is for designs with a network; {self.design} has none: "
+                'leave it out or set `design="mlp"`'
+            )
+        return replace(chosen, **given)
 
     @classmethod
     def variants(cls) -> Mapping[str, KeyssOptions]:
-        """KeySS as published."""
-        return {"published": KeyssOptions(design="published")}
-
-    @property
-    def decoder_shape(self) -> DecoderShape:
-        """Kind and sizes of the decoders; most have the same names."""
-        settings = self.settings
-        shape = {name: getattr(settings, name) for name in vars(DecoderShape()) if hasattr(settings, name)}
-        return DecoderShape(**shape | {"sh_degree": self.fit.sh_degree})
+        """The other designs, the paper's text first."""
+        return {"published": KeyssOptions(design="published"), "mlp": KeyssOptions(design="mlp")}
 
     @property
     def joint_fit(self) -> FitConfig:

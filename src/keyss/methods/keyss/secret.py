@@ -24,7 +24,9 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
+from keyss.methods.keyss import rows
 from keyss.methods.keyss.decoder import Decoder, DecoderShape, parse_mask
+from keyss.methods.keyss.rows import RowSecret
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import FrameRecord, Header, damage_refused, pack_tensors, unpack_tensors
 
@@ -145,4 +147,7 @@ def choose_anchors(stego: Gaussians, generator: torch.Generator) -> Tensor:
     return stego.means[torch.randperm(len(stego), generator=generator)[:ANCHORS]].detach().cpu()
 
 
-unpack = HiddenSecret.of
+def unpack(content: Content) -> HiddenSecret | RowSecret:
+    """The secret, whose version tells which design it is of. Raises InputError."""
+    carriers = isinstance(content, Payload) and rows.MARK in content.data[:512]
+    return RowSecret.of(content) if carriers else HiddenSecret.of(content)

@@ -1,27 +1,86 @@
-"""The joint training of the published model and the decoders (KeySS, section 3.4)."""
+"""Designs with a network: a decoder for each secret adds residuals to the cover's Gaussians.
+
+KeySS, sections 3.2 to 3.4. Start: the sparse points of all scenes. Density: gradients of all scenes together.
+Conditioning: a bias of the network's first layer, and a loss of wrong keys; or a gate.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import Gaussians
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Camera
+from keyss.core.similarity import Similarity
 from keyss.fitting.density import Rendered
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import to_gaussians
 from keyss.keys.derivation import random_embeddings
-from keyss.methods.joint import JointTraining, Picture, Pose
-from keyss.methods.keyss.decoder import Decoder
-from keyss.methods.keyss.options import KeyssOptions
+from keyss.methods.base import check_above_zero
+from keyss.methods.joint import Picture, Pose
+from keyss.methods.joint_options import JointOptions
+from keyss.methods.keyss.decoder import Decoder, DecoderShape, Mask
+from keyss.methods.keyss.designs.base import Design, DesignTraining
+from keyss.methods.keyss.secret import ANCHORS, HiddenSecret, choose_anchors
 from keyss.methods.poses import PlacedScene
 
 _SLACK = 0.02  # scene extents by which a decoder may move a Gaussian
 
 
-class KeyssTraining(JointTraining):
+@dataclass(frozen=True, kw_only=True)
+class NetworkDesign(Design):
+    """Raises UsageError for settings that do not work."""
+
+    # The decoder, see `DecoderShape`.
+    mask: Mask = ("op",)
+    conditioning: Literal["gate", "bias"] = "gate"
+    hidden: tuple[int, int] = (64, 64)
+    branch: int = 32
+    frequencies: int = 6
+    inputs: Literal["standardised", "normalised"] = "standardised"
+    residuals: Literal["signed", "one-sided"] = "signed"
+    decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
+    weight_decay: float = 1e-4  # of the decoders
+    incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
+    incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
+    # At the cap, Gaussians that ask for growth wait until others are pruned; "freeze": none are.
+    at_cap: Literal["wait", "freeze"] = "wait"
+    prune_by: Literal["all", "cover"] = "all"  # scenes in which an opaque Gaussian is spared
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "decoder_rate")
+        if self.incorrect_every < 1:
+            raise UsageError(f"`incorrect_every`: expected at least 1, got {self.incorrect_every}")
+
+    def shape(self, sh_degree: int) -> DecoderShape:
+        """Kind and sizes of the decoders."""
+        own = {name: getattr(self, name) for name in vars(DecoderShape()) if hasattr(self, name)}
+        return DecoderShape(**own | {"sh_degree": sh_degree})
+
+    def training(
+        self,
+        scenes: Sequence[PlacedScene],
+        embeddings: Sequence[Tensor],
+        options: JointOptions,
+        device: torch.device,
+    ) -> NetworkTraining:
+        return NetworkTraining(scenes, embeddings, options, device, self)
+
+    def payload_bytes(self, sh_degree: int, secrets: int) -> int:
+        decoder = Decoder(self.shape(sh_degree))
+        return len(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3)).payload().data)
+
+    def weights(self, sh_degree: int, secrets: int) -> float:
+        wrong = 1 / self.incorrect_every if self.conditioning == "bias" else 0.0
+        return (secrets + wrong) * self.shape(sh_degree).weights
+
+
+class NetworkTraining(DesignTraining):
     """Gaussians that show the cover, and for each secret a decoder that makes its Gaussians of them."""
 
     warm_up = 100
@@ -30,11 +89,12 @@ class KeyssTraining(JointTraining):
         self,
         scenes: Sequence[PlacedScene],
         embeddings: Sequence[Tensor],  # [64] of each secret's key
-        options: KeyssOptions,
+        options: JointOptions,
         device: torch.device,
+        settings: NetworkDesign,
     ) -> None:
-        self.settings = settings = options.settings
-        self.shape = options.decoder_shape
+        self.settings = settings
+        self.shape = settings.shape(options.fit.sh_degree)
         self.embeddings = [embedding.to(device) for embedding in embeddings]
         super().__init__(
             scenes,
@@ -42,7 +102,7 @@ class KeyssTraining(JointTraining):
             device,
             common_poses=settings.common_poses,
             network_rate=settings.decoder_rate,
-            weight_decay=options.weight_decay,
+            weight_decay=settings.weight_decay,
             freeze=settings.at_cap == "freeze",
         )
 
@@ -99,6 +159,16 @@ class KeyssTraining(JointTraining):
     def gaussians(self) -> Gaussians:
         """The model as it would be published."""
         return to_gaussians(self.parameters).detach()
+
+    def publish(self, entropy: bytes) -> tuple[Gaussians, list[HiddenSecret]]:
+        stego = self.gaussians().to("cpu")
+        anchors = choose_anchors(stego, torch.Generator().manual_seed(self.options.fit.known_seed))
+        secrets = []
+        for decoder, placed in zip(self.decoders, self.scenes[1:], strict=True):
+            secret = HiddenSecret(decoder.to("cpu").requires_grad_(False), placed.frame, anchors)
+            drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
+            secrets.append(replace(secret, count=int(drawn.sum())))
+        return stego, secrets
 
 
 @torch.no_grad()

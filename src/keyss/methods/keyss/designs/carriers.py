@@ -1,0 +1,270 @@
+"""The design `carriers`: every row of the model is a Gaussian of each scene.
+
+A row has the cover's 59 numbers, and for each secret those of one of its Gaussians, which publication writes
+into the spare bits of the row's harmonics (`rows`). Start: each scene has the whole cap, as plain 3DGS does.
+Density: a place that is dead in one scene takes a clone or a split of what that scene asks for; the rest of
+the row stays. Conditioning: the key's embedding decrypts rows, so nothing has to be learned of wrong keys.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+import torch.nn.functional as F
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.fitting.config import FitConfig
+from keyss.fitting.density import CappedStrategy, Rendered, combine_densification
+from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.parameters import (
+    Optimizers,
+    Parameters,
+    make_optimizers,
+    set_rates,
+    to_gaussians,
+    to_parameters,
+)
+from keyss.fitting.plain import without_faint
+from keyss.methods.joint import Picture
+from keyss.methods.joint_options import JointOptions
+from keyss.methods.keyss.designs.base import Design, DesignTraining
+from keyss.methods.keyss.rows import (
+    PAYLOAD_BYTES,
+    RowSecret,
+    carrying,
+    encrypt_rows,
+    secret_tables,
+    visibility,
+)
+from keyss.methods.points import combined_points
+from keyss.methods.poses import PlacedScene
+from keyss.methods.records.quantise import Codec
+from keyss.rendering.view import contributions
+
+# After density control, so often a step is rendered without so many of the faintest Gaussians of each scene.
+PRUNED_STEPS, PRUNED_SHARE = 0.3, 0.25
+T = TypeVar("T")
+
+_EMPTY = -8.0  # opacity logit of a place without a Gaussian
+_VIEWS = 64  # that tell how much a Gaussian of a secret contributes
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarriersDesign(Design):
+    """Nothing but the training can be set."""
+
+    def training(
+        self,
+        scenes: Sequence[PlacedScene],
+        embeddings: Sequence[Tensor],
+        options: JointOptions,
+        device: torch.device,
+    ) -> CarriersTraining:
+        return CarriersTraining(scenes, embeddings, options, device)
+
+    def payload_bytes(self, sh_degree: int, secrets: int) -> int:
+        secret_tables(sh_degree, secrets)
+        return PAYLOAD_BYTES
+
+
+DESIGN = CarriersDesign()
+
+
+class CarriersTraining(DesignTraining):
+    """One set of rows, and for each scene its own numbers, views and density control."""
+
+    def __init__(
+        self,
+        scenes: Sequence[PlacedScene],
+        embeddings: Sequence[Tensor],  # [64] of each secret's key
+        options: JointOptions,
+        device: torch.device,
+    ) -> None:
+        self.embeddings, self.pruned = embeddings, False
+        self.tables = secret_tables(options.fit.sh_degree, len(embeddings))
+        super().__init__(scenes, options, device, common_poses=0.0, network_rate=0.0)
+
+    def start(self) -> Gaussians:
+        return self._filled(0, self.options.fit.sh_degree)
+
+    def _filled(self, scene: int, sh_degree: int) -> Gaussians:
+        """A scene's sparse points, as plain 3DGS starts, and empty places up to the cap."""
+        fit = replace(self.options.fit, sh_degree=sh_degree)
+        model = combined_points([self.scenes[scene].scene], fit, self.generator)
+        rest = model[torch.arange(fit.max_gaussians - len(model)) % len(model)]
+        rest = replace(rest, opacity_logits=torch.full((len(rest),), _EMPTY))
+        return Gaussians.cat([model, rest])
+
+    def prepare(self, start: Gaussians) -> None:
+        fit = self.options.fit
+        for scene, placed in enumerate(self.scenes[1:], 1):
+            secret = to_parameters(self._filled(scene, self.tables[0].sh_degree), self.device)
+            optimizers = make_optimizers(secret, fit, placed.scene.extent)
+            for name, values in secret.items():
+                self.parameters[f"{scene}/{name}"] = values
+                self.optimizers[f"{scene}/{name}"] = optimizers[name]
+
+    def density_control(self, freeze: bool) -> CappedStrategy:
+        return DeadPlaces(self.options.fit, [placed.scene.extent for placed in self.scenes], self.generator)
+
+    def step(self) -> None:
+        grown = self.iteration >= self.strategy.refine_stop_iter
+        self.pruned = grown and float(torch.rand((), generator=self.generator)) < PRUNED_STEPS
+        super().step()
+        self.pruned = False
+
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        models = [self.scene_gaussians(scene) for scene in scenes]
+        if self.pruned:
+            models = [without_faintest(model, self.options.fit.prune_opacity) for model in models]
+        return [
+            self.render(model, scene, camera, min(sh_degree, model.sh_degree))
+            for scene, model in zip(scenes, models, strict=True)
+        ]
+
+    def scene_gaussians(self, scene: int) -> Gaussians:
+        """[N] what the rows are in a scene, attached to their graph."""
+        return to_gaussians(numbers_of(self.parameters, scene))
+
+    def _set_rates(self) -> None:
+        super()._set_rates()
+        for scene in range(1, len(self.scenes)):
+            set_rates(numbers_of(self.optimizers, scene), self.iteration / self.iterations)
+
+    def publish(self, entropy: bytes) -> tuple[Gaussians, list[RowSecret]]:
+        # Every scene's Gaussians in order: pruning faint rows takes away what no scene needs.
+        least = self.options.fit.prune_opacity
+        cover = without_faint(self.scene_gaussians(0).detach().to("cpu"), least)
+        cover = cover[cover.opacity_logits.argsort(descending=True, stable=True)]
+        counts = [len(kind.rows) for kind in carrying(cover)][: len(self.tables)]
+        models, secrets = [], []
+        for index, (placed, embedding) in enumerate(zip(self.scenes[1:], self.embeddings, strict=True)):
+            model = without_faint(self.scene_gaussians(index + 1).detach().to("cpu"), least)
+            cameras = [view.camera for view in subsample_views(placed.scene.train, _VIEWS)]
+            parts = arranged(model, contributions(model, cameras), counts)
+            codecs = [
+                Codec.fit(part.with_sh_degree(table.sh_degree), table)
+                for part, table in zip(parts, self.tables, strict=True)
+                if len(part)
+            ]
+            model, share = Gaussians.cat(parts), (index, len(self.embeddings))
+            secrets.append(
+                RowSecret(embedding, tuple(codecs), placed.frame, *share, len(model), visibility(model))
+            )
+            models.append(model)
+        return encrypt_rows(cover, secrets, models, entropy), secrets
+
+
+def arranged(model: Gaussians, weights: Tensor, counts: Sequence[int]) -> list[Gaussians]:
+    """The Gaussians for each kind of rows, of which there are so many, the most important ones first.
+
+    What contributes much and is opaque is kept longest. Rows of a later kind, which have less room, get those
+    whose harmonics matter least.
+    """
+    order = (weights * model.opacities).argsort(descending=True, stable=True)[: sum(counts)]
+    harmonics = (model.sh[:, 1:].square().mean((1, 2)).sqrt() * weights)[order]
+    later = torch.zeros(len(order), dtype=torch.bool)
+    later[harmonics.argsort(stable=True)[: max(0, len(order) - counts[0])]] = True
+    return [model[order[~later]], model[order[later]]][: len(counts)]
+
+
+def without_faintest(model: Gaussians, least: float) -> Gaussians:
+    """[N] the same with the faintest PRUNED_SHARE of those above an opacity of `least` made invisible."""
+    logits = model.opacity_logits.detach()
+    empty = int((logits < math.log(least / (1 - least))).sum())
+    limit = logits.kthvalue(empty + max(1, int(PRUNED_SHARE * (len(logits) - empty)))).values
+    return replace(model, opacity_logits=model.opacity_logits.where(logits > limit, -20.0))
+
+
+def numbers_of(parameters: dict[str, T], scene: int) -> dict[str, T]:
+    """A scene's own among the numbers of the rows."""
+    own = str(scene) if scene else ""
+    return {
+        name.rpartition("/")[2]: values
+        for name, values in parameters.items()
+        if name.rpartition("/")[0] == own
+    }
+
+
+class DeadPlaces(CappedStrategy):
+    """Density control of rows whose number stays: what is pruned becomes a place for what grows.
+
+    Thresholds and times are those of plain 3DGS. Places that nothing asks for are divided among the steps
+    that are left, so that in the end none is empty: a row without a Gaussian of the cover could carry none.
+    """
+
+    def __init__(self, fit: FitConfig, extents: Sequence[float], generator: torch.Generator) -> None:
+        super().__init__(fit)
+        self.extents, self.generator = extents, generator
+
+    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+        """Statistics [S, N] of every scene's own renders, which come in turns."""
+        found: list[dict[str, Any]] = []
+        for scene in range(len(self.extents)):
+            found.append({"grad2d": None, "count": None})
+            own = combine_densification(renders[scene :: len(self.extents)], count)
+            self._update_state({}, found[-1], own)
+        return {name: torch.stack([each[name] for each in found]) for name in found[0]}
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
+    ) -> None:
+        if step >= self.refine_stop_iter:
+            return
+        self._update_state(params, state, info)
+        if step <= self.refine_start_iter or step % self.refine_every:
+            return
+        left = (self.refine_stop_iter - 1 - step) // self.refine_every + 1
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
+        for scene, extent in enumerate(self.extents):
+            self._grow(numbers_of(params, scene), optimizers, scene, gradients[scene], extent, left)
+        state["grad2d"], state["count"] = None, None
+
+    def _grow(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        scene: int,
+        gradients: Tensor,  # [N]
+        extent: float,
+        left: int,
+    ) -> None:
+        """Clone small Gaussians and split large ones into dead places, the largest gradients first."""
+        model = to_gaussians(params).detach()
+        dead = model.opacities < self.prune_opa
+        places = dead.nonzero()[:, 0]
+        gradients = gradients.masked_fill(dead, 0)
+        asking = int((gradients > self.grow_grad2d).sum())
+        alive = len(dead) - len(places)
+        count = min(len(places), alive, max(asking, math.ceil(len(places) / left)))
+        source, target = gradients.topk(count).indices, places[:count]
+        part = model[source]
+        large = part.scales.amax(1) > self.grow_scale3d * extent
+        noise = torch.randn(2, count, 3, generator=self.generator).to(large.device)
+        offsets = noise * part.scales * large[:, None]
+        rotations = normalized_quat_to_rotmat(F.normalize(part.quats, dim=1))
+        offsets = torch.einsum("nij,bnj->bni", rotations, offsets)
+        scales = part.log_scales - math.log(1.6) * large[:, None]
+        every = torch.ones_like(large)
+        for rows, offset, fresh in ((source, offsets[0], large), (target, offsets[1], every)):
+            moved = replace(part, means=part.means + offset, log_scales=scales)
+            for (name, parameter), values in zip(params.items(), vars(moved).values(), strict=True):
+                parameter.data[rows] = values
+                full = f"{scene}/{name}" if scene else name
+                for key, moment in optimizers[full].state[parameter].items():
+                    if key != "step":
+                        moment[rows[fresh]] = 0

@@ -1,0 +1,300 @@
+"""A secret of the design `carriers`: row by row in the harmonics of a model, under the key's embedding.
+
+Of a harmonic above the constant one, sign, exponent and the two leading bits of the mantissa are the cover's.
+The next 8 bits, a *carrier*, say 7 bits of the secret. The 13 below belong to the low bits, which hold the
+payload. The carriers of a row are a cell (`keyss.channels.low_bits.cells`) under a key that follows from the
+embedding alone; its tag tells whether the embedding opens it. So rows may be pruned or reordered, the
+embedding of another key opens none and shows the cover, and the payload without the embedding shows nothing.
+
+A carrier b stands for min(b, 255 - b). Which of the two is written makes carriers as unevenly distributed as
+those of the cover are: the harmonics of a trained model become rarer with size, also within a quarter of an
+octave, and by how much follows from how large they are in their row (see `_tilts`).
+
+Harmonics that are exactly zero, such as those of a saturated colour, stay zero. A row with few of them has
+room for a Gaussian with all harmonics, a row with more for one without, and the others are left alone.
+docs/format.md lists the bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from msgspec import Meta
+from torch import Tensor
+
+from keyss.channels import Content, Payload, identities, is_appended
+from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.pruning_compensation import compensate_pruning
+from keyss.core.similarity import Similarity
+from keyss.keys.derivation import EMBEDDING_SIZE, expand, stream
+from keyss.methods.opened import Frame, Remains
+from keyss.methods.records.quantise import Codec
+from keyss.methods.records.table import Table
+from keyss.methods.tensors import FrameRecord, Header, damage_refused, pack_tensors, unpack_tensors
+
+NAME = "keyss"
+FORMAT, VERSION = "keyss-secret", 9
+MARK = rf"\"version\":{VERSION},".encode()  # in the JSON of a packed header
+PAYLOAD_BYTES = 2048  # at most, of a packed secret
+KINDS = (40, 24)  # of rows: carriers that are used where at least so many harmonics are not zero
+BITS = 7  # of a carrier
+SHIFT = np.uint32(13)  # bits of a harmonic below its carrier
+_LEAST = Table.short()  # the coarsest Gaussian
+_FEWEST = 500  # carriers that a tilt is measured on
+
+Bytes = npt.NDArray[np.uint8]
+Words = npt.NDArray[np.uint32]
+Rows = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Header(Header):
+    """msgspec holds it to these types and bounds."""
+
+    frame: FrameRecord
+    secret: Annotated[int, Meta(ge=0, le=8)]  # which share of a row's bytes it has
+    secrets: Annotated[int, Meta(ge=1, le=9)]  # that share them
+    count: Annotated[int, Meta(ge=1, le=2**31)]
+    visibility: Annotated[float, Meta(gt=0)]  # of all these Gaussians, see `visibility`
+
+
+@dataclass(frozen=True)
+class RowSecret:
+    """Everything beside the stego model that reveals one secret; see `keyss.methods.opened.Opened`."""
+
+    embedding: Tensor  # [64] of its key
+    codecs: tuple[Codec, ...]  # of the Gaussians in each of the KINDS of rows
+    frame: Similarity  # from the secret's own frame into the cover's
+    secret: int
+    secrets: int
+    count: int  # of its Gaussians
+    visibility: float
+    chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
+
+    def payload(self) -> Payload:
+        """What a channel carries; the same secret gives the same bytes."""
+        numbers = self.secret, self.secrets, self.count, self.visibility
+        header = _Header(FORMAT, VERSION, FrameRecord.of(self.frame), *numbers)
+        tensors = {"embedding": self.embedding}
+        for index, codec in enumerate(self.codecs):
+            tensors[f"codec.{index}"] = torch.frombuffer(bytearray(codec.pack()), dtype=torch.uint8)
+        return Payload(NAME, pack_tensors(tensors, header))
+
+    @staticmethod
+    def of(content: Content) -> RowSecret:
+        """What `payload` gave. Raises InputError for anything else, for damage, and another version."""
+        with damage_refused("the payload is no secret of keyss, or damaged"):
+            if not isinstance(content, Payload):
+                raise ValueError("expected one string of bytes, got records")
+            header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
+            embedding = tensors.pop("embedding")
+            packed = [tensors.pop(f"codec.{index}") for index in range(len(tensors))]
+            if embedding.shape != (EMBEDDING_SIZE,) or embedding.dtype != torch.float32:
+                raise ValueError(f"expected an embedding of {EMBEDDING_SIZE} single precision numbers")
+            if not 1 <= len(packed) <= len(KINDS) or header.secret >= header.secrets:
+                raise ValueError("its tensors or its header are others")
+            if any(each.dtype != torch.uint8 for each in packed):
+                raise ValueError("expected bytes")
+            codecs = tuple(Codec.unpack(each.numpy().tobytes()) for each in packed)
+            frame = header.frame.similarity
+        numbers = header.secret, header.secrets, header.count, header.visibility
+        return RowSecret(embedding, codecs, frame, *numbers, content.chunks)
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """A model that needs no decoder and no cover; see `Opened.reveal`.
+
+        If rows were lost, the others make up for the share of visibility that is gone.
+        """
+        decoded = self._opened(stego, self.embedding)
+        if decoded is None:
+            raise InputError(
+                "the model was moved, rounded or trained since the secret was hidden in it, or it is another "
+                "one: none of its Gaussians opens"
+            )
+        left = min(1.0, visibility(decoded) / self.visibility)
+        decoded = compensate_pruning(decoded, round(len(decoded) / max(left, 1e-6)))
+        return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
+
+    def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
+        """What `stego` shows for an embedding [64]: the secret, or itself where no row opens."""
+        opened = self._opened(stego, embedding)
+        return stego if opened is None else opened
+
+    def _opened(self, stego: Gaussians, embedding: Tensor) -> Gaussians | None:
+        own = stego.detach().to("cpu")
+        own = own[~is_appended(own)]
+        sh_degree = max(codec.table.sh_degree for codec in self.codecs)
+        found = []
+        for codec, kind in zip(self.codecs, row_kinds(own), strict=False):
+            cell, size = _cipher(embedding, codec), share(kind.carriers, self.secrets)
+            if cell.cell_bytes <= size and len(kind.rows):
+                data = kind.read(own)[:, self.secret * size :]
+                fits, records = cell.decrypt(names(own)[kind.rows], data, self.secret)
+                found += [codec.decode(records).with_sh_degree(sh_degree)] if fits.any() else []
+        return Gaussians.cat(found).to(stego.device) if found else None
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), self.count, self.chunks)
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.payload().data).hexdigest()[:16]
+
+
+def secret_tables(sh_degree: int, secrets: int) -> list[Table]:
+    """How a Gaussian of each of so many secrets is coded in the kinds of rows of a model of this SH degree.
+
+    With the highest degree for which there is room, else coarsely. Raises UsageError where nothing fits.
+    """
+    found = []
+    for carriers in _carriers(sh_degree):
+        bits = 8 * (share(carriers, secrets) - TAG_BYTES)
+        tables = [Table.of_size(bits, degree) for degree in range(sh_degree, -1, -1)]
+        found += [each for each in (*tables, Table.of_size(bits, 0, _LEAST)) if each is not None][:1]
+    if not found:
+        raise UsageError(
+            f"SH degree {sh_degree} with {secrets} secrets: a row has no room for a Gaussian of each; use a "
+            "higher degree, fewer secrets, or `method='carry'`"
+        )
+    return found
+
+
+def share(carriers: int, secrets: int) -> int:
+    """Bytes of a row with so many carriers that each secret has."""
+    return carriers * BITS // 8 // secrets
+
+
+@dataclass(frozen=True)
+class RowKind:
+    """Rows of a model with equally many carriers in use."""
+
+    rows: Rows  # [R]
+    columns: npt.NDArray[np.int64]  # [R, carriers] their first harmonics that are not zero
+
+    @property
+    def carriers(self) -> int:
+        return int(self.columns.shape[1])
+
+    def read(self, model: Gaussians) -> Bytes:
+        """[R, bytes] what the carriers say."""
+        carriers = (self._words(model) >> SHIFT & np.uint32(255)).astype(np.uint8)
+        folded = np.where(carriers < 128, carriers, 255 - carriers)
+        bits = np.unpackbits(folded[:, :, None], axis=2)[:, :, 1:]
+        return np.packbits(bits.reshape(len(bits), -1), axis=1)
+
+    def write(self, model: Gaussians, data: Bytes, noise: npt.NDArray[np.float64]) -> Gaussians:
+        """The same with other carriers; `noise` [R, carriers] in [0, 1) decides between two for each."""
+        bits = np.unpackbits(data, axis=1)[:, : self.carriers * BITS]
+        bits = bits.reshape(len(bits), -1, BITS)
+        folded = np.packbits(np.pad(bits, ((0, 0), (0, 0), (1, 0))), axis=2)[:, :, 0]
+        middle = (folded + 0.5) / 128 - 1
+        upper = noise < (1 - _tilts(model, self) * middle) / 2
+        carriers = np.where(upper, 255 - folded, folded).astype(np.uint32)
+        words = words_of(model)
+        own = self._words(model) & ~np.uint32(255 << 13) | carriers << SHIFT
+        words[self.rows[:, None], self.columns] = own
+        harmonics = torch.from_numpy(words.view(np.float32)).view(len(model), -1, 3)
+        return replace(model, sh=torch.cat([model.sh[:, :1], harmonics], dim=1))
+
+    def _words(self, model: Gaussians) -> Words:
+        return words_of(model)[self.rows[:, None], self.columns]
+
+
+def row_kinds(model: Gaussians) -> list[RowKind]:
+    """The rows of each kind, in order."""
+    exponents = words_of(model) >> np.uint32(23) & np.uint32(255)
+    unusable = (exponents == 0) | (exponents == 255)
+    order, usable = unusable.argsort(axis=1, kind="stable"), (~unusable).sum(axis=1)
+    found, most = [], usable.max(initial=0) + 1
+    for carriers in _carriers(model.sh_degree):
+        rows = np.flatnonzero((usable >= carriers) & (usable < most))
+        found.append(RowKind(rows, order[rows, :carriers]))
+        most = carriers
+    return found
+
+
+def carrying(cover: Gaussians) -> list[RowKind]:
+    """The rows of each kind that can be written without equal values being missed.
+
+    Clones keep harmonics in common, to the last bit, where a colour was saturated ever since.
+    """
+    first, second = words_of(cover)[:, 0:3].astype(np.uint64), words_of(cover)[:, 3:6].astype(np.uint64)
+    pairs = first << np.uint64(32) | second  # of each colour, from the first two harmonics
+    values, counts = np.unique(pairs, return_counts=True)
+    apart = ((counts[np.searchsorted(values, pairs)] == 1) | (pairs == 0)).all(axis=1)
+    return [RowKind(kind.rows[apart[kind.rows]], kind.columns[apart[kind.rows]]) for kind in row_kinds(cover)]
+
+
+def _carriers(sh_degree: int) -> list[int]:
+    return [each for each in KINDS if each <= 3 * ((sh_degree + 1) ** 2 - 1)]
+
+
+def _tilts(model: Gaussians, kind: RowKind) -> npt.NDArray[np.float64]:
+    """[R, carriers] slopes of the density of carriers, from -1 to 1, as they are in `model`.
+
+    Harmonics are classed by how many quarters of an octave they are above the median of their row.
+    """
+    words = words_of(model)[kind.rows]
+    quarters = (words >> np.uint32(21) & np.uint32(1023)).astype(np.int64)
+    above = quarters - np.median(quarters, axis=1, keepdims=True).astype(np.int64)
+    classes = np.take_along_axis(above, kind.columns, 1).clip(-20, 20) + 20
+    carriers = np.take_along_axis(words >> SHIFT & np.uint32(255), kind.columns, 1)
+    counts = np.bincount(classes.ravel(), minlength=41)
+    sums = np.bincount(classes.ravel(), ((carriers + 0.5) / 256 - 0.5).ravel(), minlength=41)
+    slopes = np.where(counts >= _FEWEST, 6 * sums / np.maximum(counts, 1), 0.0).clip(-1, 1)
+    own: npt.NDArray[np.float64] = slopes[classes]
+    return own
+
+
+def encrypt_rows(
+    cover: Gaussians, secrets: Sequence[RowSecret], models: Sequence[Gaussians], entropy: bytes
+) -> Gaussians:
+    """`cover` with the Gaussians of each model in its rows, one in each: first those of the first kind.
+
+    Carriers that no Gaussian needs are random.
+    """
+    first, every = 0, names(cover)
+    for index, kind in enumerate(carrying(cover)):
+        count, size = len(kind.rows), kind.carriers * BITS // 8
+        random = stream(entropy, f"carriers/{index}", count * (size + 4 * kind.carriers))
+        data = np.frombuffer(random[: count * size], np.uint8).reshape(count, -1).copy()
+        coins = np.frombuffer(random[count * size :], "<u4").reshape(count, -1) / 2**32
+        for secret, model in zip(secrets, models, strict=True):
+            if index < len(secret.codecs):
+                codec, start = secret.codecs[index], secret.secret * share(kind.carriers, secret.secrets)
+                own, cell = model[first : first + count], _cipher(secret.embedding, codec)
+                records = codec.encode(own.with_sh_degree(codec.table.sh_degree))
+                cells = cell.encrypt(every[kind.rows[: len(own)]], records, secret.secret)
+                data[: len(own), start : start + cell.cell_bytes] = cells
+        cover = kind.write(cover, data, coins)
+        first += count
+    return cover
+
+
+def names(gaussians: Gaussians) -> Bytes:
+    """[N, 16] the identity of each row, which neither its harmonics nor new low bits change."""
+    return identities(gaussians.with_sh_degree(0))
+
+
+def visibility(gaussians: Gaussians) -> float:
+    """The sum of all opacities."""
+    return float(gaussians.opacities.double().sum())
+
+
+def words_of(gaussians: Gaussians) -> Words:
+    """[N, K] bit patterns of the harmonics above the constant one; a copy."""
+    harmonics = gaussians.sh[:, 1:].detach().cpu().reshape(len(gaussians), -1)
+    return harmonics.contiguous().numpy().copy().view(np.uint32)
+
+
+def _cipher(embedding: Tensor, codec: Codec) -> CellCipher:
+    """Encrypts rows; its key follows from the embedding [64] and from nothing else."""
+    secret = hashlib.sha256(embedding.detach().cpu().numpy().astype("<f4").tobytes()).digest()
+    return CellCipher(expand(secret, "carriers", 32), "carriers", codec.table.record_bytes)

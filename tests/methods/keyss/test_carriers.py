@@ -1,0 +1,207 @@
+"""The design `carriers`: rows that are a Gaussian of each scene, told apart by the key alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from channels.low_bits.trained_like import trained_like
+from fitting.test_plain import InterruptAt
+from keyss import Gaussians, KeyssOptions, WrongKeyError
+from keyss.channels import LOW_BITS, Payload
+from keyss.core import InputError, Interrupted, UsageError
+from keyss.core.similarity import Similarity
+from keyss.keys import random_embeddings
+from keyss.measure import search_embeddings
+from keyss.methods import RowSecret, registry
+from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, encrypt_rows, row_kinds, secret_tables
+from keyss.methods.records.quantise import Codec
+from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
+from methods.keyss.hiding import FIT, KEYS
+from tiny_scenes import random_gaussians
+
+OPTIONS = KeyssOptions(design="carriers", fit=replace(FIT, iterations=200))
+EMBEDDINGS = random_embeddings(3, torch.Generator().manual_seed(1234))
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    scenes, models = three_scenes()
+    return hide_scenes(scenes, KEYS, OPTIONS, plains=models)
+
+
+def _cover() -> Gaussians:
+    """A tenth of the rows without blue harmonics, and a tenth without any."""
+    cover = trained_like(1000)
+    sh = cover.sh.clone()
+    sh[::10, 1:, 2] = 0
+    sh[5::10, 1:] = 0
+    return replace(cover, sh=sh)
+
+
+def _written(secrets: int = 1, count: int = 850) -> tuple[Gaussians, list[RowSecret], list[Gaussians]]:
+    """Models in the rows of a larger one."""
+    cover = _cover()
+    tables = secret_tables(3, secrets)
+    models = [trained_like(count, seed=1 + i).with_sh_degree(tables[0].sh_degree) for i in range(secrets)]
+    made = [
+        RowSecret(
+            EMBEDDINGS[i],
+            tuple(Codec.fit(model.with_sh_degree(table.sh_degree), table) for table in tables),
+            Similarity.identity(),
+            i,
+            secrets,
+            count,
+            1.0,
+        )
+        for i, model in enumerate(models)
+    ]
+    return encrypt_rows(cover, made, models, bytes(32)), made, models
+
+
+def test_each_key_opens_its_secret_and_another_key_nothing(hidden: Hidden) -> None:
+    scenes, _ = three_scenes()
+    for index, key in enumerate(KEYS):
+        revealed = registry.open_model(hidden.stego, key).reveal(hidden.stego)
+        assert psnr_in(revealed, scenes[index + 1]) > psnr_in(hidden.stego, scenes[index + 1]) + 4
+    with pytest.raises(WrongKeyError):
+        registry.open_model(hidden.stego, "another key")
+
+
+def test_an_embedding_of_no_key_shows_the_very_cover(hidden: Hidden) -> None:
+    for embedding in random_embeddings(8, torch.Generator().manual_seed(5)):
+        assert hidden.opened[0].decode(hidden.stego, embedding) is hidden.stego
+
+
+def test_rows_open_in_any_order_and_after_pruning_and_low_bits() -> None:
+    stego, (secret,), _ = _written()
+    whole = secret.decode(stego, secret.embedding)
+    assert len(whole) == secret.count
+    embedded = LOW_BITS.prepare(stego).embed([("key", Payload("keyss", b"else"))], entropy=bytes(32))
+    assert same(secret.decode(embedded, secret.embedding), whole)
+    chosen = torch.randperm(len(stego), generator=torch.Generator().manual_seed(0))[:500]
+    some = secret.decode(stego[chosen], secret.embedding)
+    rows = {row.numpy().tobytes() for row in whole.means}
+    assert 100 < len(some) < len(whole)
+    assert all(row.numpy().tobytes() in rows for row in some.means)
+
+
+@pytest.mark.parametrize(("secrets", "count"), [(1, 850), (2, 750)])
+def test_every_secret_comes_back_as_coded(secrets: int, count: int) -> None:
+    stego, made, models = _written(secrets, count)
+    first = len(carrying(_cover())[0].rows)
+    for index, secret in enumerate(made):
+        parts = models[index][:first], models[index][first:]
+        coded = [
+            codec.decode(codec.encode(part.with_sh_degree(codec.table.sh_degree)))
+            for codec, part in zip(secret.codecs, parts, strict=False)
+        ]
+        degree = coded[0].sh_degree
+        expected = Gaussians.cat([part.with_sh_degree(degree) for part in coded if len(part)])
+        assert same(secret.decode(stego, secret.embedding), expected)
+        other = made[1 - index].embedding if secrets == 2 else EMBEDDINGS[2]
+        assert secret.decode(stego, other) is stego
+
+
+def test_the_cover_keeps_signs_exponents_leading_bits_and_zeros() -> None:
+    cover, (stego, *_) = _cover(), _written()
+    before, after = (model.sh[:, 1:].numpy().view(np.uint32) >> 21 for model in (cover, stego))
+    assert np.array_equal(before, after)
+    assert torch.equal(cover.sh == 0, stego.sh == 0)
+    assert same(replace(stego, sh=cover.sh), cover)
+
+
+def test_what_rows_say_is_uniform() -> None:
+    stego, *_ = _written()
+    said = row_kinds(stego)[0].read(stego)
+    counts = np.bincount(said.ravel(), minlength=256)
+    expected = counts.sum() / 256
+    assert ((counts - expected) ** 2 / expected).sum() / 255 == pytest.approx(1, abs=0.4)
+
+
+def test_carriers_are_as_uneven_as_those_of_the_cover() -> None:
+    """Harmonics of `trained_like` are normal: larger ones are rarer, also within a quarter of an octave."""
+
+    def unevenness(model: Gaussians) -> float:
+        words = model.sh[:, 1:].contiguous().numpy().view(np.uint32)
+        return float((words >> 20 & 1)[np.abs(model.sh[:, 1:].numpy()) > 0].mean() - 0.5)
+
+    cover, (stego, *_) = _cover(), _written()
+    assert unevenness(cover) < -0.01
+    assert unevenness(stego) == pytest.approx(unevenness(cover), abs=0.01)
+
+
+def test_the_decoder_without_the_key_shows_nothing_to_a_search() -> None:
+    """The white-box attack has the payload but for the embedding, and no gradient."""
+    stego, (secret,), _ = _written()
+    for found in search_embeddings(secret.decode, stego, restarts=2, steps=20):
+        assert secret.decode(stego, found) is stego
+
+
+def test_nearly_the_key_is_as_wrong_as_any() -> None:
+    stego, (secret,), _ = _written()
+    near = secret.embedding.clone()
+    near[0] = torch.nextafter(near[0], torch.tensor(2.0))
+    assert secret.decode(stego, near) is stego
+
+
+def test_the_same_secret_gives_the_same_bytes_which_are_few() -> None:
+    _, (secret,), _ = _written()
+    packed = secret.payload()
+    assert len(packed.data) <= PAYLOAD_BYTES
+    opened = registry._unpacked(packed)
+    assert isinstance(opened, RowSecret)
+    assert opened.payload() == packed
+    assert opened.fingerprint() == secret.fingerprint()
+
+
+@pytest.mark.parametrize(
+    "change", [{"secret": 1}, {"count": 0}, {"visibility": 0.0}, {"embedding": EMBEDDINGS}]
+)
+def test_damaged_payloads_are_input_errors(change: dict[str, object]) -> None:
+    _, (secret,), _ = _written()
+    with pytest.raises(InputError):
+        RowSecret.of(replace(secret, **change).payload())  # type: ignore[arg-type]
+
+
+def test_a_model_that_was_moved_is_refused() -> None:
+    stego, (secret,), _ = _written()
+    for other in (
+        replace(stego, means=stego.means + 1e-3),
+        random_gaussians(seed=9),
+        stego.with_sh_degree(0),
+    ):
+        with pytest.raises(InputError, match="none of its Gaussians opens"):
+            secret.reveal(other)
+
+
+def test_a_row_has_room_for_two_secrets_and_no_more() -> None:
+    assert [table.sh_degree for table in secret_tables(3, 1)] == [3, 0]
+    assert [table.sh_degree for table in secret_tables(2, 1)] == [0]
+    assert [table.sh_degree for table in secret_tables(3, 2)] == [0]
+    for degree, secrets in ((3, 3), (1, 1)):
+        with pytest.raises(UsageError, match="no room for a Gaussian of each"):
+            secret_tables(degree, secrets)
+
+
+def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path) -> None:
+    scenes, models = three_scenes()
+    options = replace(OPTIONS, fit=replace(FIT, iterations=40, grow_every=5))
+    whole = hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2])
+    for resume in (False, True):
+        with pytest.raises(Interrupted):
+            hide_scenes(
+                scenes[:2],
+                KEYS[:1],
+                options,
+                plains=models[:2],
+                checkpoints=tmp_path,
+                resume=resume,
+                reporter=InterruptAt(13 + 20 * resume, "hide"),
+            )
+    resumed = hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2], checkpoints=tmp_path, resume=True)
+    assert same(resumed.stego, whole.stego)
