@@ -59,32 +59,35 @@ def steps_done(path: Path | None) -> int:
         return 0
 
 
-def pack_optimizers(parameters: Parameters, optimizers: Optimizers) -> State:
-    """Parameters and their Adam moments as flat names: `means`, `means.exp_avg`, ..."""
+def pack_model(parameters: Parameters, optimizers: Optimizers, density: Mapping[str, Any]) -> State:
+    """Parameters, their Adam moments and the statistics of a strategy: `means`, `means.exp_avg`, ..."""
     state: State = {}
     for name, parameter in parameters.items():
         state[name] = parameter.detach()
         for key, value in optimizers[name].state[parameter].items():
             state[f"{name}.{key}"] = torch.as_tensor(value)
-    return state
+    return state | {f"density.{key}": value for key, value in density.items() if isinstance(value, Tensor)}
 
 
-def unpack_optimizers(state: State, parameters: Parameters, optimizers: Optimizers) -> None:
-    """Restore the result of `pack_optimizers`, whatever the present number of Gaussians is."""
+def unpack_model(
+    state: State, parameters: Parameters, optimizers: Optimizers, density: dict[str, Any]
+) -> None:
+    """Restore the result of `pack_model`, whatever the present number of Gaussians is."""
+    device = parameters["means"].device
     for name, old in list(parameters.items()):
-        parameter = torch.nn.Parameter(state[name].to(old.device))
+        parameter = torch.nn.Parameter(state[name].to(device))
         optimizer = optimizers[name]
         optimizer.state.pop(old, None)
         optimizer.param_groups[0]["params"] = [parameter]
-        prefix = f"{name}."
-        moments = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        moments = _with_prefix(state, f"{name}.")
         if moments:
             counts_on_cpu = not optimizer.param_groups[0]["fused"]
             optimizer.state[parameter] = {
-                key: value if key == "step" and counts_on_cpu else value.to(old.device)
+                key: value if key == "step" and counts_on_cpu else value.to(device)
                 for key, value in moments.items()
             }
         parameters[name] = parameter
+    density |= {key: value.to(device) for key, value in _with_prefix(state, "density.").items()}
 
 
 def pack_network(prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> State:
@@ -99,25 +102,13 @@ def unpack_network(
     state: State, prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
     """Restore the result of `pack_network`."""
-    start = f"{prefix}."
-    network.load_state_dict(
-        {name.removeprefix(start): value for name, value in state.items() if name.startswith(start)}
-    )
+    network.load_state_dict(_with_prefix(state, f"{prefix}."))
     adam = optimizer.state_dict()
-    for name, value in state.items():
-        if name.startswith(f"{prefix}_adam."):
-            index, key = name.removeprefix(f"{prefix}_adam.").split(".")
-            adam["state"].setdefault(int(index), {})[key] = value
+    for name, value in _with_prefix(state, f"{prefix}_adam.").items():
+        index, key = name.split(".")
+        adam["state"].setdefault(int(index), {})[key] = value
     optimizer.load_state_dict(adam)
 
 
-def pack_density(state: Mapping[str, Any]) -> State:
-    """Statistics of a strategy."""
-    return {f"density.{key}": value for key, value in state.items() if isinstance(value, Tensor)}
-
-
-def unpack_density(state: State, density: dict[str, Any], device: torch.device) -> None:
-    """Restore the result of `pack_density`."""
-    for key in density:
-        if f"density.{key}" in state:
-            density[key] = state[f"density.{key}"].to(device)
+def _with_prefix(state: State, prefix: str) -> State:
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}

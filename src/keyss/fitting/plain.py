@@ -11,7 +11,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.fitting.checkpoint import State, pack_density, pack_optimizers, unpack_density, unpack_optimizers
+from keyss.fitting.checkpoint import State, pack_model, unpack_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
@@ -102,13 +102,12 @@ class PlainRun:
         return {"PSNR": mean_psnr(self.gaussians(), self.watched, self.background)}
 
     def state(self) -> tuple[State, dict[str, Any]]:
-        tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
+        tensors = pack_model(self.parameters, self.optimizers, self.density)
         tensors |= {"order": self.shuffle.state(), "generator": self.generator.get_state()}
         return tensors, {"iteration": self.iteration}
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None:
-        unpack_optimizers(tensors, self.parameters, self.optimizers)
-        unpack_density(tensors, self.density, self.device)
+        unpack_model(tensors, self.parameters, self.optimizers, self.density)
         self.shuffle.load(tensors["order"])
         self.generator.set_state(tensors["generator"])
         self.iteration = int(meta["iteration"])

@@ -20,15 +20,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
-from keyss.fitting.checkpoint import (
-    State,
-    pack_density,
-    pack_network,
-    pack_optimizers,
-    unpack_density,
-    unpack_network,
-    unpack_optimizers,
-)
+from keyss.fitting.checkpoint import State, pack_model, pack_network, unpack_model, unpack_network
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.loop import train
@@ -211,7 +203,7 @@ class JointTraining(ABC):
         return found
 
     def state(self) -> tuple[State, dict[str, Any]]:
-        tensors = pack_optimizers(self.parameters, self.optimizers) | pack_density(self.density)
+        tensors = pack_model(self.parameters, self.optimizers, self.density)
         tensors |= pack_network("networks", self.networks, self.network_optimizer)
         tensors |= {"owners": self.owner_order.state(), "generator": self.generator.get_state()}
         tensors |= {f"order.{i}": shuffle.state() for i, shuffle in enumerate(self.shuffles)}
@@ -219,8 +211,7 @@ class JointTraining(ABC):
         return tensors, {"iteration": self.iteration}
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None:
-        unpack_optimizers(tensors, self.parameters, self.optimizers)
-        unpack_density(tensors, self.density, self.device)
+        unpack_model(tensors, self.parameters, self.optimizers, self.density)
         unpack_network(tensors, "networks", self.networks, self.network_optimizer)
         self.owner_order.load(tensors["owners"])
         for i, shuffle in enumerate(self.shuffles):
