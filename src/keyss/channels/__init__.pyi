@@ -30,11 +30,7 @@ from .low_bits.layout import (
 )
 from .low_bits.reading import LowBitsReader as LowBitsReader
 from .low_bits.salts import salt_rows as salt_rows
-from .low_bits.usable import (
-    chance_of_bits as chance_of_bits,
-    is_uniform as is_uniform,
-    usable_carriers as usable_carriers,
-)
+from .low_bits.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
 from .opening import open_content as open_content, quick_attempt as quick_attempt
 from .payloads import pack_payload as pack_payload, unpack_payload as unpack_payload
 from .publishing import (

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels import chance_of_bits, is_uniform
+from keyss.channels import chance_of_bits
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 
@@ -72,7 +72,7 @@ def _is_natural(values: Floats) -> bool:
     measured = values[values != 0]
     if len(measured) > _FEW * len(values):
         values = measured
-    if len(np.unique(values)) <= _FEW * len(values) or not is_uniform(values):
+    if len(np.unique(values)) <= _FEW * len(values):
         return False
     words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
     return chance_of_bits(words, _BITS) > _CHANCE

@@ -1,27 +1,25 @@
 """Which Gaussians of a model can get new low bits without anybody noticing.
 
-In a trained model most low bits are uniformly random to anybody who does not know how it was trained, but
-not all of them. A Gaussian is left alone, as a whole, so that none contradicts itself, for one of these:
+In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
+A Gaussian is left alone as a whole, so that its numbers do not contradict each other, because of:
 
 - *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
   occur too often (after a few steps of training many are the same small multiple of the learning rate).
-- *Coincidences*: numbers that agree in all bits above the written ones would agree in nothing else
-  afterwards. These are near-equal components (grey colours, round Gaussians), harmonics of one colour that
-  are equal several times (a Gaussian that few views show gets equal steps), Gaussians that share whole
-  triples of numbers (clones that training hardly moved apart), unit quaternions, and Gaussians that occur
-  twice.
+- *Coincidences*: numbers that agree in all bits above the written ones would differ in these afterwards. They
+  are near-equal components (grey colours, round Gaussians), harmonics of one colour that are equal several
+  times (a Gaussian that few views show gets equal steps), Gaussians that share whole triples of numbers
+  (clones that training hardly moved apart), unit quaternions, and Gaussians that occur twice.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
 
-Coincidences are found in what embedding leaves as it is. A Gaussian whose bits are random must hardly ever be
-left alone for any other reason: what is left stays, embedding makes more of the same kind by chance, and
-twice as many as expected would be seen.
+Coincidences are found in bits that embedding never changes. A Gaussian whose bits are random must hardly ever
+be left alone for another reason: embedding makes more such Gaussians by chance, and twice as many as expected
+would be noticed.
 """
 
 from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +27,6 @@ import torch
 
 from keyss.channels.low_bits.bits import (
     BLOCK,
-    FIELDS,
     GEOMETRY,
     QUATS,
     UNIT_TOLERANCE,
@@ -49,27 +46,29 @@ from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
 
 MIN_USABLE = 0.5  # share of the Gaussians of a cover
-# What small numbers may give away: squared separation (d') of a plain file and one with new bits, to somebody
-# who knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
+# Bound of what small numbers give away: squared separation (d') of a plain file and one with new bits, to
+# somebody who knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
 GIVEN_AWAY = 0.03
 
-_GROUPS = (slice(0, 3), QUATS, slice(7, 8), slice(8, None))  # scales, quaternions, opacity, harmonics
-_GROUP_NAMES = ("log scales", "quaternions", "opacity logits", "harmonics")
+_GROUPS = {
+    "log scales": slice(0, 3),
+    "quaternions": QUATS,
+    "opacity logits": slice(7, 8),
+    "harmonics": slice(GEOMETRY, None),
+}
 
-# A value is not random, but a short number, when at least this many low bits of its mantissa are zero. By
-# chance that happens to one value in a million; where there are no more of them than that, it is chance.
+# A value is a short number when at least so many low bits of its mantissa are zero. By chance one value in a
+# million is: only where there are more, these are left alone.
 _SHORT_BITS = 20
 _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
-# Nor is a Gaussian, when so many of its values have 12 zeros; by chance one in three million is that.
+# A Gaussian is no measurement when so many of its values have 12 zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 _EQUAL_HARMONICS = 2
 
 _EXACT = 1e-6  # of the length of a unit quaternion in single precision
-# Sets of equal values that there may be by chance: those are left alone, and embedding makes as many again.
+# Sets of equal values that there may be by chance: they are left alone, and embedding makes as many again.
 _SETS_BY_CHANCE = 0.1
-_SAMPLE = 20_000
-_SHIFTS = (UNUSED_BITS, UNUSED_BITS + 4)  # two overlapping bytes
-_LARGEST_RATIO = 2.0  # chi-square over degrees of freedom; 0.7 to 1.3 in trained models, above 50 in others
+_SAMPLE = 20_000  # Gaussians whose bits are tested
 _CHANCE = 1e-6  # that a model with uniform bits is refused
 
 
@@ -78,81 +77,60 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
 
     `names` [N, 16]: their identities, where they are known.
     """
-    layout, count = layout or Layout.of(gaussians), len(gaussians)
+    layout = layout or Layout.of(gaussians)
     usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
     frequent = _frequent_values(gaussians)
-    used_groups = [each for each in range(len(_GROUPS)) if layout.quats or _GROUPS[each] != QUATS]
 
     def judge(start: int, stop: int) -> Counts:
         used, own = used_words(gaussians[start:stop]), usable[start:stop]
         own &= _are_measured(used, layout, frequent, short) & ~near_equal(used, layout)
         if layout.quats:
             own &= ~_have_unit_length(used)
-        return np.stack([count_trailing_zeros(used[own][:, group]) for group in _GROUPS])
+        return np.stack([count_trailing_zeros(used[own][:, group]) for group in _GROUPS.values()])
 
-    parts = in_blocks(judge, count, BLOCK)
+    parts = in_blocks(judge, len(gaussians), BLOCK)
     if not parts:
         return usable
-    counts = np.sum(parts, axis=0)
-    least = [least_exponent(each, GIVEN_AWAY / len(_GROUPS)) for each in counts]
+    least = [least_exponent(counts, GIVEN_AWAY / len(_GROUPS)) for counts in np.sum(parts, axis=0)]
 
     def leave_small(start: int, stop: int) -> None:
         used = used_words(gaussians[start:stop])
-        for index in used_groups:
-            values = used[:, _GROUPS[index]]
-            small = (exponents(values) < least[index]) & (values & 1 == 0)
-            usable[start:stop] &= ~small.any(axis=1)
+        for group, bound in zip(_GROUPS.values(), least, strict=True):
+            if layout.quats or group != QUATS:
+                values = used[:, group]
+                usable[start:stop] &= ~((exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
 
-    in_blocks(leave_small, count, BLOCK)
+    in_blocks(leave_small, len(gaussians), BLOCK)
     return usable
 
 
 def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
-    """Raise InputError unless half of the Gaussians are `usable` [N], with uniform low bits in every field.
+    """Raise InputError unless half of the Gaussians are `usable` [N], and their low bits uniform.
 
-    Uniform: chi-square of the frequencies of two overlapping bytes, and every bit given the field's exponent,
-    the last bit and the bit below; over at most 20,000 Gaussians.
+    Tested on at most 20,000 Gaussians: see `chance_of_bits`.
     """
-    if not len(usable) or usable.mean() < MIN_USABLE:
-        share = usable.mean() if len(usable) else 0.0
+    share = float(usable.mean()) if len(usable) else 0.0
+    if share < MIN_USABLE:
         raise InputError(
             f"only {share:.0%} of the Gaussians have random low bits; the others hold short, repeated or "
-            "predictable values: the model was quantised or hardly trained, and what is put there could be "
-            "seen"
+            "predictable values: the model was quantised or hardly trained, and new bits could be noticed"
         )
     layout, rows = layout or Layout.of(gaussians), np.flatnonzero(usable)
-    rows = rows[:: max(1, len(rows) // _SAMPLE)]
-    used = used_words(gaussians[torch.from_numpy(rows)])
-    for column in layout.columns:
-        ratio = max(_chi_square(used[:, column] >> shift & 255) for shift in _SHIFTS)
-        if ratio > _LARGEST_RATIO:
-            name = FIELDS[column] if column < GEOMETRY else "f_rest"
+    used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
+    for name, group in _GROUPS.items():
+        bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
+        if bits and used[:, group].size and (chance := chance_of_bits(used[:, group], bits)) < _CHANCE:
             raise InputError(
-                f"the low bits of {name} are not random in this model (chi-square "
-                f"{ratio:.1f} per degree of freedom, 1 expected), and nothing can be hidden in them: "
-                "it was quantised, scaled or moved after its training"
+                f"the low bits of {name} are not random in this model (by chance that happens with p = "
+                f"{chance:.0e}), and nothing can be hidden in them: it was quantised, scaled or moved after "
+                "its training"
             )
-    for name, group in zip(_GROUP_NAMES, _GROUPS, strict=True):
-        if layout.quats or group != QUATS:
-            bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
-            if used[:, group].size and (chance := chance_of_bits(used[:, group], bits)) < _CHANCE:
-                raise InputError(
-                    f"the low bits of {name} are not random in this model: they depend on the size of the "
-                    f"numbers or on each other (by chance that happens with p = {chance:.0e}), and "
-                    "nothing can be hidden in them"
-                )
-
-
-def is_uniform(values: npt.NDArray[np.float32]) -> bool:
-    """Whether one property [N] has low bits whose bytes are uniform."""
-    words = np.ascontiguousarray(values[:: max(1, len(values) // _SAMPLE)]).view(np.uint32)
-    return all(_chi_square(words >> shift & 255) <= _LARGEST_RATIO for shift in _SHIFTS)
 
 
 def chance_of_bits(words: Words, bits: int) -> float:
-    """How likely bits 1 to `bits` - 1 of words [...] are what they are, if all of them are uniform.
+    """The probability of bits 1 to `bits` - 1 of words [...] if all of them are uniform.
 
-    Exactly, of the most unlikely one given exponent, last bit and the bit below it; times how many there are.
+    Exactly, of the most unlikely one given exponent, last bit and the bit below it; times their number.
     """
     from scipy.special import bdtr  # takes long to load
 
@@ -178,18 +156,25 @@ def exponents(words: Words) -> npt.NDArray[np.uint8]:
 def near_equal(used: Words, layout: Layout) -> Flags:
     """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
 
-    Or two pairs of one colour's harmonics, next to each other by size, equal. Decided by the bits that
-    embedding leaves, which by chance are so in some 4 % of all Gaussians. `used` [N, F]: of `used_words`.
+    Or two pairs of one colour's harmonics, next to each other by size, equal. By chance some 4 % of all
+    Gaussians are. `used` [N, F]: of `used_words`.
     """
     high = ((used & np.uint32(0x7FFFFFFF)) >> layout.shifts).astype(np.int32)
     harmonics = high[:, GEOMETRY:].reshape(len(used), -1, 3)
-    found = np.zeros(len(used), bool)
+    near = np.zeros(len(used), bool)
     for values in (high[:, None, 0:3], harmonics, *([high[:, None, QUATS]] if layout.quats else [])):
         for a, b in combinations(range(values.shape[2]), 2):
-            found |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
+            near |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
     ordered = np.sort(harmonics.transpose(0, 2, 1), axis=2)
-    found |= (ordered[:, :, 1:] == ordered[:, :, :-1]).sum(axis=(1, 2)) >= _EQUAL_HARMONICS
-    return found
+    near |= (ordered[:, :, 1:] == ordered[:, :, :-1]).sum(axis=(1, 2)) >= _EQUAL_HARMONICS
+    return near
+
+
+def repeated(values: npt.NDArray[np.uint64]) -> Flags:
+    """[N] which of the values [N] occur at least twice."""
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    result: Flags = (counts > 1)[inverse]
+    return result
 
 
 def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: bool) -> Flags:
@@ -198,7 +183,7 @@ def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: boo
     fine = (large > 0) & (large < 254)
     if short:
         fine &= (used & _SHORT) != 0
-    for group, values in zip(_GROUPS, frequent, strict=True):
+    for group, values in zip(_GROUPS.values(), frequent, strict=True):
         if len(values):
             fine[:, group] &= ~np.isin(used[:, group], values)
     zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
@@ -207,7 +192,7 @@ def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: boo
 
 
 def _have_unit_length(used: Words) -> Flags:
-    """[N] whether a quaternion has it, and whatever its low bits are could have it."""
+    """[N] which quaternions have unit length, and could have it with any low bits."""
     words = np.ascontiguousarray(used[:, QUATS])
     near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
     lengths = np.linalg.norm(np.where(near[:, None], words.view(np.float32).astype(np.float64), 0), axis=1)
@@ -218,8 +203,8 @@ def _have_unit_length(used: Words) -> Flags:
 def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, bool]:
     """[N] whether neither the Gaussian, its scales, its quaternion nor two harmonics in a row occur twice.
 
-    Of harmonics, those with numbers 1 and 2, 3 and 4 and so on, of all colours. Decided by the bits that
-    embedding leaves. Then whether there are more short values than by chance.
+    Harmonics: numbers 1 and 2, 3 and 4 and so on, of all colours. Then whether there are more short values
+    than by chance.
     """
     together = [slice(0, 3), *([QUATS] if layout.quats else [])]
     together += [slice(first, first + 6) for first in range(GEOMETRY, len(layout.mask) - 5, 6)]
@@ -239,27 +224,14 @@ def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, b
     return apart, short > expected + 5 * (expected + 1) ** 0.5
 
 
-def repeated(values: npt.NDArray[np.uint64]) -> Flags:
-    """[N] which of the values [N] occur at least twice."""
-    equal = _frequent(values, 2)
-    found = np.zeros(len(values), bool)
-    if len(equal):
-        found = equal[np.searchsorted(equal, values).clip(max=len(equal) - 1)] == values
-    return found
-
-
 def _frequent_values(gaussians: Gaussians) -> list[Words]:
     """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
-    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
-    words = [each.detach().to("cpu", torch.float32).numpy().view(np.uint32) for each in fields]
-    return [_frequent(each.ravel(), _unlikely_copies(each.size)) for each in words]
-
-
-def _frequent(values: npt.NDArray[Any], copies: int) -> npt.NDArray[Any]:
-    """[V] those of the values [N] that occur so often or more, in ascending order."""
-    ordered = np.sort(values)
-    more = copies - 1
-    return np.unique(ordered[more:][ordered[more:] == ordered[: max(0, len(ordered) - more)]])
+    frequent = []
+    for field in (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]):
+        words = field.detach().to("cpu", torch.float32).numpy().view(np.uint32)
+        values, counts = np.unique(words, return_counts=True)
+        frequent.append(values[counts >= _unlikely_copies(words.size)])
+    return frequent
 
 
 def _unlikely_copies(count: int) -> int:
@@ -271,10 +243,3 @@ def _unlikely_copies(count: int) -> int:
     while count**copies / math.factorial(copies) > _SETS_BY_CHANCE * 2 ** (26 * (copies - 1)):
         copies += 1
     return copies
-
-
-def _chi_square(bytes_: npt.NDArray[np.integer[Any]]) -> float:
-    """Per degree of freedom, of the frequencies of numbers below 256."""
-    counts = np.bincount(bytes_, minlength=256)
-    expected = len(bytes_) / 256
-    return float(((counts - expected) ** 2).sum() / expected / 255)
