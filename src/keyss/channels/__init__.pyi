@@ -19,18 +19,33 @@ from .codes.channel import (
     CodesReader as CodesReader,
     last_bits as last_bits,
 )
+from .codes.fields import Field as Field
 from .codes.order import in_counted_order as in_counted_order
 from .colours.channel import COLOURS as COLOURS, ColoursCover as ColoursCover
-from .low_bits.bits import identities as identities, read_low_bits as read_low_bits
+from .colours.fountain import Fountain as Fountain
+from .colours.reading import ColoursReader as ColoursReader
+from .low_bits.bits import (
+    Layout as Layout,
+    identities as identities,
+    read_low_bits as read_low_bits,
+    used_words as used_words,
+    write_low_bits as write_low_bits,
+)
+from .low_bits.cells import CellCipher as CellCipher
 from .low_bits.channel import LOW_BITS as LOW_BITS, LowBitsCover as LowBitsCover
 from .low_bits.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsRoom as LowBitsRoom,
     check_payload_fits as check_payload_fits,
 )
+from .low_bits.parameters import key_cipher as key_cipher
 from .low_bits.reading import LowBitsReader as LowBitsReader
 from .low_bits.salts import salt_rows as salt_rows
-from .low_bits.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
+from .low_bits.usable import (
+    chance_of_bits as chance_of_bits,
+    check_usable as check_usable,
+    usable_carriers as usable_carriers,
+)
 from .opening import open_content as open_content, quick_attempt as quick_attempt
 from .payloads import pack_payload as pack_payload, unpack_payload as unpack_payload
 from .publishing import (
@@ -40,3 +55,4 @@ from .publishing import (
     channel_for as channel_for,
     suffix_of as suffix_of,
 )
+from .reed_solomon import Codewords as Codewords

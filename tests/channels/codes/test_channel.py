@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from channels.codes.published import FORMATS, codes_of, model_of, opened, there_and_back, written
-from keyss.channels import CodesCover, CodesReader, Payload, in_counted_order, pack_payload
-from keyss.channels.codes.fields import Field, format_of
+from keyss.channels import CodesCover, CodesReader, Field, Payload, in_counted_order, pack_payload
+from keyss.channels.codes.fields import format_of
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files.formats import sog, spz
 from keyss.files.formats.common import morton_order

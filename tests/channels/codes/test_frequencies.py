@@ -8,8 +8,7 @@ import pytest
 from scipy import stats
 
 from channels.codes.published import FORMATS, codes_of, written
-from keyss.channels import CodesCover, CodesReader, in_counted_order
-from keyss.channels.codes.fields import Field
+from keyss.channels import CodesCover, CodesReader, Field, in_counted_order
 
 COUNT = 30_000
 EVERY = pytest.mark.parametrize("suffix", FORMATS)

@@ -17,11 +17,9 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from channels.colours.made import PACKED, cover, embed, extract
-from keyss.channels import COLOURS, ColoursCover
+from keyss.channels import COLOURS, ColoursCover, ColoursReader, Fountain
 from keyss.channels.colours.carriers import CELL, Numbers
-from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, derived, read_header
-from keyss.channels.colours.reading import ColoursReader
 from keyss.channels.colours.salts import Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, Similarity, UsageError, WrongKeyError
 from keyss.measure import converters, half_floats, noise, opacity_pruning, random_pruning

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from keyss.channels.colours.fountain import Fountain, equations
+from keyss.channels import Fountain
+from keyss.channels.colours.fountain import equations
 from keyss.channels.mixing import mixed
 
 
@@ -33,7 +34,7 @@ def test_mixed_is_splitmix64() -> None:
 
 
 def test_code_bits_are_the_sums_that_the_equations_say() -> None:
-    code, data, seeds = Fountain.of(40), _random_bits(40, 0), _seeds(200)
+    code, data, seeds = Fountain(40), _random_bits(40, 0), _seeds(200)
     bits = code.encode(data, seeds)
     starts, members = equations(seeds, code.length)
     # The intermediate bits follow from code bits of one member.
@@ -58,7 +59,7 @@ def test_a_member_is_chosen_evenly_and_the_degrees_are_the_stated_ones() -> None
 @given(size=st.integers(100, 700), seed=st.integers(0, 1000))
 def test_any_data_come_back_from_twice_as_many_bits_with_errors(size: int, seed: int) -> None:
     """2 % of errors leave a capacity of 0.86; the shortest codes need most beside it."""
-    code, data, seeds = Fountain.of(size), _random_bits(size, seed), _seeds(3 * size + 200, seed)
+    code, data, seeds = Fountain(size), _random_bits(size, seed), _seeds(3 * size + 200, seed)
     found, _ = code.decode(seeds, _noisy(code.encode(data, seeds), 0.02, seed), 60)
     assert (found == data).all()
 
@@ -67,18 +68,18 @@ def test_any_data_come_back_from_twice_as_many_bits_with_errors(size: int, seed:
 def test_a_long_code_needs_a_quarter_more_than_capacity(errors: float) -> None:
     size = 8000
     capacity = 1 + errors * math.log2(errors) + (1 - errors) * math.log2(1 - errors)
-    code, data, seeds = Fountain.of(size), _random_bits(size, 1), _seeds(int(1.25 * size / capacity))
+    code, data, seeds = Fountain(size), _random_bits(size, 1), _seeds(int(1.25 * size / capacity))
     found, done = code.decode(seeds, _noisy(code.encode(data, seeds), errors, 2), 60)
     assert done
     assert (found == data).all()
 
 
 def test_too_few_bits_are_not_taken_for_enough() -> None:
-    code, data, seeds = Fountain.of(800), _random_bits(800, 1), _seeds(700)
+    code, data, seeds = Fountain(800), _random_bits(800, 1), _seeds(700)
     _, done = code.decode(seeds, _noisy(code.encode(data, seeds), 0.02, 2), 30)
     assert not done
 
 
 def test_bits_of_the_wrong_number_are_refused() -> None:
     with pytest.raises(ValueError, match="expected 40 bits"):
-        Fountain.of(40).encode(_random_bits(41, 0), _seeds(9))
+        Fountain(40).encode(_random_bits(41, 0), _seeds(9))

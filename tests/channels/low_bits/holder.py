@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from keyss.channels import LowBitsReader, Records
-from keyss.channels.low_bits.cells import CellCipher
+from keyss.channels import CellCipher, LowBitsReader, Records
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 

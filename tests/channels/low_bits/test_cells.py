@@ -8,7 +8,8 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB
 
-from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
+from keyss.channels import CellCipher
+from keyss.channels.low_bits.cells import TAG_BYTES
 from keyss.keys.derivation import expand
 
 RANDOM = np.random.default_rng(0)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LowBitsReader, Payload
+from keyss.channels import LOW_BITS, Codewords, LowBitsReader, Payload
 from keyss.channels.low_bits import spread, writing
 from keyss.channels.low_bits.parameters import PAYLOAD, RECORDS, Parameters, pack_codewords
-from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
+from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError
 from keyss.keys import encryption
 

@@ -11,10 +11,9 @@ import pytest
 from scipy.stats import ks_2samp
 
 from channels.low_bits.trained_like import keys
-from keyss.channels import Content, Payload, RecordRequest, Records
-from keyss.channels.low_bits.cells import CellCipher
-from keyss.channels.low_bits.layout import SALTS, LowBitsRoom
-from keyss.channels.low_bits.parameters import key_cipher, parameter_cipher, unpack
+from keyss.channels import CellCipher, Content, LowBitsRoom, Payload, RecordRequest, Records, key_cipher
+from keyss.channels.low_bits.layout import SALTS
+from keyss.channels.low_bits.parameters import parameter_cipher, unpack
 from keyss.channels.low_bits.writing import Writer
 from keyss.core import KeyssWarning
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from keyss.channels.low_bits.cells import CellCipher
+from keyss.channels import CellCipher
 from keyss.core import errors
 from keyss.keys import DerivedKey, KeyDerivation, encryption
 

@@ -200,7 +200,7 @@ class ColoursCover:
             if writing.payload is not None:
                 rows, key = np.flatnonzero(free & mine), data_key(writing.static, header)
                 encrypted = encrypt(key, writing.payload, ASSOCIATED, size=bucket_bytes(header.bucket))
-                code, words = Fountain.of(8 * len(encrypted)), seeds(key, "seeds", carriers.names[rows])
+                code, words = Fountain(8 * len(encrypted)), seeds(key, "seeds", carriers.names[rows])
                 bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), words)
                 values[rows], chosen[rows] = write(key, carriers[rows], bits), some
         return self._with_colours(values, chosen, random)

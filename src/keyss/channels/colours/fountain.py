@@ -41,16 +41,15 @@ Ratios = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Fountain:
-    """The code for `size` data bits; `parity` bits are added to them."""
+    """The code for `size` data bits."""
 
     size: int
-    parity: int
     degrees: tuple[tuple[int, float], ...] = _RAPTOR  # shares of code bits that are sums of so many
 
-    @staticmethod
-    def of(size: int, degrees: tuple[tuple[int, float], ...] = _RAPTOR) -> Fountain:
-        """Half as many parity bits for a few hundred data bits, 4 % and some for many."""
-        return Fountain(size, 64 + size // 25, degrees)
+    @property
+    def parity(self) -> int:
+        """Parity bits: half as many for a few hundred data bits, 4 % and some for many."""
+        return 64 + self.size // 25
 
     @property
     def length(self) -> int:

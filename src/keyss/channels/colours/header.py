@@ -255,4 +255,4 @@ def _pads(words: Words) -> Bits:
 
 @cache
 def _fountain() -> Fountain:
-    return Fountain.of(8 * _BYTES, NOISY)
+    return Fountain(8 * _BYTES, NOISY)

@@ -121,7 +121,7 @@ def _payload(
     garbage = min(0.9, header.idle * IDLE + changed)
     doubt = 1 - (1 - garbage) * (1 - own.doubt) / own.namesakes()
     ratios = read(dithers(key, own.names), own, doubt)
-    bits, _ = Fountain.of(8 * size).decode(seeds(key, "seeds", own.names), ratios, rounds)
+    bits, _ = Fountain(8 * size).decode(seeds(key, "seeds", own.names), ratios, rounds)
     try:
         return decrypt(key, np.packbits(bits).tobytes(), ASSOCIATED)
     except InputError:
