@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -92,14 +91,3 @@ def test_the_scenes_that_come_with_the_package(which: str) -> None:
     assert {tuple(view.image.shape) for view in scene.views} == {(120, 160, 3)}
     assert scene.points is not None
     assert scene.points.shape == (3000, 3)
-
-
-def test_contact_sheet() -> None:
-    red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
-    sheet = np.asarray(
-        demo.contact_sheet([("left", "", [red, red]), ("right", "1 dB", [blue, blue])], cell=80)
-    )
-    assert sheet.shape == (13 + 2 * 62 + 2, 2 + 2 * 82, 3)
-    assert (sheet[13:73, 2:82] == (255, 0, 0)).all()
-    assert (sheet[75:135, 84:164] == (0, 0, 255)).all()
-    assert (sheet[:13] != 255).any()

@@ -104,6 +104,14 @@ def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> N
 def test_no_heading_of_the_picture_is_cut() -> None:
     """However narrow the pictures are."""
     narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
-    picture = sheet._drawn([("photos", narrow)])
+    picture = sheet.contact_sheet(["cover", "secret", "error of the secret"], {"photos": narrow})
     right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
     assert (right == 255).all()
+
+
+def test_pictures_stand_in_rows_and_columns() -> None:
+    red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
+    picture = np.asarray(sheet.contact_sheet(["left", "right"], {"": [red, blue], "2": [red, blue]}, cell=60))
+    assert (picture[-61:-1, -162:-82] == (255, 0, 0)).all()
+    assert (picture[-122:-62, -81:-1] == (0, 0, 255)).all()
+    assert (picture[:-124] != 255).any()

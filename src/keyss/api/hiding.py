@@ -27,7 +27,7 @@ from keyss.fitting.reporting import Reporter
 from keyss.keys import DerivedKey, KeyDerivation
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
-from keyss.methods.base import Context, Method, MethodOptions, Stego
+from keyss.methods.base import Context, MethodOptions, Source, Stego
 from keyss.methods.handed import pack
 from keyss.methods.opened import Opened
 from keyss.methods.plain_models import Bound, fit_bounds, with_plain_models
@@ -161,7 +161,7 @@ def hide(
     sources = sources_of(cover, cover_model, secrets)
     options = chosen.prepare(sources, options)
     configs = options.fits(len(sources))
-    fitted = [
+    plain_steps = [
         config.iterations if each.given is None else _steps_of(model)
         for each, model, config in zip(sources, models, configs, strict=True)
     ]
@@ -180,7 +180,6 @@ def hide(
         )
         for source, each in zip(given, sources, strict=True)
     ]
-    scenes = [each.scene for each in sources]
     if dry_run:
         return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
     if reporter and ranks.first and trains and not resume and worth_planning(options.fit):
@@ -195,19 +194,14 @@ def hide(
         shown: list[Shown] = []
         if ranks.first:
             shown = [
-                show(model.to(target), original.to(target), scene, of_plain=not each.photos)
-                for model, original, scene, each in zip(
-                    _as_read(stego, keys, folder), plain, scenes, sources, strict=True
-                )
+                show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
+                for model, each in zip(_as_read(stego, keys, folder), sources, strict=True)
             ]
             _check_quality(shown, min_psnr)
-        photos = tuple(each.photos for each in sources)
-        bounds = list(map(Bound.of, options.training(len(scenes)), fitted))
-        longer = _longer(bounds, scenes, plain, photos, stego, options, context) if bound else {}
+        bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
+        longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
         if ranks.first:
-            metrics = _measured(
-                chosen, stego, scenes, plain, photos, options, shown, target, bounds, fitted, longer, began
-            )
+            metrics = _measured(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
         if folder:
             payloads = secret_ids(options.fit.known_seed, stego.opened)
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
@@ -215,8 +209,8 @@ def hide(
             settings = replace(settings, options=options, payloads=payloads)
             folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
     if ranks.count > 1:
-        found = json.dumps(asdict(metrics) if ranks.first else None)  # which keeps NaN
-        metrics = msgspec.convert(json.loads(ranks.from_first(found.encode())), HideMetrics)
+        text = json.dumps(asdict(metrics) if ranks.first else None)  # keeps NaN
+        metrics = msgspec.convert(json.loads(ranks.from_first(text.encode())), HideMetrics)
     return HideResult(stego.gaussians, metrics)
 
 
@@ -288,63 +282,57 @@ def _steps_of(model: PathLike | Gaussians | None) -> int | None:
     return read_record(metrics, FitMetrics).iterations if metrics.is_file() else None
 
 
-def _longer(
+def _fit_bounds(
     bounds: Sequence[Bound],
-    scenes: Sequence[Scene],
-    plain: Sequence[Gaussians],
-    photos: Sequence[bool],
+    sources: Sequence[Source],
     stego: Stego,
     options: MethodOptions,
     context: Context,
 ) -> dict[int, Gaussians]:
-    """Plain 3DGS of scenes that were trained for longer than their plain models, by index."""
+    """Plain 3DGS of scenes with more training steps than their plain models, by index."""
     sizes = [len(stego.gaussians), *(len(each.reveal(stego.gaussians)) for each in stego.opened)]
     configs = {
         # A secret that was pruned to fit is compared with a model of that size.
-        index: each.config(options.fit, size if size < len(model) else None)
-        for index, (each, model, size) in enumerate(zip(bounds, plain, sizes, strict=True))
-        if not each.equal and each.steps is not None and photos[index]
+        index: bound.config(options.fit, size if size < len(source.model) else None)
+        for index, (bound, source, size) in enumerate(zip(bounds, sources, sizes, strict=True))
+        if not bound.equal and bound.steps is not None and source.photos
     }
-    return fit_bounds(scenes, configs, context)
+    return fit_bounds([each.scene for each in sources], configs, context)
 
 
 def _measured(
-    method: Method,
     stego: Stego,
-    scenes: Sequence[Scene],
-    models: Sequence[Gaussians],  # plain models of the scenes
-    photos: tuple[bool, ...],  # whether scenes have any
+    sources: Sequence[Source],
     options: MethodOptions,
-    shown: Sequence[Shown],  # compared with the plain models
+    shown: Sequence[Shown],  # renders compared with those of the plain models
     device: torch.device,
     bounds: Sequence[Bound],
-    fitted: Sequence[int | None],  # steps of the plain models
-    longer: Mapping[int, Gaussians],  # plain models with more steps
+    plain_steps: Sequence[int | None],
+    longer: Mapping[int, Gaussians],  # plain models with as many steps as the bounds
     began: float,  # time.monotonic() at the start of the run
 ) -> HideMetrics:
     """The measurements of a hiding."""
-    baselines = [longer.get(index, model) for index, model in enumerate(models)]
-    beside_bounds = [
-        replace(each, plain=quality(longer[index].to(device), scene.test, scene.background.to(device)))
-        if index in longer
-        else each
-        for index, (each, scene) in enumerate(zip(shown, scenes, strict=True))
-    ]
+    scenes = [each.scene for each in sources]
+    beside_bounds = list(shown)
+    for index, model in longer.items():
+        scene = scenes[index]
+        plain = quality(model.to(device), scene.test, scene.background.to(device))
+        beside_bounds[index] = replace(shown[index], plain=plain)
     measured = measure_hiding(
         stego.gaussians.to(device),
         stego.opened,
         scenes,
-        baselines,
-        steps=[each.steps if index in longer else fitted[index] for index, each in enumerate(bounds)],
+        [longer.get(index, each.model) for index, each in enumerate(sources)],
+        steps=[each.steps if index in longer else plain_steps[index] for index, each in enumerate(bounds)],
         equal=[each.equal or index in longer for index, each in enumerate(bounds)],
         seed=options.fit.known_seed,
         shown=beside_bounds,
     )
     return HideMetrics(
         **vars(measured),
-        method=method.name,
+        method=options.method,
         gaussians=len(stego.gaussians),
-        photos=photos,
+        photos=tuple(each.photos for each in sources),
         secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
         iterations=stego.iterations,
         steps=tuple(each.steps for each in bounds),

@@ -10,6 +10,5 @@ from .run import (
     VIEWER as VIEWER,
     WRONG_KEYS as WRONG_KEYS,
     DemoResult as DemoResult,
-    contact_sheet as contact_sheet,
     run_demo as run_demo,
 )

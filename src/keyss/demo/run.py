@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 import keyss
 from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
 from keyss.files import load_scene
 from keyss.fitting import FitConfig, Reporter, mean_psnr
+from keyss.many.sheet import contact_sheet
 from keyss.methods import CarryOptions
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import STEGO, plain_names, writers
@@ -144,34 +144,15 @@ def _comparison(
     shown, opened = metrics.cover.psnr, metrics.secrets[0].psnr
     wrong = mean_psnr(decoy.to(target), cover.test, cover.background.to(target))
     carried = mean_psnr(converted.to(target), secret.test, secret.background.to(target))
-    columns = [
-        ("cover: photo", "", photos(cover)),
-        ("cover: published model", f"{shown:.1f} dB", renders(out / STEGO, cover)),
-        ("secret: photo", "", photos(secret)),
-        ("opened with the key", f"{opened:.1f} dB", renders(revealed, secret)),
-        ("opened from the .spz", f"{carried:.1f} dB", renders(converted, secret)),
-        ("with a wrong key", f"{wrong:.1f} dB against the cover", renders(decoy, cover)),
-    ]
-    return contact_sheet(columns)
-
-
-def contact_sheet(
-    columns: Sequence[tuple[str, str, Sequence[NDArray[np.uint8]]]], cell: int = 240
-) -> Image.Image:
-    """Columns of images [H, W, 3] of one size, scaled to a width of `cell` pixels, below two captions."""
-    first = columns[0][2][0]
-    height = round(first.shape[0] * cell / first.shape[1])
-    gap, head = cell // 40, cell // 6
-    rows = len(columns[0][2])
-    size = gap + len(columns) * (cell + gap), head + rows * (height + gap) + gap
-    sheet = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(sheet)
-    large, small = ImageFont.load_default(cell // 15), ImageFont.load_default(cell // 19)
-    for index, (title, note, images) in enumerate(columns):
-        x = gap + index * (cell + gap)
-        draw.text((x, gap // 2), title, fill=(20, 20, 20), font=large)
-        draw.text((x, gap // 2 + cell // 12), note, fill=(90, 90, 90), font=small)
-        for row, image in enumerate(images):
-            picture = Image.fromarray(image).resize((cell, height), Image.Resampling.LANCZOS)
-            sheet.paste(picture, (x, head + row * (height + gap)))
-    return sheet
+    columns = {
+        "cover: photo": photos(cover),
+        f"cover: published model\n{shown:.1f} dB": renders(out / STEGO, cover),
+        "secret: photo": photos(secret),
+        f"opened with the key\n{opened:.1f} dB": renders(revealed, secret),
+        f"opened from the .spz\n{carried:.1f} dB": renders(converted, secret),
+        f"with a wrong key\n{wrong:.1f} dB to the cover": renders(decoy, cover),
+    }
+    pictures = zip(*columns.values(), strict=True)
+    return contact_sheet(
+        list(columns), {f"view {row}": each for row, each in zip(rows, pictures, strict=True)}
+    )

@@ -18,7 +18,7 @@ from keyss.many.comparison import ComparedMethod, Comparison, comparison_text
 from keyss.many.folder import CellFolder, Forecast
 from keyss.many.performing import keys_of
 from keyss.many.running import Outcome
-from keyss.many.sheet import sheet
+from keyss.many.sheet import comparison_sheet
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.progress import reporter as default_reporter
@@ -86,7 +86,7 @@ def compare(
     runs = {name: _opened(folder, place) for name, place in places.items() if outcomes[place].result}
     if runs:
         picture = io.BytesIO()
-        sheet(runs, device).save(picture, "PNG", optimize=True)
+        comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
         write_bytes(folder.out / PICTURE, picture.getvalue())
     return found
 

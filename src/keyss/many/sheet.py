@@ -1,4 +1,4 @@
-"""The picture of a comparison: a row for each method."""
+"""Pictures in rows and columns: a comparison of methods, and the demo's."""
 
 from __future__ import annotations
 
@@ -13,50 +13,58 @@ from keyss.measure.images import renders_of
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.opening import HidingRun
 
-_TITLES = ("cover", "secret", "error of the secret, x4")
+Picture = NDArray[np.uint8]  # [H, W, 3]
 
 
-def sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
+def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
     """A row for each method: cover, secret and its error (times 4) from the middle test camera."""
     target = resolve_device(device)
-    rows: list[tuple[str, list[NDArray[np.uint8]]]] = []
+    rows: dict[str, Sequence[Picture]] = {}
     for name, run in runs.items():
         stego = run.stego.to(target)
-        shown = []
-        for scene, model in zip(
-            run.scenes(train_pictures=False), [stego, run.opened[0].reveal(stego).to(target)], strict=True
-        ):
+        models = [stego, run.opened[0].reveal(stego).to(target)]
+        photos, renders = [], []
+        for scene, model in zip(run.scenes(train_pictures=False), models, strict=True):
             view = scene.test[len(scene.test) // 2]
-            shown.append((view.image.numpy(), renders_of(model, scene, [view])[0][1].numpy()))
-        error = np.abs(shown[1][0].astype(int) - shown[1][1]).clip(0, 63).astype(np.uint8) * 4
-        if not rows:
-            rows.append(("photos", [shown[0][0], shown[1][0], np.zeros_like(error)]))
-        rows.append((name, [shown[0][1], shown[1][1], error]))
-    return _drawn(rows)
+            photos.append(view.image.numpy())
+            renders.append(renders_of(model, scene, [view])[0][1].numpy())
+        error = np.abs(photos[1].astype(int) - renders[1]).clip(0, 63).astype(np.uint8) * 4
+        rows.setdefault("photos", [*photos, np.zeros_like(error)])
+        rows[name] = [*renders, error]
+    return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
 
 
-def _drawn(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], cell: int = 200) -> Image.Image:
-    """Rows of pictures [H, W, 3], each `cell` pixels high, beside their names."""
-    gap, label, head = cell // 40, cell // 2, cell // 8
-    pictures = [[Image.fromarray(each) for each in own] for _, own in rows]
+def contact_sheet(
+    heads: Sequence[str], rows: Mapping[str, Sequence[Picture]], cell: int = 200
+) -> Image.Image:
+    """Rows of pictures, each `cell` pixels high, beside the names of the rows and below heads."""
+    gap, font = cell // 40, ImageFont.load_default(cell // 14)
     scaled = [
-        [each.resize((max(1, round(each.width * cell / each.height)), cell)) for each in own]
-        for own in pictures
+        [
+            Image.fromarray(each).resize((max(1, round(each.shape[1] * cell / each.shape[0])), cell))
+            for each in pictures
+        ]
+        for pictures in rows.values()
     ]
-    font = ImageFont.load_default(cell // 14)
+    label = max(math.ceil(font.getlength(name)) for name in rows) + gap
+    lines = 1 + max(head.count("\n") for head in heads)
+    top = gap + lines * (cell // 8)
     widths = [
-        max(math.ceil(font.getlength(title)), *(each.width for each in column))
-        for title, column in zip(_TITLES, zip(*scaled, strict=True), strict=True)
+        max(
+            *(math.ceil(font.getlength(line)) for line in ["", *head.split("\n")]),
+            *(each.width for each in column),
+        )
+        for head, column in zip(heads, zip(*scaled, strict=True), strict=True)
     ]
-    size = label + sum(widths) + gap * (len(widths) + 1), head + (cell + gap) * len(rows) + gap
+    starts = [label + gap + sum(widths[:index]) + gap * index for index in range(len(widths))]
+    size = starts[-1] + widths[-1] + gap, top + (cell + gap) * len(rows)
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    starts = [label + sum(widths[:index]) + gap * index for index in range(len(widths))]
-    for x, text in zip(starts, _TITLES, strict=True):
-        draw.text((x, gap), text, fill=(20, 20, 20), font=font)
-    for number, ((name, _), own) in enumerate(zip(rows, scaled, strict=True)):
-        y = head + (cell + gap) * number
+    for x, head in zip(starts, heads, strict=True):
+        draw.multiline_text((x, gap), head, fill=(20, 20, 20), font=font)
+    for number, (name, pictures) in enumerate(zip(rows, scaled, strict=True)):
+        y = top + (cell + gap) * number
         draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
-        for x, each in zip(starts, own, strict=True):
-            sheet.paste(each, (x, y))
+        for x, picture in zip(starts, pictures, strict=True):
+            sheet.paste(picture, (x, y))
     return sheet
