@@ -23,7 +23,7 @@ _READERS = 2  # threads that read files
 
 @dataclass(frozen=True)
 class Secret:
-    """What to hide, a scene or a file, and the key that opens it (methods without keys take none)."""
+    """A scene or a file to hide, and its key (methods without keys take none)."""
 
     scene: PathLike | Scene | Gaussians | None = None  # folder of photos, or model
     key: str = field(default="", repr=False)
@@ -41,7 +41,7 @@ class Secret:
 
 @dataclass(frozen=True)
 class HideResult:
-    """What `hide` made."""
+    """The result of `hide`."""
 
     stego: Gaussians | None = None  # to be published; None of a dry run
     metrics: HideMetrics | None = None  # None of files and of a dry run

@@ -1,4 +1,4 @@
-"""`convert`: a model in another format, and what that costs the model and its secrets."""
+"""`convert`: a model in another format, and the cost for the model and its secrets."""
 
 from __future__ import annotations
 

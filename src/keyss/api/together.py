@@ -19,7 +19,7 @@ R = TypeVar("R")
 
 
 def together(verb: Callable[P, R]) -> Callable[P, R]:
-    """`verb`, which takes `device`, in all processes that torchrun has started."""
+    """Let all processes of torchrun join in `verb`, which takes `device`."""
 
     @wraps(verb)
     def joining(*arguments: P.args, **options: P.kwargs) -> R:

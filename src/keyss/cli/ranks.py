@@ -13,7 +13,7 @@ COMMANDS = ("fit", "hide")  # that train
 
 
 def answers() -> bool:
-    """Whether this is the first process, or the only one."""
+    """True in the first process, or the only one."""
     return rank() == 0
 
 
@@ -28,7 +28,7 @@ def only_first_prints() -> Iterator[None]:
 
 
 def prints(error: BaseException) -> bool:
-    """Whether this process prints `error`: processes other than the first skip what all of them raise."""
+    """True if this process prints `error`: only the first prints errors that all of them raise."""
     return answers() or not isinstance(error, UsageError | OtherProcessError | KeyboardInterrupt)
 
 

@@ -1,4 +1,4 @@
-"""What shows a training while it runs: progress lines, TensorBoard's event files, a local page."""
+"""Progress of a training: lines, TensorBoard's event files, a local page."""
 
 from __future__ import annotations
 

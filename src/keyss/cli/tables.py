@@ -1,4 +1,4 @@
-"""What commands print when they are done."""
+"""The output of commands that are done."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
 
 
 def print_outcome(result: ManyResult, what: str) -> None:
-    """How many cells are done, and why others failed. Raises InputError if any failed."""
+    """The number of cells that are done, and errors. Raises InputError if any cell failed."""
     failed, count = result.failed, len(result.outcomes)
     print(f"{count - len(failed)} of {count} {what} are done")
     for each in failed:
@@ -231,7 +231,7 @@ def _size(count: int) -> str:
 
 
 def print_forecast(found: Forecast, jobs: int | None = None) -> None:
-    """Which of several cells are done, and roughly what the others take."""
+    """The cells of a dry run, with estimates for those that are not done."""
     from keyss.many.processes import Resources
 
     rows = []
@@ -254,7 +254,7 @@ def print_forecast(found: Forecast, jobs: int | None = None) -> None:
 
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:
-    """The paths of the results that exist, and what each is."""
+    """The paths and descriptions of the results that exist."""
     _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
 
 

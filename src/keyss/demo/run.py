@@ -32,7 +32,7 @@ VIEWER = "index.html"
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo measured."""
+    """The measurements of the demo."""
 
     metrics: HideMetrics  # as in metrics.json
     refused: int  # how many of the wrong keys were refused

@@ -1,4 +1,4 @@
-"""Many runs: one engine, and four specifications for it.
+"""Many runs: one engine and four kinds of specification.
 
 A *cell* is a plain fit, or a hiding and its measures, in a folder of its own (`keyss.many.cell`). Cells run
 in processes of this machine, on a cluster, or in this process (`keyss.many.running`); a cell that is done is

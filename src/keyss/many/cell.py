@@ -4,8 +4,8 @@
 | --- | --- |
 | `cell.json` | the cell |
 | `result.json` | its numbers; there only when it is done |
-| `failed.json` | why the last attempt was refused |
-| `log.txt` | what its attempts printed |
+| `failed.json` | the reason, if the last attempt was refused |
+| `log.txt` | the output of its attempts |
 | `lock` | held (flock) by the process at work |
 | `run/` | the results of `keyss fit` or `keyss hide`, unless the cell names another folder |
 
@@ -35,21 +35,21 @@ from keyss.runs.records import read_record
 CELL, RESULT, FAILED, LOG, LOCK, RUN = (
     *("cell.json", "result.json", "failed.json", "log.txt", "lock", "run"),
 )
-# Code that cannot change a result, but for the measures.
+# Code that does not affect results, except the measures.
 _OUTSIDE, _MEASURES = ("cli", "demo", "many", "viewer"), ("many", "measures.py")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """What is hidden in what, how, and with which keys. Paths are absolute.
+    """A hiding: cover, secrets, options, and where its keys come from. Paths are absolute.
 
-    Without secrets and files, a plain model of the cover is fitted. A plain model may be that of another cell
+    Without secrets and files, it is a plain fit of the cover. A plain model may be that of another cell
     beside this one: `model_of` gives its relative path.
     """
 
     version: int = 2
     name: str  # for people
-    id: str = ""  # the identity, where the folder has another name
+    id: str = ""  # the identity, if the folder has another name
     cover: str  # a scene, or a model
     secrets: tuple[str, ...] = ()  # scenes or models ...
     files: tuple[str, ...] = ()  # ... or any files
@@ -70,21 +70,21 @@ class Cell:
 
     @property
     def fits(self) -> bool:
-        """Whether this is a plain fit."""
+        """True for a plain fit."""
         return not self.secrets and not self.files
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """All files and scenes that are read, except keys and the models of other cells."""
+        """All files and scenes to read, except keys and the models of other cells."""
         models = (each for each in self.models if each and os.path.isabs(each))
         return (self.cover, *self.secrets, *self.files, *models)
 
     @property
     def identity(self) -> str:
-        """SHA-256, in hexadecimal, over everything that determines the result.
+        """SHA-256 (hexadecimal) of everything that determines the result.
 
-        Names and places of files do not count, except the folder of results and the names of hidden files;
-        nor do keys. Raises InputError for an input that cannot be read.
+        Keys do not count, nor do names and places of files, except the folder of results and the names of
+        hidden files. Raises InputError for an input that cannot be read.
         """
 
         def content(path: str) -> str:
@@ -118,13 +118,13 @@ class Result:
     published: str  # the model, relative to the cell's folder
     sha256: str  # of that file
     numbers: dict[str, float] = field(default_factory=dict)  # everything measured, by names with dots
-    notes: dict[str, str] = field(default_factory=dict)  # why something was not measured, by the same
+    notes: dict[str, str] = field(default_factory=dict)  # reasons to skip a measure, by the same names
     measures: tuple[str, ...] = ()  # of the cell's, those in `numbers`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """Why a cell was refused."""
+    """The reason to refuse a cell."""
 
     version: int = 1
     status: int  # exit status of the command line for this error
@@ -189,7 +189,7 @@ def _files_below(folder: str, above: tuple[str, ...] = ()) -> Iterator[str]:
 
 @cache
 def code_version() -> str:
-    """The version of keyss, and a digest of all of its code that a result can depend on."""
+    """The version of keyss, and a digest of the code that affects results."""
     root = Path(_version.__file__).parent
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):

@@ -1,4 +1,4 @@
-"""Processes on a cluster: Ray starts them wherever cores and memory are free.
+"""Processes on a cluster: Ray starts them where cores and memory are free.
 
 Folders and inputs must be reachable under the same paths from every node, as on a shared file system, and its
 locks (flock) must hold between nodes. Ray pickles its own tasks; no file of keyss is pickled.
@@ -59,7 +59,7 @@ class Cluster:
         return status
 
     def close(self) -> None:
-        """Leave the cluster; what runs for this process ends."""
+        """Leave the cluster and end its running cells."""
         self.closed = True
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of its own sockets
@@ -67,7 +67,7 @@ class Cluster:
 
 
 def _attempt(folder: str, threads: int, command: tuple[str, ...]) -> int:
-    """On a node: the exit status of a process that does the cell. If this is killed, the process ends too."""
+    """On a node: run the cell in a process, which ends with this task; returns its exit status."""
     process = processes.start(Path(folder), threads, command)
     try:
         return process.wait()

@@ -64,8 +64,8 @@ def compare(
     `3dgs` is the bound of all: plain 3DGS of as many Gaussians and as many training steps.
 
     `out` (a folder) gets the cells, and `comparison.json`, `.md` and `.png` (a row for each method: cover,
-    secret, and the secret's error). Cells that are done are skipped. `dry_run`: only say what they will take.
-    A method that fails has a row that says why. Raises KeyssError and its children; Interrupted.
+    secret, and the secret's error). Cells that are done are skipped. `dry_run`: only return their plans.
+    A method that fails has a row with the error. Raises KeyssError and its children; Interrupted.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")

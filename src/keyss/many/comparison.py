@@ -26,7 +26,7 @@ _LEGEND = (
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedMethod:
-    """One method. Without a result, `error` says why."""
+    """One method; `error` is the reason for a missing result."""
 
     name: str  # METHOD, METHOD:PRESET or METHOD:VARIANT
     run: str | None = None  # the folder of its run, relative to that of the comparison
@@ -113,7 +113,7 @@ def _wrong_keys(each: ComparedMethod) -> str:
 
 
 def _standard(each: ComparedMethod) -> str:
-    """What other people's readers find, not what the method claims."""
+    """Measured with third-party readers, not the method's claim."""
     tried, load = (int(each.numbers[f"files.{name}"]) for name in ("readers", "readers that load"))
     word = "yes" if load == tried else "no"
     return f"{word}, {load} of {tried} readers" if tried else "not tried"

@@ -1,4 +1,4 @@
-"""The cells of one folder: what a specification adds, what they will take, and how they run."""
+"""The cells of one folder: add, plan and run them."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class Forecast:
 
     @property
     def plans(self) -> list[Plan]:
-        """Of those that would run."""
+        """The plans of the cells to run."""
         return [each.plan for each in self.cells if each.plan is not None]
 
 
 @dataclass
 class CellFolder:
-    """Cells, each with its place in `out`. Equal ones are there once."""
+    """Cells by their folders in `out`; equal cells share one."""
 
     out: Path
     master_key_file: Path | None = None
@@ -97,14 +97,14 @@ class CellFolder:
         return place
 
     def run(self, title: str, **options: Any) -> dict[Path, Outcome]:
-        """Run all cells that are not done, with the options of `run_cells`; what became of each."""
+        """Run all cells that are not done, with the options of `run_cells`; returns outcomes by folder."""
         with claimed(self.out):
             settle_master_key(self.out, self.master_key_file)
             outcomes = run_cells(title, [(cell, place) for place, cell in self.cells.items()], **options)
         return {each.folder: each for each in outcomes}
 
     def forecast(self) -> Forecast:
-        """What each cell will take. Nothing is written."""
+        """The plan of each cell. Writes nothing."""
         plans: dict[str, CellPlan] = {}
         found = []
         for place, cell in self.cells.items():

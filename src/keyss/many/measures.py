@@ -1,6 +1,6 @@
 """Measures of a finished hiding that `compare` and `reproduce` ask for, beside those of `hide` and `audit`.
 
-Each is a function from a run to numbers by name; a text in place of a number says why there is none.
+Each is a function from a run to numbers by name; a text in place of a number is the reason to skip it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xy
 
 @dataclass(frozen=True)
 class Subject:
-    """A run, and what its measures share."""
+    """A run, and data that its measures share."""
 
     run: HidingRun
     backend: Backend
@@ -76,11 +76,11 @@ class Subject:
 
     @property
     def standard(self) -> bool:
-        """Whether a 3DGS model is published."""
+        """True if the published file is a 3DGS model."""
         return registry.get(self.run.config.method).capabilities.standard
 
     def times(self, models: Sequence[Gaussians]) -> dict[str, RenderTime]:
-        """How long a picture of the cover and of the first secret takes, also beside plain 3DGS."""
+        """Render times of the cover and the first secret, also relative to plain 3DGS."""
         found = {}
         plains = self.run.plain_models()
         for role, model, plain, scene in zip(_ROLES, models, plains, self.scenes, strict=False):
@@ -90,7 +90,7 @@ class Subject:
 
 
 def files(subject: Subject) -> Numbers:
-    """Bytes of the published and of the handed files; how many of other people's programs read the former."""
+    """Bytes of the published and the handed files; how many third-party programs read the published one."""
     published = stego_in(subject.run.folder)
     handed = (subject.run.folder / HANDED).glob("*")
     found: Numbers = {"published": published.stat().st_size}
@@ -115,7 +115,7 @@ def pictures(subject: Subject) -> Numbers:
 
 
 def rendering(subject: Subject) -> Numbers:
-    """Times without what is appended, and whether a 3DGS model is published."""
+    """Render times without appended Gaussians; 1 for a published 3DGS model, else 0."""
     stego, secret = subject.models
     found: Numbers = {"standard": float(subject.standard)}
     for role, each in subject.times([own_gaussians(stego), secret]).items():
@@ -124,7 +124,7 @@ def rendering(subject: Subject) -> Numbers:
 
 
 def secrecy(subject: Subject) -> Numbers:
-    """How usual the published model is among plain ones, and beside it the plain model of its seed.
+    """How well the published model, and the plain model of its seed, pass for plain models of other seeds.
 
     Without a 3DGS model only its pictures are judged.
     """
@@ -137,7 +137,7 @@ def secrecy(subject: Subject) -> Numbers:
 def survival(subject: Subject) -> Numbers:
     """Loss in dB of cover and secret by pruning, conversion and purification.
 
-    There is none of a secret that does not open any more.
+    A secret that does not open any more has none.
     """
     changes = trials(subject.scenes[0])
     found: Numbers = {}
@@ -167,7 +167,7 @@ def trials(cover: Scene) -> dict[str, Change]:
 
 
 def pruning(subject: Subject) -> Numbers:
-    """PSNR in dB of the cover and the first secret after pruning, without those that do not open any more."""
+    """PSNR in dB of the cover and the first secret after pruning, where they still open."""
     kinds = {"by opacity": opacity_pruning, "random": random_pruning}
     named = {f"{share:.0%} {how}": kinds[how](share) for how in kinds for share in PRUNED_SHARES}
     cover, *others = subject.scenes
@@ -257,12 +257,12 @@ def _covers(paths: tuple[Path, ...], cover: str, views: ViewOptions, backend: Ba
 
 
 def own_gaussians(stego: Gaussians) -> Gaussians:
-    """A published model without what is appended."""
+    """A published model without appended Gaussians."""
     return stego if isinstance(stego, DecodedGaussians) else stego[~is_appended(stego)]
 
 
 def sparing(change: Change) -> Change:
-    """The same change, except to what is appended."""
+    """The same change, but not to appended Gaussians."""
 
     def apply(model: Gaussians) -> Gaussians:
         if isinstance(model, DecodedGaussians) or not bool(is_appended(model).any()):

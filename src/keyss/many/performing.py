@@ -1,4 +1,4 @@
-"""How a cell is done: fit or hide, measure, and gather the numbers."""
+"""Run one cell: fit or hide, measure, collect the numbers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from keyss.runs.sources import as_scene
 
 
 def perform(cell: Cell, folder: Path, reporter: Reporter | None = None) -> Result:
-    """Fit or hide, and measure; resumes an attempt that was interrupted. Raises KeyssError."""
+    """Fit or hide, and measure; resumes an interrupted attempt. Raises KeyssError."""
     start, reporter = time.monotonic(), reporter or default_reporter()
     run = _place(folder, cell.run)
     numbers: dict[str, float] = {}
@@ -70,7 +70,7 @@ def perform(cell: Cell, folder: Path, reporter: Reporter | None = None) -> Resul
 
 
 def plan_of(cell: Cell, folder: Path) -> Plan:
-    """What the cell will take, without the plain fits of other cells. Raises KeyssError."""
+    """The plan of a cell, without the plain fits of other cells. Raises KeyssError."""
     device = cast(Backend, cell.device)
     if cell.fits:
         scene = as_scene(cell.cover, cell.views, train_pictures=False)
@@ -83,7 +83,7 @@ def plan_of(cell: Cell, folder: Path) -> Plan:
 
 
 def options_of(cell: Cell) -> MethodOptions:
-    """The options as the method has them. Raises UsageError."""
+    """The options of the method. Raises UsageError."""
     generic: Any = registry.get(cell.method).options
     try:
         options: MethodOptions = msgspec.convert(cell.options, generic)
@@ -103,7 +103,7 @@ def keys_of(cell: Cell) -> list[str]:
 
 
 def flat(record: Any, prefix: str = "") -> dict[str, float]:
-    """All finite numbers of a record that JSON can hold, by names with dots between."""
+    """All finite numbers of a nested record, by names joined with dots."""
     if isinstance(record, dict):
         pairs = [(str(name), each) for name, each in record.items()]
     elif isinstance(record, list | tuple):
@@ -123,7 +123,7 @@ def _place(folder: Path, path: str) -> Path:
 
 
 def _model(folder: Path, path: str) -> Path:
-    """A plain model that is given, or of another cell. Raises InputError where that cell failed."""
+    """The path of a plain model, given or of another cell. Raises InputError if that cell failed."""
     place = _place(folder, path)
     if not os.path.isabs(path) and not place.exists():
         failure = failure_of(folder.parent / Path(path).parts[1])
@@ -199,7 +199,7 @@ def _arguments(cell: Cell, folder: Path, *, placeholders: bool = False) -> dict[
 def _measured(
     cell: Cell, names: list[str], folder: Path, run: Path, reporter: Reporter
 ) -> dict[str, float | str]:
-    """Numbers, and why there are none, of the measures with these names."""
+    """The numbers of some measures, or texts with the reasons to skip them."""
     if not names:
         return {}
     keys, device = [key for key in keys_of(cell) if key], cast(Backend, cell.device)

@@ -1,4 +1,4 @@
-"""Processes of this machine that do cells, a few at once."""
+"""Processes of this machine that run cells, a few at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PATIENCE = 20.0  # s for cells to save their state when they are interrupted
 
 @dataclass(frozen=True)
 class Resources:
-    """What cells may take."""
+    """Jobs at once, and the threads of each."""
 
     jobs: int  # at once
     threads: int  # of each
@@ -50,7 +50,7 @@ class Processes:
         self.closed = False
 
     def attempt(self, name: str, folder: Path, memory: int) -> int:
-        """Wait for a process that does the cell in `folder`; its exit status."""
+        """Run the cell in `folder` in a process, and return its exit status."""
         with self._lock:
             if self.closed:
                 return -1
@@ -63,7 +63,7 @@ class Processes:
         return status
 
     def close(self) -> None:
-        """End what runs, after it has saved its state."""
+        """End all processes, after they have saved their state."""
         with self._lock:
             self.closed, running = True, list(self._running)
         for process in running:
@@ -77,7 +77,7 @@ class Processes:
 
 
 def start(folder: Path, threads: int, worker: Sequence[str]) -> subprocess.Popen[bytes]:
-    """A process that does the cell in `folder`, and that ends with this one. Raises OSError."""
+    """Start a process that runs the cell in `folder` and ends with this process. Raises OSError."""
     with (folder / LOG).open("ab") as log:
         return subprocess.Popen(
             [*worker, str(folder)],

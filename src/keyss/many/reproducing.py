@@ -63,7 +63,7 @@ def reproduce(
     default each hides the next, and the paper's as published. `most`: only so many of these.
 
     `out` (a folder) gets `TABLE.json` and `TABLE.md`, and the cells, which tables in one folder share. Cells
-    that are done are skipped. `dry_run`: only say what they will take. A run that fails is in the result.
+    that are done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
     Raises KeyssError and its children for impossible scenes and arguments; Interrupted.
     """
     if table not in TABLES:

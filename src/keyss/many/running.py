@@ -1,4 +1,4 @@
-"""Run cells: those that are done are skipped, the others run in processes, on a cluster or here."""
+"""Run cells that are not done: in processes, on a cluster, or in this process."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MODEL_COPIES = 12  # of the models it reads, in bytes of their files
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cell."""
+    """The outcome of a cell."""
 
     name: str
     folder: Path
@@ -49,7 +49,7 @@ class Outcome:
 
     @property
     def error(self) -> str | None:
-        """Why there is no result."""
+        """The reason for a missing result."""
         if self.result is not None:
             return None
         died = f"its process died repeatedly; see {self.folder / LOG}"
@@ -58,7 +58,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ManyResult:
-    """What became of all cells, in their order."""
+    """The outcomes of all cells, in their order."""
 
     outcomes: tuple[Outcome, ...]
     tables: tuple[str, ...] = ()  # names of files in the folder
@@ -69,7 +69,7 @@ class ManyResult:
 
 
 class InThisProcess:
-    """One cell after the other, with a reporter."""
+    """Runs one cell after the other, with a reporter."""
 
     jobs, closed = 1, False
 
@@ -91,9 +91,9 @@ Engine = Processes | Cluster | InThisProcess
 
 @contextmanager
 def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
-    """Make the folder if there is none, and keep other processes out while the block runs.
+    """Create the folder if necessary, and lock it while the block runs.
 
-    Raises OutputError, also for a folder that would be published.
+    Raises OutputError, also inside a folder to be published.
     """
     check_not_published(out)
     try:
@@ -106,7 +106,7 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder that others cannot read. Raises OutputError."""
+    """Create a folder that only its owner can read. Raises OutputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
@@ -115,9 +115,9 @@ def make_private(folder: Path) -> None:
 
 
 def settle_master_key(out: Path, given: Path | None) -> None:
-    """Make a master key where none is given; all cells in a folder have keys of one master key.
+    """Create a master key if none is given; all cells in a folder have keys of one master key.
 
-    Raises OutputError for another master key than that of the cells which are there.
+    Raises OutputError if existing cells have another master key.
     """
     own = out / MASTER_KEY
     if given is None and not own.exists():
@@ -142,10 +142,10 @@ def run_cells(
     retries: int = RETRIES,
     reporter: Reporter | None = None,
 ) -> list[Outcome]:
-    """Do all cells that are not done, in a folder that is `claimed`; what became of each.
+    """Run all cells that are not done, in a `claimed` folder, and return all outcomes.
 
-    Plain fits come first: hidings use their models. `reporter`: run all in this process. Raises OutputError,
-    BackendError and UsageError.
+    Plain fits come first, as hidings use their models. `reporter`: run all in this process. Raises
+    OutputError, BackendError and UsageError.
     """
     every = list(cells)
     before = [result_of(folder, cell.measures) for cell, folder in every]
@@ -173,7 +173,7 @@ def run_cells(
 
 
 class _Run:
-    """Does cells, and shows on the standard error stream how far it is."""
+    """Runs cells, with progress on the standard error stream."""
 
     def __init__(self, title: str, total: int, skipped: int, engine: Engine, retries: int) -> None:
         console = Console(stderr=True, quiet=progress.level < 0)
@@ -188,7 +188,7 @@ class _Run:
             self._say(f"{title}: {skipped} of {total} are done already")
 
     def do(self, due: Sequence[tuple[Cell, Path]]) -> None:
-        """Returns when each is done, was refused, or has died once more than it may."""
+        """Return when each cell is done, refused, or out of retries."""
         fits = [each for each in due if each[0].fits]
         with self.bars:
             for group in (fits, [each for each in due if not each[0].fits]):
@@ -246,6 +246,6 @@ def _engine(due: Sequence[tuple[Cell, Path]], jobs: int | None, ray: str | None)
 
 
 def _memory(cell: Cell) -> int:
-    """Bytes that the process of a cell takes, roughly."""
+    """A rough estimate of the memory in bytes of a cell's process."""
     paths = (Path(each) for each in cell.inputs)
     return _BASE_BYTES + _MODEL_COPIES * sum(each.stat().st_size for each in paths if each.is_file())

@@ -14,7 +14,7 @@ from keyss.many.tables import CellNumbers, write_tables
 from keyss.rendering.orbit import is_model
 from keyss.runs.sources import PathLike
 
-# They differ from run to run, or say what was asked for.
+# Numbers that differ from run to run, or repeat arguments.
 _NO_MEASURES = {"seconds", "seed", "version", "width"}
 
 
@@ -31,9 +31,9 @@ def sweep(
     """Run all cells of a specification that are not done, and write the tables of all that are.
 
     `jobs`: cells at once, among which the cores are divided; by default as many as cores and memory allow.
-    `ray`: address of a Ray cluster, or "local". `retries`: how often a cell is tried again that died.
-    `dry_run`: only say what the cells will take. Keys are derived from a master key and the cells' names:
-    that in `master_key_file`, or one that is made in the private part of `out`. Raises KeyssError and its
+    `ray`: address of a Ray cluster, or "local". `retries`: of a cell whose process died.
+    `dry_run`: only return the plans of the cells. Keys are derived from a master key and the cells' names:
+    the one in `master_key_file`, or a new one in the private part of `out`. Raises KeyssError and its
     children; a cell that fails is in the result.
     """
     path = Path(spec)
@@ -73,6 +73,6 @@ def _rows(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, CellNum
 
 
 def _numbers(outcome: Outcome) -> dict[str, float]:
-    """Those that measure something; none of a cell that failed."""
+    """The measurements of a cell, none if it failed."""
     numbers = outcome.result.numbers if outcome.result else {}
     return {name: value for name, value in numbers.items() if _NO_MEASURES.isdisjoint(name.split("."))}

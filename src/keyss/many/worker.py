@@ -1,6 +1,6 @@
-"""The process that does one cell: `python -m keyss.many.worker FOLDER`.
+"""The process that runs one cell: `python -m keyss.many.worker FOLDER`.
 
-It ends with the process that started it: its standard input is a pipe that closes then. A cell is done when
+It ends with its parent, which holds the other end of its standard input. A cell is done when
 `result.json` is there. Only the holder of the cell's lock writes it, after checking that there is none: two
 processes that were started for one cell do it once.
 """
@@ -27,7 +27,7 @@ INTERRUPTED = 130
 
 
 def main(arguments: list[str]) -> int:
-    """Do the cell in the given folder; the exit status."""
+    """Run the cell in the given folder; returns the exit status."""
     from keyss.many.performing import perform
 
     for signum in (signal.SIGINT, signal.SIGTERM):
@@ -40,7 +40,7 @@ def main(arguments: list[str]) -> int:
 
 
 def attempt(folder: Path, perform: Callable[[Cell, Path], Result], *, log: bool = True) -> int:
-    """Do the cell unless it is done; the exit status. A refusal is recorded.
+    """Run the cell unless it is done, and record a refusal; returns the exit status.
 
     `log`: print to the standard error stream.
     """
