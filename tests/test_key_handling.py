@@ -106,6 +106,17 @@ def test_no_command_takes_a_key_as_an_argument() -> None:
             assert "Path" in str(keys[name]), name
 
 
+@pytest.mark.parametrize("option", [["--key", KEY], [f"--key={KEY}"], ["--password", KEY]])
+@pytest.mark.parametrize("command", [["reveal", "stego.ply", "-o", "out.ply"], ["hide", "-o", "out"]])
+def test_a_key_among_the_arguments_is_refused_and_not_repeated(
+    capsys: pytest.CaptureFixture[str], command: list[str], option: list[str]
+) -> None:
+    assert main([*command, *option]) == 2
+    said = capsys.readouterr()
+    assert "--key-file FILE" in said.err
+    assert not _spelt((said.out + said.err).encode())
+
+
 def test_errors_and_representations_do_not_show_the_key() -> None:
     derived = DerivedKey(KEY, KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8192, parallelism=1))
     assert KEY not in repr(derived)

@@ -28,6 +28,7 @@ from keyss.core.nearest import nearest
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
+_KEY_OPTIONS = ("--key", "--keys", "--password", "--passphrase")  # that people may expect
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,6 +81,11 @@ def _run(arguments: list[str], options: set[str]) -> None:
         near = nearest(name.lower(), commands.MODULES)
         hint = f"did you mean `keyss {near}`?" if near else "see `keyss --help`"
         raise UsageError(f"there is no command {name!r}: {hint}")
+    if any(word.partition("=")[0] in _KEY_OPTIONS for word in rest):  # the parser would print its value
+        raise UsageError(
+            "no option takes a key itself, as others can see arguments: give --key-file FILE, set KEYSS_KEY, "
+            "or type it at the prompt"
+        )
     command = commands.to_parse(name, rest)
     options.update(options_of(command))
     tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))

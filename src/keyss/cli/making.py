@@ -161,7 +161,7 @@ def convert(
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
-    """Convert a model to another format, and report what that costs.
+    """Convert a model to another format, and report the cost.
 
     The suffix of OUT selects the format: .ply, .compressed.ply, .spz, .sog, .glb or .splat; the
     meta.json of a SOG folder can only be read. All formats but .ply round values, which destroys what is
