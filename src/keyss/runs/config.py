@@ -51,7 +51,7 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
     # Unknown fields are skipped, so the name can be read whatever the method.
     name = read_record(path, RunConfig[MethodOptions]).method
     if name not in registry.METHODS:
-        raise InputError(f"{path}: expected a method of {', '.join(registry.METHODS)}, got {name!r}")
+        raise InputError(f"{path}: method {name!r}: expected one of {', '.join(registry.METHODS)}")
     generic: Any = RunConfig
     config: RunConfig[MethodOptions] = read_record(path, generic[registry.get(name).options])
     if config.options.fit.seed is None:
