@@ -27,7 +27,7 @@ from keyss.core.alignment import align
 from keyss.files.scenes import load_scene
 from keyss.fitting import PlainRun, load_checkpoint, mean_psnr, save_checkpoint
 from keyss.keys import random_embeddings
-from keyss.measure import opacity_pruning
+from keyss.measure import opacity_pruning, stealth_statistics
 from keyss.methods import PlacedScene
 from keyss.methods.keyss.method import published
 
@@ -106,6 +106,8 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
             role, suffix = f"secret {index}" if index else "cover", " half" if part == 2 else ""
             found[f"{role} bound{suffix}"] = mean_psnr(plains[scene.name, part], scene.test, scene.background)
     found["cover"], found["published"] = psnr(stego, 0), len(stego)
+    if design == "carriers":
+        found["statistic"] = noticed(run.scene_gaussians(0).detach(), stego)
     pruned = opacity_pruning(0.25).apply(stego)
     found["cover pruned"] = psnr(pruned, 0)
     wrong = random_embeddings(WRONG_KEYS, torch.Generator().manual_seed(99))
@@ -119,6 +121,21 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
         found |= {"wrong mean": sum(losses) / len(losses), "wrong worst": max(losses)}
         found |= {f"secret {index} chance": chance, f"secret {index} wrong": max(gains)}
     return {name: round(value, 3) for name, value in found.items()}
+
+
+def noticed(cover: Gaussians, stego: Gaussians) -> float:
+    """By how many standard errors the most changed statistic of `keyss.measure.stealth` differs.
+
+    Between the published model and its Gaussians before anything was written into their harmonics.
+    """
+    cover = cover[cover.opacities >= FitConfig().prune_opacity]
+    shuffled = cover[torch.randperm(len(cover), generator=torch.Generator().manual_seed(0))]
+    before, after = stealth_statistics(shuffled), stealth_statistics(stego)
+    return max(
+        abs(each.value - before[name].value) / each.error
+        for name, each in after.items()
+        if name in before and each.error
+    )
 
 
 def plain(folder: Path, scene: Scene, fit: FitConfig, width: int) -> tuple[Gaussians, float]:

@@ -61,7 +61,8 @@ class TestArguments:
         monkeypatch.setenv("KEYSS_KEY", "k")
         said = keyss(
             *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
-            *("--max-gaussians", 80, "--seed", 9, "--mask", "xyz,sc", "--method", "keyss", "--width", 10),
+            *("--max-gaussians", 80, "--seed", 9, "--method", "keyss", "--design", "mlp", "--mask", "xyz,sc"),
+            *("--width", 10),
             *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
         )
         assert said.status == 0, said.err

@@ -116,7 +116,7 @@ def reproduce(
 def _options(run: Run) -> MethodOptions:
     """The paper's settings, except the changes of the run."""
     design: dict[str, Any] = {"design": "published"} if run.method == "keyss" else {}
-    return replace(registry.get(run.method).options.preset("full"), **design, **run.changes)
+    return replace(registry.get(run.method).options.preset("full"), **{**design, **run.changes})
 
 
 def _paths(scenes: Sequence[PathLike], data: PathLike | None) -> dict[str, str]:

@@ -167,6 +167,9 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match="common_poses"):
         KeyssOptions(design="mlp", poses="cover")
     KeyssOptions(poses="cover", design="published")
+    for change in ({"key_encoder": "clip"}, {"points": "cover"}, {"densification": "secret"}):
+        with pytest.raises(UsageError, match="carriers"):
+            KeyssOptions(design="carriers", **change)  # type: ignore[arg-type]
 
 
 def test_options_override_the_design() -> None:

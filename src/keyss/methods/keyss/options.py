@@ -74,6 +74,11 @@ class KeyssOptions(JointOptions):
                 '`clip_model` is for the key encoder clip: leave it out or set `key_encoder="clip"`'
             )
         self.check_poses(settings.common_poses)
+        if self.key_encoder == "clip" and not hasattr(settings, "mask"):
+            raise UsageError(
+                f'`key_encoder="clip"`: the embedding encrypts in the design {self.design}, and CLIP is no '
+                "key derivation; use a design with a network"
+            )
         if (self.points, self.densification) != ("both", "both") and not hasattr(settings, "mask"):
             raise UsageError(
                 f"`points` and `densification`: in the design {self.design} each scene has its own"
@@ -94,8 +99,8 @@ class KeyssOptions(JointOptions):
 
     @classmethod
     def variants(cls) -> Mapping[str, KeyssOptions]:
-        """The other designs, the paper's text first."""
-        return {"published": KeyssOptions(design="published"), "mlp": KeyssOptions(design="mlp")}
+        """KeySS as published."""
+        return {"published": KeyssOptions(design="published")}
 
     @property
     def joint_fit(self) -> FitConfig:

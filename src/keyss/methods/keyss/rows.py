@@ -221,14 +221,15 @@ def row_kinds(model: Gaussians) -> list[RowKind]:
 
 
 def carrying(cover: Gaussians) -> list[RowKind]:
-    """The rows of each kind that can be written without equal values being missed.
+    """The rows of each kind that can be written without near-equal values being missed.
 
-    Clones keep harmonics in common, to the last bit, where a colour was saturated ever since.
+    Clones that training hardly moved apart agree in harmonics, such as those of a saturated colour: here in
+    three in a row of one colour, in all bits above the low ones.
     """
-    first, second = words_of(cover)[:, 0:3].astype(np.uint64), words_of(cover)[:, 3:6].astype(np.uint64)
-    pairs = first << np.uint64(32) | second  # of each colour, from the first two harmonics
-    values, counts = np.unique(pairs, return_counts=True)
-    apart = ((counts[np.searchsorted(values, pairs)] == 1) | (pairs == 0)).all(axis=1)
+    words = (words_of(cover) >> SHIFT).astype(np.uint64)
+    windows = words[:, :-6] << np.uint64(38) | words[:, 3:-3] << np.uint64(19) | words[:, 6:]
+    values, counts = np.unique(windows, return_counts=True)
+    apart = ((counts[np.searchsorted(values, windows)] == 1) | (windows == 0)).all(axis=1)
     return [RowKind(kind.rows[apart[kind.rows]], kind.columns[apart[kind.rows]]) for kind in row_kinds(cover)]
 
 
