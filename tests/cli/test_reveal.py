@@ -13,15 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from channels.codes.published import codes_of, model_of
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
 from keyss import Secret, hide
-from keyss.channels import LOW_BITS, base, opening
+from keyss.channels import LOW_BITS, CodesCover, Payload, base, opening
 from keyss.channels.low_bits import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
 from keyss.methods import encode_all
+from keyss.methods.records import whole
 from keyss.methods.records.opening import COUNT
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -58,6 +60,19 @@ def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
         return keyss("reveal", files / model, "--key-file", files / key, "-o", tmp_path / "s.ply", *more)
 
     return run
+
+
+@pytest.mark.parametrize("command", ["reveal", "verify"])
+def test_many_gaussians_in_a_small_file_are_refused(
+    keyss: Run, files: Path, tmp_path: Path, command: str
+) -> None:
+    hostile = whole.encode(Gaussians.cat([model_of(1, sh_degree=3)] * (1 << 17)))
+    write_model(
+        tmp_path / "stego.spz", CodesCover.of(codes_of(".spz")).embed([(KEY, Payload("carry", hostile))])
+    )
+    out = ["-o", tmp_path / "s.ply"] if command == "reveal" else []
+    said = keyss(command, tmp_path / "stego.spz", "--key-file", files / "key", *out)
+    assert_refused(said, 4, "announces 131,072 Gaussians, more than")
 
 
 class TestCounts:

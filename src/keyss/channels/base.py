@@ -36,6 +36,7 @@ class Payload:
     data: bytes
     # Of a payload that was cut into chunks: those that were read and those that were written.
     chunks: tuple[int, int] | None = field(default=None, compare=False)
+    carriers: int | None = field(default=None, compare=False)  # Gaussians of the model that it was read from
 
 
 @dataclass(frozen=True)

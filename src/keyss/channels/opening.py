@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from keyss.channels.base import Content, Reader, SaltedReader
+from keyss.channels.base import Content, Payload, Reader, SaltedReader
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
@@ -17,7 +17,7 @@ def open_content(stego: Gaussians, key: str) -> Content:
     """The content that `key` opens in any channel. Raises WrongKeyError, and InputError for damage."""
     for reader in _readers(stego):
         with suppress(WrongKeyError):
-            return reader.open(key)
+            return _read_from(stego, reader.open(key))
     raise WrongKeyError()
 
 
@@ -42,8 +42,12 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     derived = DerivedKey(key, KeyDerivation(salt=reader.salts[0]))
     content = None
     with suppress(WrongKeyError):
-        content = reader.extract(derived)
+        content = _read_from(stego, reader.extract(derived))
     return Attempt(derived, content, appended is not None)
+
+
+def _read_from(stego: Gaussians, content: Content) -> Content:
+    return replace(content, carriers=len(stego)) if isinstance(content, Payload) else content
 
 
 def _readers(stego: Gaussians) -> Iterator[Reader]:

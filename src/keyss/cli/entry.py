@@ -26,6 +26,7 @@ from keyss.core.errors import (
 from keyss.core.nearest import nearest
 
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
+OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _KEY_OPTIONS = ("--key", "--keys", "--password", "--passphrase")  # that people may expect
@@ -121,9 +122,9 @@ def explain(error: BaseException) -> tuple[int, str]:
                 word += f"{where}; {saved}"
             return 128 + signum, word
         case _ if _is_out_of_memory(error):
-            return NO_ROOM, (
-                "error: out of memory; a smaller --width or --max-gaussians needs less "
-                f"({type(error).__name__}: {error})"
+            return OUT_OF_MEMORY, (
+                "error: there is too little memory for this; smaller models and images "
+                f"(`width`, `max_gaussians`) need less ({type(error).__name__}: {error})"
             )
         case ModuleNotFoundError():
             return BackendError.exit_status, f"error: the package {error.name} is missing: see `keyss doctor`"

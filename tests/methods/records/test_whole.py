@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import zstandard
 
 from channels.codes.published import model_of
-from keyss.core import Camera, InputError, Scene, UsageError, View
+from keyss.core import Camera, Gaussians, InputError, Scene, UsageError, View
 from keyss.core.colour import OPPONENT
 from keyss.methods import Table, fitted, good_enough, pruned
 from keyss.methods.records import whole
@@ -62,9 +65,41 @@ def test_a_few_bytes_that_announce_many_gaussians_are_refused_before_they_are_un
     data = whole.encode(model_of(500))
     with pytest.raises(InputError, match="more than"):
         whole.decode((1 << 20).to_bytes(4, "little") + data[4:])
+    padding = (1 << 22) * b"\0\0\0"  # blocks that hold nothing, which channels compress to kilobytes
+    with pytest.raises(InputError, match=r"more than .* in 6,000 Gaussians hold"):
+        whole.decode((1 << 20).to_bytes(4, "little") + data[4:101] + padding + data[101:], 6000)
     block = bytes([0b011 | 0xF8, 0xFF, 0xFF, 7])  # 2 MiB of one byte
     with pytest.raises(InputError, match="damaged"):
         whole.decode((1 << 17).to_bytes(4, "little") + data[4 : -len(block)] + 1000 * block)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_hostile_payloads_take_little_memory(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    count = int(random.choice([1 << 16, (1 << 16) + 1, 1 << 20, 1 << 22, (1 << 32) - 1]))
+    head = bytearray(whole.encode(model_of(500))[:101])
+    head[:5] = count.to_bytes(4, "little") + bytes([int(random.integers(4))])
+    zeros = zstandard.ZstdCompressor(19).compress(bytes(70 * min(count, 1 << 22)))
+    padding = int(random.choice([0, 1 << 20, 3 << 22])) * b"\0"
+    tracemalloc.start()
+    with suppress(InputError):
+        whole.decode(bytes(head) + padding + zeros[9:], 6000)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < len(padding) + (200 << 20)
+
+
+def test_the_most_gaussians_that_a_small_model_may_announce_take_little_memory() -> None:
+    model = model_of(1, sh_degree=3)
+    most = Gaussians.cat([model] * (1 << 16))
+    data = whole.encode(most)
+    tracemalloc.start()
+    assert len(whole.decode(data, 100)) == 1 << 16
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 200 << 20
+    with pytest.raises(InputError, match="announces"):
+        whole.decode(whole.encode(Gaussians.cat([most, model])), 100)
 
 
 def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() -> None:

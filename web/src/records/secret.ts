@@ -21,7 +21,7 @@ export function secretOf(content: Content, stego: Gaussians): Secret | null {
   if (content.service === 'payload') {
     if (content.method === KEYSS) return decodeKeyss(content.data, stego);
     if (content.method !== WHOLE) return null;
-    const gaussians = decodeWhole(content.data);
+    const gaussians = decodeWhole(content.data, stego.count);
     return { gaussians, hidden: gaussians.count };
   }
   if (content.header.length < 4) throw damaged();

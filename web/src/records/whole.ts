@@ -3,22 +3,26 @@ import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { unpackedZstd } from '../core/unpacking.ts';
-import { holds } from '../files/coded.ts';
 import { Codec, type Layout, putColours } from './codec.ts';
 
-const MAX_GAUSSIANS = 1 << 22;
+const ALWAYS = 1 << 16; // Gaussians, whatever announces them
+const LEAST_BYTES = 2; // of each Gaussian in larger models
 const HEAD_BYTES = 9; // Gaussians (4), SH degree (1), step of harmonics (4)
 const PER_OCTAVE = 0.5 / Math.LN2; // half octaves of the step
 const FINER = 6; // half octaves by which a step is finer or coarser, at most
 const [FIRST_POSITION, AFTER_POSITIONS] = [3, 6]; // among the parts of a layout
 
-/** The model. Raises InputError for damage; above 2^18 Gaussians, each announced one must take at least a byte. */
-export function decodeWhole(data: Uint8Array): Gaussians {
+/**
+ * The model, read from a model of `carriers` Gaussians. Raises InputError for damage. Above 2^16 Gaussians, each takes
+ * at least 2 bytes of `data`, and there are no more than `carriers`.
+ */
+export function decodeWhole(data: Uint8Array, carriers: number): Gaussians {
   if (data.length < HEAD_BYTES) throw damaged();
   const view = viewOf(data);
   const [count, shDegree, step] = [view.getUint32(0, true), data[4], view.getFloat32(5, true)];
   const codec = Codec.unpack(data.subarray(HEAD_BYTES));
-  const possible = holds(data.length, count) && count <= MAX_GAUSSIANS && shDegree <= 3 && step > 0 && step < 1;
+  const largest = Math.max(ALWAYS, Math.min(Math.floor(data.length / LEAST_BYTES), carriers));
+  const possible = count > 0 && count <= largest && shDegree <= 3 && step > 0 && step < 1;
   if (!possible || codec.shDegree !== 0) throw damaged();
   const { layout } = codec;
   const own = layout.reduce((sum, [columns, bits]) => sum + columns * Math.ceil(bits / 8), 0);

@@ -46,7 +46,7 @@ def unpack(content: Content) -> CarriedSecret:
     """The Gaussians that are left. Raises InputError for damage."""
     if isinstance(content, Records):
         return decode(content)
-    gaussians = whole.decode(content.data)
+    gaussians = whole.decode(content.data, content.carriers)
     return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))
 
 

@@ -30,12 +30,13 @@ import zstandard
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.files.formats.common import check_count, in_morton_order
+from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.lines import Codes
 from keyss.methods.records.quantise import Bytes, Codec
 from keyss.methods.records.table import Table
 
-MAX_GAUSSIANS = 1 << 22
+_ALWAYS = 1 << 16  # Gaussians, whatever announces them
+_LEAST_BYTES = 2  # of each Gaussian in larger models
 USUAL_BITS, MAX_BITS = 110, 143  # of all but harmonics: about 48 and 60 dB
 _HEAD = struct.Struct("<IBf")
 _STEP, _HALVED = 0.06, 20  # of harmonics at the usual bits; with so many more bits it is half as large
@@ -79,20 +80,26 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     return _HEAD.pack(len(model), model.sh_degree, step) + codec.pack() + _compress(planes)
 
 
-def decode(data: bytes) -> Gaussians:
-    """The model of `encode`. Raises InputError for damage.
+def decode(data: bytes, carriers: int | None = None) -> Gaussians:
+    """The model of `encode`, read from a model of `carriers` Gaussians. Raises InputError for damage.
 
-    Memory is bounded by `data`: above 2^18 Gaussians, each announced one must take at least a byte.
+    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and there are no more than
+    `carriers`.
     """
     if len(data) < _HEAD.size:
         raise InputError("the hidden secret is damaged: it is too short")
     count, sh_degree, step = _HEAD.unpack_from(data)
     codec = Codec.unpack(data[_HEAD.size :])
-    if not (0 < count <= MAX_GAUSSIANS and sh_degree <= 3 and codec.table.sh_degree == 0 and 0 < step < 1):
+    if not (count > 0 and sh_degree <= 3 and codec.table.sh_degree == 0 and 0 < step < 1):
         raise InputError(
             f"the hidden secret is damaged: it announces {count:,} Gaussians of SH degree {sh_degree}"
         )
-    check_count(count, len(data))
+    largest = len(data) // _LEAST_BYTES
+    if count > max(_ALWAYS, largest if carriers is None else min(largest, carriers)):
+        held_by = f"{len(data):,} bytes" + ("" if carriers is None else f" in {carriers:,} Gaussians")
+        raise InputError(
+            f"the hidden secret is damaged: it announces {count:,} Gaussians, more than {held_by} hold"
+        )
     layout, harmonics = codec.table.layout, 3 * ((sh_degree + 1) ** 2 - 1)
     own = count * sum(columns * -(-bits // 8) for columns, bits in layout)
     planes = _decompress(data[_HEAD.size + Codec.packed_size(0) :], own + count * harmonics)
