@@ -208,7 +208,9 @@ def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[
     found = audit(made.out, [], only=["images", "speed"], controls=2)
     assert found.run.standard == standard
     assert found.images is not None
-    assert found.images.secrets[0].mean.psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
+    assert found.images.models[1].images.mean.psnr == pytest.approx(
+        made.result.metrics.secrets[0].psnr, abs=0.1
+    )
     assert found.speed is not None
     ours = [each for each in found.speed.readers if each.file == "secret 1"]
     assert ours
