@@ -60,13 +60,14 @@ from keyss.methods import (  # noqa: E402  # noqa: E402
     DecoderShape,
     HiddenFile,
     HiddenSecret,
+    RowSecret,
     choose_anchors,
 )
 from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import METHOD  # noqa: E402
 from keyss.methods.records.opening import unpack  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
-from methods.keyss.hiding import some_secret  # noqa: E402
+from methods.keyss.hiding import some_secret, written  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
@@ -160,6 +161,7 @@ def main() -> None:
     write_counted()
     write_whole()
     write_keyss()
+    write_carriers()
 
 
 def write_published() -> None:
@@ -275,6 +277,17 @@ def write_keyss() -> None:
         for name, payload in payloads
     ]
     (FOLDER / "keyss.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def write_carriers() -> None:
+    """Rows of a secret of the design `carriers`, some without blue harmonics, and what they reveal."""
+    stego, (secret,), _ = written(count=50, rows=60)
+    write_model(FOLDER / "carriers.ply", stego)
+    payload = secret.payload().data
+    model = RowSecret.of(Payload("keyss", payload)).reveal(stego)
+    rows = {each.name: getattr(model[::9], each.name).flatten().tolist() for each in fields(Gaussians)}
+    found = {"payload": payload.hex(), "count": len(model), "rows": rows}
+    (FOLDER / "carriers.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
 def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:

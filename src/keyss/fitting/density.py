@@ -85,6 +85,14 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         """The info of a step's renders of `count` Gaussians."""
         return combine_densification(renders, count)
 
+    def by_scene(self, renders: Sequence[Rendered], count: int, scenes: int, *, dim: int) -> dict[str, Any]:
+        """Statistics of each scene's own renders, which come in turns, stacked along `dim`."""
+        found: list[dict[str, Any]] = []
+        for scene in range(scenes):
+            found.append(dict.fromkeys(_STATISTICS))
+            self._update_state({}, found[-1], combine_densification(renders[scene::scenes], count))
+        return {name: torch.stack([each[name] for each in found], dim) for name in _STATISTICS}
+
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:

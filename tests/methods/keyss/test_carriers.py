@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,58 +10,25 @@ import numpy as np
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
 from fitting.test_plain import InterruptAt
-from keyss import Gaussians, KeyssOptions, WrongKeyError
+from keyss import Gaussians, KeyssOptions, WrongKeyError, read_model
 from keyss.channels import LOW_BITS, Payload
 from keyss.core import InputError, Interrupted, UsageError
-from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
 from keyss.measure import search_embeddings
 from keyss.methods import RowSecret, registry
-from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, encrypt_rows, row_kinds, secret_tables
-from keyss.methods.records.quantise import Codec
+from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, row_kinds, secret_tables
 from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
-from methods.keyss.hiding import FIT, KEYS
+from methods.keyss.hiding import EMBEDDINGS, FIT, KEYS, cover_with_zeros, written
 from tiny_scenes import random_gaussians
 
 OPTIONS = KeyssOptions(design="carriers", fit=replace(FIT, iterations=200))
-EMBEDDINGS = random_embeddings(3, torch.Generator().manual_seed(1234))
 
 
 @pytest.fixture(scope="module")
 def hidden() -> Hidden:
     scenes, models = three_scenes()
     return hide_scenes(scenes, KEYS, OPTIONS, plains=models)
-
-
-def _cover() -> Gaussians:
-    """A tenth of the rows without blue harmonics, and a tenth without any."""
-    cover = trained_like(1000)
-    sh = cover.sh.clone()
-    sh[::10, 1:, 2] = 0
-    sh[5::10, 1:] = 0
-    return replace(cover, sh=sh)
-
-
-def _written(secrets: int = 1, count: int = 850) -> tuple[Gaussians, list[RowSecret], list[Gaussians]]:
-    """Models in the rows of a larger one."""
-    cover = _cover()
-    tables = secret_tables(3, secrets)
-    models = [trained_like(count, seed=1 + i).with_sh_degree(tables[0].sh_degree) for i in range(secrets)]
-    made = [
-        RowSecret(
-            EMBEDDINGS[i],
-            tuple(Codec.fit(model.with_sh_degree(table.sh_degree), table) for table in tables),
-            Similarity.identity(),
-            i,
-            secrets,
-            count,
-            1.0,
-        )
-        for i, model in enumerate(models)
-    ]
-    return encrypt_rows(cover, made, models, bytes(32)), made, models
 
 
 def test_each_key_opens_its_secret_and_another_key_nothing(hidden: Hidden) -> None:
@@ -78,7 +46,7 @@ def test_an_embedding_of_no_key_shows_the_very_cover(hidden: Hidden) -> None:
 
 
 def test_rows_open_in_any_order_and_after_pruning_and_low_bits() -> None:
-    stego, (secret,), _ = _written()
+    stego, (secret,), _ = written()
     whole = secret.decode(stego, secret.embedding)
     assert len(whole) == secret.count
     embedded = LOW_BITS.prepare(stego).embed([("key", Payload("keyss", b"else"))], entropy=bytes(32))
@@ -92,8 +60,8 @@ def test_rows_open_in_any_order_and_after_pruning_and_low_bits() -> None:
 
 @pytest.mark.parametrize(("secrets", "count"), [(1, 850), (2, 750)])
 def test_every_secret_comes_back_as_coded(secrets: int, count: int) -> None:
-    stego, made, models = _written(secrets, count)
-    first = len(carrying(_cover())[0].rows)
+    stego, made, models = written(secrets, count)
+    first = len(carrying(cover_with_zeros())[0].rows)
     for index, secret in enumerate(made):
         parts = models[index][:first], models[index][first:]
         coded = [
@@ -108,7 +76,7 @@ def test_every_secret_comes_back_as_coded(secrets: int, count: int) -> None:
 
 
 def test_the_cover_keeps_signs_exponents_leading_bits_and_zeros() -> None:
-    cover, (stego, *_) = _cover(), _written()
+    cover, (stego, *_) = cover_with_zeros(), written()
     before, after = (model.sh[:, 1:].numpy().view(np.uint32) >> 21 for model in (cover, stego))
     assert np.array_equal(before, after)
     assert torch.equal(cover.sh == 0, stego.sh == 0)
@@ -116,41 +84,41 @@ def test_the_cover_keeps_signs_exponents_leading_bits_and_zeros() -> None:
 
 
 def test_what_rows_say_is_uniform() -> None:
-    stego, *_ = _written()
+    stego, *_ = written()
     said = row_kinds(stego)[0].read(stego)
     counts = np.bincount(said.ravel(), minlength=256)
     expected = counts.sum() / 256
     assert ((counts - expected) ** 2 / expected).sum() / 255 == pytest.approx(1, abs=0.4)
 
 
-def test_carriers_are_as_uneven_as_those_of_the_cover() -> None:
+def test_carriers_are_as_uneven_as_those_of_thecover_with_zeros() -> None:
     """Harmonics of `trained_like` are normal: larger ones are rarer, also within a quarter of an octave."""
 
     def unevenness(model: Gaussians) -> float:
         words = model.sh[:, 1:].contiguous().numpy().view(np.uint32)
         return float((words >> 20 & 1)[np.abs(model.sh[:, 1:].numpy()) > 0].mean() - 0.5)
 
-    cover, (stego, *_) = _cover(), _written()
+    cover, (stego, *_) = cover_with_zeros(), written()
     assert unevenness(cover) < -0.01
     assert unevenness(stego) == pytest.approx(unevenness(cover), abs=0.01)
 
 
 def test_the_decoder_without_the_key_shows_nothing_to_a_search() -> None:
     """The white-box attack has the payload but for the embedding, and no gradient."""
-    stego, (secret,), _ = _written()
+    stego, (secret,), _ = written()
     for found in search_embeddings(secret.decode, stego, restarts=2, steps=20):
         assert secret.decode(stego, found) is stego
 
 
 def test_nearly_the_key_is_as_wrong_as_any() -> None:
-    stego, (secret,), _ = _written()
+    stego, (secret,), _ = written()
     near = secret.embedding.clone()
     near[0] = torch.nextafter(near[0], torch.tensor(2.0))
     assert secret.decode(stego, near) is stego
 
 
 def test_the_same_secret_gives_the_same_bytes_which_are_few() -> None:
-    _, (secret,), _ = _written()
+    _, (secret,), _ = written()
     packed = secret.payload()
     assert len(packed.data) <= PAYLOAD_BYTES
     opened = registry._unpacked(packed)
@@ -163,13 +131,13 @@ def test_the_same_secret_gives_the_same_bytes_which_are_few() -> None:
     "change", [{"secret": 1}, {"count": 0}, {"visibility": 0.0}, {"embedding": EMBEDDINGS}]
 )
 def test_damaged_payloads_are_input_errors(change: dict[str, object]) -> None:
-    _, (secret,), _ = _written()
+    _, (secret,), _ = written()
     with pytest.raises(InputError):
         RowSecret.of(replace(secret, **change).payload())  # type: ignore[arg-type]
 
 
 def test_a_model_that_was_moved_is_refused() -> None:
-    stego, (secret,), _ = _written()
+    stego, (secret,), _ = written()
     for other in (
         replace(stego, means=stego.means + 1e-3),
         random_gaussians(seed=9),
@@ -205,3 +173,21 @@ def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path) -> N
             )
     resumed = hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2], checkpoints=tmp_path, resume=True)
     assert same(resumed.stego, whole.stego)
+
+
+def test_a_cover_without_harmonics_is_refused() -> None:
+    scenes, models = three_scenes()
+    options = replace(OPTIONS, fit=replace(FIT, iterations=1))
+    with pytest.raises(InputError, match="train longer"):
+        hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2])
+
+
+def test_files_of_this_version_stay_readable() -> None:
+    folder = Path(__file__).parents[2] / "vectors"
+    expected = json.loads((folder / "carriers.json").read_text())
+    stego = read_model(folder / "carriers.ply")
+    revealed = RowSecret.of(Payload("keyss", bytes.fromhex(expected["payload"]))).reveal(stego)
+    assert len(revealed) == expected["count"]
+    for name, values in expected["rows"].items():
+        found = getattr(revealed[::9], name).flatten().tolist()
+        assert found == pytest.approx(values, rel=1e-5, abs=1e-5)

@@ -14,11 +14,12 @@ from keyss import FitConfig, Gaussians, KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
 from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.core.similarity import Similarity
+from keyss.fitting import make_optimizers, to_parameters
 from keyss.fitting.density import combine_densification
 from keyss.keys import random_embeddings
 from keyss.methods import CombinedPoses, PlacedScene, Source, registry
 from keyss.methods.keyss import method
-from keyss.methods.keyss.designs.network import possibly_seen
+from keyss.methods.keyss.designs.network import EvenGrowth, possibly_seen
 from keyss.rendering import render, render_with_meta
 from keyss.rendering.orbit import orbit
 from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, same, three_scenes
@@ -215,6 +216,20 @@ def test_decoders_are_appended_rather_than_lost(monkeypatch: pytest.MonkeyPatch)
     assert is_appended(hidden.stego).any()
     revealed = registry.open_model(hidden.stego, KEYS[0]).reveal(hidden.stego)
     assert revealed.means.isfinite().all()
+
+
+def test_free_places_go_to_the_scene_that_has_fewer_gaussians() -> None:
+    """Although the gradients of the other scene are larger."""
+    model = replace(random_gaussians(60), log_scales=torch.full((60, 3), -9.0))
+    few = torch.arange(60) < 10
+    opacities = torch.stack([(~few).float(), few.float()], dim=1)
+    growth = EvenGrowth(FitConfig(max_gaussians=100), lambda: opacities, 2)
+    parameters = to_parameters(model, torch.device("cpu"))
+    state = growth.initialize_state(1.0)
+    state |= {"grad2d": torch.stack([1.0 * ~few, 0.5 * few], dim=1), "count": torch.ones(60, 2)}
+    growth._grow_gs(parameters, make_optimizers(parameters, FitConfig(), 1.0), state, 1)
+    assert torch.equal(parameters["means"][60:], model.means[:10])
+    assert state["grad2d"].shape == (70, 2)
 
 
 @pytest.mark.parametrize("slack", [0.0, 0.5])

@@ -65,6 +65,7 @@ class KeyssOptions(JointOptions):
     ssim_weight: float | None = None
     at_cap: Literal["wait", "freeze"] | None = None
     prune_by: Literal["all", "cover"] | None = None
+    growth: Literal["largest", "even"] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

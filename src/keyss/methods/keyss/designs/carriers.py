@@ -18,10 +18,11 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
+from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Rendered, combine_densification
+from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import (
     Optimizers,
@@ -144,6 +145,11 @@ class CarriersTraining(DesignTraining):
         cover = without_faint(self.scene_gaussians(0).detach().to("cpu"), least)
         cover = cover[cover.opacity_logits.argsort(descending=True, stable=True)]
         counts = [len(kind.rows) for kind in carrying(cover)][: len(self.tables)]
+        if not counts[0]:
+            raise InputError(
+                "no Gaussian of the cover has harmonics to hide one of a secret: train longer, or use "
+                '`method="carry"`'
+            )
         models, secrets = [], []
         for index, (placed, embedding) in enumerate(zip(self.scenes[1:], self.embeddings, strict=True)):
             model = without_faint(self.scene_gaussians(index + 1).detach().to("cpu"), least)
@@ -205,13 +211,7 @@ class DeadPlaces(CappedStrategy):
         self.extents, self.generator = extents, generator
 
     def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
-        """Statistics [S, N] of every scene's own renders, which come in turns."""
-        found: list[dict[str, Any]] = []
-        for scene in range(len(self.extents)):
-            found.append({"grad2d": None, "count": None})
-            own = combine_densification(renders[scene :: len(self.extents)], count)
-            self._update_state({}, found[-1], own)
-        return {name: torch.stack([each[name] for each in found]) for name in found[0]}
+        return self.by_scene(renders, count, len(self.extents), dim=0)
 
     @torch.no_grad()
     def step_post_backward(

@@ -6,9 +6,9 @@ Conditioning: a bias of the network's first layer, and a loss of wrong keys; or 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,9 +17,10 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
-from keyss.fitting.density import Rendered
+from keyss.fitting.config import FitConfig
+from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.losses import photometric_loss
-from keyss.fitting.parameters import to_gaussians
+from keyss.fitting.parameters import Optimizers, Parameters, to_gaussians
 from keyss.keys.derivation import random_embeddings
 from keyss.methods.base import check_above_zero
 from keyss.methods.joint import Picture, Pose
@@ -29,6 +30,7 @@ from keyss.methods.keyss.designs.base import Design, DesignTraining
 from keyss.methods.keyss.secret import ANCHORS, HiddenSecret, choose_anchors
 from keyss.methods.poses import PlacedScene
 
+_VISIBLE = 0.05  # opacity from which a Gaussian counts for a scene
 _SLACK = 0.02  # scene extents by which a decoder may move a Gaussian
 
 
@@ -51,6 +53,8 @@ class NetworkDesign(Design):
     # At the cap, Gaussians that ask for growth wait until others are pruned; "freeze": none are.
     at_cap: Literal["wait", "freeze"] = "wait"
     prune_by: Literal["all", "cover"] = "all"  # scenes in which an opaque Gaussian is spared
+    # Who gets free places: the largest gradients of all scenes, or the scenes with the fewest Gaussians.
+    growth: Literal["largest", "even"] = "even"
 
     def __post_init__(self) -> None:
         check_above_zero(self, "decoder_rate")
@@ -148,13 +152,24 @@ class NetworkTraining(DesignTraining):
         loss = photometric_loss(picture.image, self.poses.target(0, *pose), fit.ssim_weight)
         return settings.incorrect_weight * settings.incorrect_every * len(self.decoders) * loss
 
+    def density_control(self, freeze: bool) -> CappedStrategy:
+        even = self.settings.growth == "even" and len(self.growing) == len(self.scenes)
+        if not even:
+            return super().density_control(freeze)
+        return EvenGrowth(self.options.fit, self.opacities, len(self.scenes))
+
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:
-        if self.settings.prune_by == "cover":
-            return super().opacity_for_pruning()
+        return (
+            super().opacity_for_pruning() if self.settings.prune_by == "cover" else self.opacities().amax(1)
+        )
+
+    @torch.no_grad()
+    def opacities(self) -> Tensor:
+        """[N, S] in every scene."""
         cover = self.gaussians()
         decoded = [each(cover, key) for each, key in zip(self.decoders, self.embeddings, strict=True)]
-        return torch.stack([model.opacities for model in (cover, *decoded)]).amax(0)
+        return torch.stack([model.opacities for model in (cover, *decoded)], dim=1)
 
     def gaussians(self) -> Gaussians:
         """The model as it would be published."""
@@ -169,6 +184,40 @@ class NetworkTraining(DesignTraining):
             drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
             secrets.append(replace(secret, count=int(drawn.sum())))
         return stego, secrets
+
+
+class EvenGrowth(CappedStrategy):
+    """Density control that gives free places to the scenes that have fewer Gaussians than their share.
+
+    By the largest gradients, a scene with more detail takes nearly all of them.
+    """
+
+    def __init__(self, fit: FitConfig, opacities: Callable[[], Tensor], scenes: int) -> None:
+        super().__init__(fit, lambda: opacities().amax(1))
+        self.opacities, self.scenes = opacities, scenes
+
+    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+        return self.by_scene(renders, count, self.scenes, dim=1)
+
+    @torch.no_grad()
+    def _grow_gs(
+        self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int
+    ) -> tuple[int, int]:
+        gradients = state["grad2d"] / state["count"].clamp_min(1)  # [N, S]
+        visible = (self.opacities() > _VISIBLE).sum(0)
+        missing = (self.max_gaussians / self.scenes - visible).clamp_min(0)
+        room = max(0, self.max_gaussians - len(gradients))
+        shares = (room * missing / missing.sum().clamp_min(1e-9)).long().tolist()
+        chosen = torch.zeros(len(gradients), dtype=torch.bool, device=gradients.device)
+        for scene, share in enumerate(shares):
+            own = gradients[:, scene].masked_fill(chosen, 0)
+            best = own.topk(min(share, len(own))).indices
+            chosen[best[own[best] > self.grow_grad2d]] = True
+        state["grad2d"], state["count"] = gradients.amax(1) * chosen, torch.ones_like(gradients[:, 0])
+        grown = super()._grow_gs(params, optimizers, state, step)
+        state["grad2d"] = state["grad2d"][:, None].expand(-1, self.scenes).clone()
+        state["count"] = state["count"][:, None].expand(-1, self.scenes).clone()
+        return grown
 
 
 @torch.no_grad()

@@ -14,4 +14,5 @@ DESIGN = NetworkDesign(
     incorrect_weight=0.01,
     incorrect_every=1,
     ssim_weight=0.5,
+    growth="largest",
 )
