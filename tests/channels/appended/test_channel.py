@@ -14,6 +14,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from keyss.channels import APPENDED, AppendedReader, Payload
+from keyss.channels.appended import pilots
+from keyss.channels.appended.lattice import WORD_BITS, Cube, to_gaussians
 from keyss.core import (
     DRAWN_OPACITY,
     Gaussians,
@@ -92,6 +94,19 @@ def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
 
 
 @pytest.mark.argon2
+@pytest.mark.parametrize("moved", [False, True], ids=["random", "pilots"])
+def test_many_faint_gaussians_that_do_not_agree_cost_little(moved: bool) -> None:
+    random = np.random.default_rng(0)
+    words = random.integers(0, 2, (100_000, WORD_BITS)).astype(np.uint8)
+    if moved:
+        words = pilots.write(bytes(16), 100_000, random)
+    faint = to_gaussians(words, Cube(np.zeros(3), 1.0), 0)
+    faint = replace(faint, means=torch.rand(len(faint), 3))
+    began = time.process_time()
+    assert AppendedReader.of(faint) is None
+    assert time.process_time() - began < 8
+
+
 def test_a_wrong_key_opens_nothing_in_about_the_same_time(cover: Gaussians) -> None:
     reader = AppendedReader.of(embedded(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
     assert reader is not None

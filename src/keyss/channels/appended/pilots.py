@@ -37,7 +37,10 @@ ONE_IN = 64  # words is a pilot by chance
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2
 _RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # beside the part of the salt and its number
 _TRIES, _AGREE = 300, 12  # of three pilots; that have to agree
+_SAMPLE = 1024  # pilots that are tried first, so that many that disagree cost no more than few
 _NEAR = 1.5 / 2**POSITION_BITS  # in the own frame
+
+Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -94,28 +97,32 @@ def read(invariants: Words, means: Doubles) -> Found | None:
     points = places[:, None] >> shifts & np.uint64(2**POSITION_BITS - 1)
     expected = (points.astype(np.float64) + 0.5) / 2**POSITION_BITS
     there = means[own]
-    best = np.zeros(len(own), bool)
+    some = np.arange(min(len(own), _SAMPLE)) * len(own) // min(len(own), _SAMPLE)
+    best = some[:0]
     for _ in range(_TRIES):
-        three = random.choice(len(own), 3, replace=False)
-        agreeing = _agreeing(there, expected, three)
-        if agreeing.sum() > best.sum():
+        three = random.choice(some, 3, replace=False)
+        agreeing = some[_agreeing(there, expected, three, some)]
+        if len(agreeing) > len(best):
             best = agreeing
-        if best.sum() > max(_AGREE, 0.5 * len(own)):
+        if len(best) > max(_AGREE, 0.5 * len(some)):
             break
     for _ in range(3):
-        if best.sum() < _AGREE:
+        if len(best) < _AGREE:
             return None
-        best = _agreeing(there, expected, np.flatnonzero(best))
-    if best.sum() < _AGREE:
+        best = np.flatnonzero(_agreeing(there, expected, best))
+    if len(best) < _AGREE:
         return None
     moved = _similarity(there[best], expected[best])
     salt = _salt(invariants[own[best]])
-    return None if moved is None or salt is None else Found(moved, int(best.sum()), salt)
+    return None if moved is None or salt is None else Found(moved, len(best), salt)
 
 
-def _agreeing(there: Doubles, expected: Doubles, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """[P] which pilots come to lie where they should by the similarity of the chosen ones."""
+def _agreeing(
+    there: Doubles, expected: Doubles, chosen: Rows, among: Rows | slice = slice(None)
+) -> npt.NDArray[np.bool_]:
+    """Which pilots `among` [P] come to lie where they should by the similarity of the chosen ones."""
     moved = _similarity(there[chosen], expected[chosen])
+    there, expected = there[among], expected[among]
     if moved is None:
         return np.zeros(len(there), bool)
     off = moved.apply_points(torch.from_numpy(there)).numpy() - expected

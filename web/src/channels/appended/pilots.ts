@@ -12,6 +12,7 @@ const [PUBLIC_LOW, PUBLIC_HIGH] = [0x73617070, 0x6b657973]; // what tells this h
 const PARTS = SALT_BYTES / 2;
 const RANDOM_BITS = 2; // of a pilot's colours, beside the part of the salt and its number
 const [TRIES, AGREE] = [300, 12]; // of three pilots; that have to agree
+const SAMPLE = 1024; // pilots that are tried first
 const NEAR = 1.5 / 2 ** POSITION_BITS; // in the own frame
 
 /** What pilots tell. */
@@ -39,24 +40,29 @@ export function readPilots(invariants: Words, means: Float32Array): Found | null
     there.set(means.subarray(3 * row, 3 * row + 3), 3 * to);
     expected.set(placeOf(invariants, row), 3 * to);
   });
-  const draw = drawing(own.length);
+  const sample = Math.min(own.length, SAMPLE);
+  const some = Array.from({ length: sample }, (_, at) => Math.floor((at * own.length) / sample));
+  const draw = drawing(sample);
   let best: number[] = [];
-  for (let attempt = 0; attempt < TRIES && best.length <= Math.max(AGREE, own.length / 2); attempt++) {
-    const near = agreeing(there, expected, [draw(), draw(), draw()]);
+  for (let attempt = 0; attempt < TRIES && best.length <= Math.max(AGREE, sample / 2); attempt++) {
+    const near = agreeing(there, expected, [some[draw()], some[draw()], some[draw()]], some);
     if (near.length > best.length) best = near;
   }
-  for (let round = 0; round < 3 && best.length >= AGREE; round++) best = agreeing(there, expected, best);
+  for (let round = 0; round < 3 && best.length >= AGREE; round++) best = agreeing(there, expected, best, own.keys());
   if (best.length < AGREE) return null;
   const toOwn = fittedSimilarity(there, expected, best);
   const salt = saltOf(invariants, best.map((at) => own[at]));
   return toOwn && salt && { toOwn, agreeing: best.length, salt };
 }
 
-/** Which pilots come to lie where they should by the similarity of the chosen ones. */
-function agreeing(there: Float64Array, expected: Float64Array, chosen: number[]): number[] {
+/** Which pilots `among` all come to lie where they should by the similarity of the chosen ones. */
+function agreeing(
+  there: Float64Array, expected: Float64Array, chosen: number[], among: Iterable<number>,
+): number[] {
   const found: number[] = [];
   const similarity = fittedSimilarity(there, expected, chosen);
-  for (let at = 0; similarity && at < there.length / 3; at++) {
+  if (!similarity) return found;
+  for (const at of among) {
     const place = movedPoint(similarity, there.subarray(3 * at, 3 * at + 3));
     if (place.every((each, axis) => Math.abs(each - expected[3 * at + axis]) < NEAR)) found.push(at);
   }
