@@ -1,12 +1,12 @@
 """What the colours of a model carry, what that costs, and what of it survives.
 
-python benchmarks/colours.py MODEL.ply ... [--gaussians N] [--payloads P] [--changes]
+python benchmarks/colours.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
                                 [--only FORMAT] [--size BYTES]
 python benchmarks/colours.py MODEL.ply ... --payloads N --log FILE [--gaussians N] [--foreign-each M]
 python benchmarks/colours.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
 python benchmarks/colours.py MODEL.ply --speed [--gaussians N]
 
-For each model: net bits per Gaussian and the cost of a full model, and how many of P payloads,
+For each model and strength: net bits per Gaussian and the cost of a full model, and how many of P payloads,
 each with a new key and new entropy, do not come back from each format, alone and with a quarter of the
 Gaussians removed at random on top. With --changes also other changes, at full capacity and at a fifth of it.
 Argon2id is cheap, which has nothing to do with what is measured, but with --speed.
@@ -16,7 +16,7 @@ and each M-th through other people's programs as well: one line of JSON for each
 the file already is not done again.
 
 With --pairs nothing is measured: each model, and each with a payload of so much of its capacity, is written
-as it comes back from each format, and `FOLDER/FORMAT-SHARE.txt` names them for
+as it comes back from each format, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` names them for
 `xargs python benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200
 bytes and of reading with a right key and a wrong one, Argon2id included. `--gaussians` draws so many of each
 model, and with --speed more than it has.
@@ -40,7 +40,7 @@ from pathlib import Path
 
 from keyss import measure
 from colours_payloads import run_payloads
-from keyss.channels import COLOURS, ColoursCover, Payload
+from keyss.channels import Colours, ColoursCover, Payload
 from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -67,6 +67,7 @@ def main() -> None:
     parser.add_argument("--payloads", type=int, default=5)
     parser.add_argument("--log", type=Path, metavar="FILE")
     parser.add_argument("--foreign-each", type=int, default=10)
+    parser.add_argument("--strengths", type=float, nargs="+", default=[45.0])
     parser.add_argument("--seed", type=int, default=0, help="of keys, payloads and what is removed")
     parser.add_argument("--size", type=int, help="bytes of a payload, instead of all that a model holds")
     parser.add_argument("--changes", action="store_true")
@@ -78,7 +79,8 @@ def main() -> None:
     if not asked.speed:
         cheap_keys.pytest_sessionstart()
     if asked.pairs:
-        _write_pairs(asked.models, asked.pairs, asked.shares, asked.only)
+        for strength in asked.strengths:
+            _write_pairs(asked.models, asked.pairs, asked.shares, strength, asked.only)
         return
     if asked.speed:
         _measure_speed(asked.models, asked.gaussians)
@@ -88,24 +90,26 @@ def main() -> None:
             [(path.stem, partial(_of_file, path, asked.gaussians)) for path in asked.models],
             asked.payloads,
             asked.log,
+            strength=asked.strengths[0],
             foreign={what: change for what, change in _BY_TOOL.items() if asked.only in what},
             each=asked.foreign_each,
             embed=_embedded,
             opens=_opens,
         )
         return
-    print("| model | Gaussians | cost, dB | bytes | bits per Gaussian | what | failures |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for path in asked.models:
         model = _of_file(path, asked.gaussians)
-        prepared = COLOURS.prepare(model)
-        name = f"{path.stem} | {len(prepared.cover):,}"
-        formats = {what: change for what, change in FORMATS.items() if asked.only in what}
-        share = 1.0 if asked.size is None else asked.size / prepared.capacity
-        _measure(prepared, name, formats, asked.payloads, asked.seed, share, pruned=True)
-        if asked.changes:
-            _measure(prepared, name, OTHERS, asked.payloads, asked.seed)
-            _measure(prepared, name, OTHERS, asked.payloads, asked.seed, FIFTH)
+        for strength in asked.strengths:
+            prepared = Colours(strength).prepare(model)
+            name = f"{path.stem} | {len(prepared.cover):,} | {strength:.0f}"
+            formats = {what: change for what, change in FORMATS.items() if asked.only in what}
+            share = 1.0 if asked.size is None else asked.size / prepared.capacity
+            _measure(prepared, name, formats, asked.payloads, asked.seed, share, pruned=True)
+            if asked.changes:
+                _measure(prepared, name, OTHERS, asked.payloads, asked.seed)
+                _measure(prepared, name, OTHERS, asked.payloads, asked.seed, FIFTH)
 
 
 def _of_file(path: Path, gaussians: int | None) -> Gaussians:
@@ -155,11 +159,13 @@ def _measure(
             print(f"{start} | {row} | {failures[row]} of {payloads} |", flush=True)
 
 
-def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], only: str) -> None:
+def _write_pairs(
+    models: Sequence[Path], folder: Path, shares: Sequence[float], strength: float, only: str
+) -> None:
     wanted = {what: change for what, change in FORMATS.items() if only in what}
     lines: dict[str, list[str]] = {}
     for number, path in enumerate(models):
-        scene, prepared = path.stem.rsplit("-", 1)[0], COLOURS.prepare(read_model(path))
+        scene, prepared = path.stem.rsplit("-", 1)[0], Colours(strength).prepare(read_model(path))
         made = {"plain": prepared.cover}
         for share in shares:
             size = int(share * (prepared.capacity - PACKED))
@@ -170,7 +176,7 @@ def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], 
                 flush=True,
             )
         for what, change in wanted.items():
-            own = folder / re.sub("[^a-z]+", "-", what).strip("-")
+            own = folder / f"{strength:g}-{re.sub('[^a-z]+', '-', what).strip('-')}"
             own.mkdir(parents=True, exist_ok=True)
             for name, model in made.items():
                 write_model(own / f"{path.stem}-{name}.ply", change(model))
@@ -191,12 +197,14 @@ def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
         for step in ("embed", "right", "wrong"):
             start = time.monotonic()
             if step == "embed":
-                stego = COLOURS.prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
+                stego = (
+                    Colours().prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
+                )
             elif step == "right":
-                COLOURS.reader(stego).open("a key of some length")
+                Colours().reader(stego).open("a key of some length")
             else:
                 with suppress(WrongKeyError):
-                    COLOURS.reader(stego).open("another key of some length")
+                    Colours().reader(stego).open("another key of some length")
             seconds.append(f"{time.monotonic() - start:.1f} s")
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
@@ -217,7 +225,7 @@ def _drawn(model: Gaussians, count: int | None) -> Gaussians:
 
 def _opens(model: Gaussians, seed: int, data: bytes) -> bool:
     try:
-        return COLOURS.reader(model).open(_key(seed)) == Payload(METHOD, data)
+        return Colours().reader(model).open(_key(seed)) == Payload(METHOD, data)
     except (WrongKeyError, InputError):
         return False
 

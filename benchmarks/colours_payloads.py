@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss import measure
-from keyss.channels import COLOURS, ColoursCover
+from keyss.channels import Colours, ColoursCover
 from keyss.core.errors import BackendError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
@@ -36,6 +36,7 @@ def run_payloads(
     count: int,
     log: Path,
     *,
+    strength: float,
     foreign: Mapping[str, Change],
     each: int,
     embed: Embed,
@@ -47,7 +48,7 @@ def run_payloads(
     for number in range(len(done), count):
         name, read = covers[number % len(covers)]
         if name not in prepared:
-            prepared[name] = COLOURS.prepare(read())
+            prepared[name] = Colours(strength).prepare(read())
         cover, started = prepared[name], time.monotonic()
         data = np.random.default_rng(number).bytes(cover.capacity - 2)
         stego = embed(cover, number, data)

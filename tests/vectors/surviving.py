@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from channels.low_bits.trained_like import trained_like
-from keyss.channels import APPENDED, COLOURS, Payload
+from keyss.channels import APPENDED, COLOURS, Colours, Payload
 from keyss.core.errors import KeyssWarning
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -37,7 +37,9 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
     cover = lifelike(4000, 22).with_sh_degree(0)
     notes = [(keys[0], NOTE.payload()), (keys[1], Payload("file", b"\0" + b"?" * 9))]
     write_model(one, COLOURS.prepare(cover).embed(notes, entropy=bytes(32)))
-    write_model(moved, elsewhere(COLOURS.prepare(cover).embed(notes[:1], entropy=bytes(32))))
+    secret = Payload(METHOD, whole.encode(trained_like(12, 25, 0)))
+    small = Colours(strength=40).prepare(cover[:2300])
+    write_model(moved, elsewhere(small.embed([(keys[0], secret)], entropy=bytes(32))))
 
 
 def with_appended(keys: tuple[str, str]) -> Gaussians:

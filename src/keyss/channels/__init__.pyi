@@ -21,7 +21,7 @@ from .codes.channel import (
 )
 from .codes.fields import Field as Field
 from .codes.order import in_counted_order as in_counted_order
-from .colours.channel import COLOURS as COLOURS, ColoursCover as ColoursCover
+from .colours.channel import COLOURS as COLOURS, Colours as Colours, ColoursCover as ColoursCover
 from .colours.fountain import Fountain as Fountain
 from .colours.reading import ColoursReader as ColoursReader
 from .low_bits.bits import (

@@ -17,15 +17,16 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from channels.colours.made import PACKED, cover, embed, extract
-from keyss.channels import COLOURS, ColoursCover, ColoursReader, Fountain
+from keyss.channels import COLOURS, Colours, ColoursCover, ColoursReader, Fountain
 from keyss.channels.colours.carriers import CELL, Numbers
-from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, derived, read_header
+from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
 from keyss.channels.colours.salts import Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, Similarity, UsageError, WrongKeyError
-from keyss.measure import converters, half_floats, noise, opacity_pruning, random_pruning
+from keyss.measure import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
 
 ENTROPY = bytes(range(32))
+STRENGTH = 45.0
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,8 @@ def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: flo
 def test_a_header_made_up_by_chance_hides_no_other(
     prepared: ColoursCover, payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One attempt of 2^16 gives bits whose tag is right, and there are 18 for each key."""
-    made_up = (Header(bytes([number] * FILE_KEY_BYTES), bytes(2), 0, 63, 20, 0) for number in range(2))
+    """One attempt of 2^16 gives bits whose tag is right, and there are 27 for each key."""
+    made_up = (Header(bytes([number] * FILE_KEY_BYTES), bytes(2), 40, 1, 0, 63, 20, 0) for number in range(2))
     monkeypatch.setattr(
         "keyss.channels.colours.reading.read_header", lambda *args: next(made_up, None) or read_header(*args)
     )
@@ -100,6 +101,8 @@ def test_names_are_those_that_agree_best_with_the_header(
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
     with pytest.raises(UsageError, match=f"{prepared.capacity:,} bytes in all"):
         embed(prepared, [("a", payload + b"x")])
+    with pytest.raises(UsageError, match="`strength`"):
+        Colours(math.nan)
 
 
 def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, stego: Gaussians) -> None:
@@ -111,12 +114,22 @@ def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, st
     assert (model.sh != stego.sh).any(dim=2).any(dim=1).float().mean() > 0.5
 
 
-def test_changes_are_invisible_and_in_proportion(prepared: ColoursCover, stego: Gaussians) -> None:
-    assert psnr_between(prepared.cover, stego) > 48
+def test_it_costs_no_more_than_was_asked_for(prepared: ColoursCover, stego: Gaussians) -> None:
+    assert psnr_between(prepared.cover, stego) > STRENGTH
+    sizes = [Colours(strength).prepare(prepared.cover).capacity for strength in (40.0, 50.0, 60.0)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > 1.3 * sizes[2]
+
+
+def test_a_small_payload_changes_far_less_than_a_large_one(prepared: ColoursCover, stego: Gaussians) -> None:
     small = embed(prepared, [("a", bytes(20))], entropy=ENTROPY)
-    full, little = ((each.sh != prepared.cover.sh).any(dim=2).float().mean() for each in (stego, small))
-    assert little < 0.6 * full
+    full, little = ((each.sh[:, 0] - prepared.cover.sh[:, 0]).square().sum() for each in (stego, small))
+    assert little < full / 30
+    assert float((small.sh != prepared.cover.sh).any(dim=2).any(dim=1).float().mean()) < 0.6
     assert float((small.sh - prepared.cover.sh).abs().quantile(0.99)) < 0.0277
+    others = [embed(prepared, [("a", bytes(20))], entropy=bytes([seed] * 32)) for seed in range(4)]
+    psnr = np.mean([psnr_between(prepared.cover, each) for each in others])  # depends on where salts are
+    assert psnr > psnr_between(prepared.cover, stego) + 3
 
 
 def _spz(model: Gaussians) -> Gaussians:
@@ -153,7 +166,9 @@ def test_a_full_model_opens_after(name: str, stego: Gaussians, payload: bytes) -
 
 
 HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
-    "a random third": random_pruning(1 / 3),
+    "one half": cropping(1),
+    "another half": cropping(2),
+    "a random half": random_pruning(0.5),
     "without the faintest": opacity_pruning(0.25),
     "scaling before spz": lambda model: _spz(_turned(0.4)(model)),
     "another scene beside it": lambda model: Gaussians.cat([cover(2000, seed=5), model]),
@@ -180,7 +195,8 @@ def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes)
 
 
 def test_two_keys_open_their_own_and_a_third_nothing(prepared: ColoursCover) -> None:
-    data = {name: os.urandom(prepared.unseen_capacity // 4 - PACKED) for name in "ab"}
+    size = prepared.unseen_capacity // 3 - PACKED - 11  # which zlib adds to random bytes
+    data = {name: os.urandom(size) for name in "ab"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         stego = embed(prepared, [(name, data[name]) for name in "ab"], entropy=ENTROPY)
@@ -232,15 +248,13 @@ def test_entropy_decides_everything(prepared: ColoursCover) -> None:
 def test_a_lost_payload_is_told_from_one_that_was_never_there(
     stego: Gaussians, prepared: ColoursCover
 ) -> None:
-    """All colours but those of salts and headers are the cover's again."""
-    numbers = Numbers.of(stego)
-    index, salts = Index(numbers.carriers(round(numbers.size / CELL) * CELL)), Salts.of(numbers)
-    headers = [index.rows(secret) for secret in derived("a", salts.salts)[1]]
-    kept = numbers.rows[np.concatenate([salts.rows, *headers])]
-    sh = prepared.cover.sh.clone()
-    sh[kept] = stego.sh[kept]
-    with pytest.raises(InputError, match="the key is right, but too much"):
-        extract(replace(stego, sh=sh), "a")
+    """Headers survive a little more loss than payloads; now and then one is lost first all the same."""
+    told = 0
+    for seed in range(5):
+        with pytest.raises((InputError, WrongKeyError)) as error:
+            extract(random_pruning(0.45, seed)(stego), "a")
+        told += "the key is right, but too much" in str(error.value)
+    assert told >= 3
     with pytest.raises(WrongKeyError):
         extract(prepared.cover, "a")
 

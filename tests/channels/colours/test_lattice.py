@@ -17,6 +17,7 @@ from keyss.channels.colours.salts import SALTS, Salts, renewed
 from keyss.core import Gaussians
 
 SECRET = bytes(range(16))
+LEVEL = 44
 
 
 def _own(model: Gaussians | None = None):
@@ -24,31 +25,42 @@ def _own(model: Gaussians | None = None):
     return carriers[carriers.one_of_each()]
 
 
-def _written():
+def _written(level: int = LEVEL):
     own = _own()
-    code = np.random.default_rng(0).integers(0, 2, lattice.COLUMNS * len(own)).astype(np.uint8)
-    return own, code, replace(own, values=lattice.write(SECRET, own, code))
+    bits = _bits(own, level)
+    code = np.random.default_rng(0).integers(0, 2, lattice.COLUMNS * bits.sum()).astype(np.uint8)
+    return own, code, replace(own, values=lattice.write(SECRET, own, bits, code))
 
 
-def test_bits_come_back_after_noise_below_half_of_the_spacing() -> None:
-    own, code, written = _written()
+def _bits(carriers: Carriers, level: int = LEVEL):
+    return lattice.bit_counts(carriers, level, lattice.MAX_BITS)
+
+
+@pytest.mark.parametrize("level", [20, 44, 55])
+def test_bits_come_back_after_noise_below_half_of_the_spacing(level: int) -> None:
+    own, code, written = _written(level)
     noise = np.random.default_rng(1).uniform(-0.0131, 0.0131, own.values.shape)  # as .spz rounds
     noisy = replace(written, values=written.values + noise)
-    ratios = lattice.read(lattice.dithers(SECRET, own.names), noisy, np.zeros(len(own)))
+    dither = lattice.dithers(SECRET, own.names)
+    ratios = lattice.read(dither, noisy, _bits(own, level), np.zeros(len(own)))
     assert ((ratios < 0) == code).all()
 
 
 def test_what_is_added_is_uniform_noise_of_the_stated_variance() -> None:
     own, _, written = _written()
-    moved = (written.values - own.values) / lattice.STEP
+    bits = _bits(own)
+    steps = (lattice.SPACING * 2.0**bits)[bits > 0, None]
+    moved = (written.values - own.values)[bits > 0] / steps
     assert kstest(moved.ravel() + 0.5, "uniform").pvalue > 0.001
     assert abs(np.corrcoef(moved.T)[0, 1]) < 0.06
+    assert (written.values[bits == 0] == own.values[bits == 0]).all()
 
 
 def _fit(secret: bytes, carriers: Carriers) -> float:
     """How well values lie on the lattice: 0 by chance, 1 on its points."""
-    place = carriers.values / lattice.SPACING - 2 * lattice.dithers(secret, carriers.names)
-    return float(np.cos(2 * np.pi * place).mean())
+    bits = _bits(carriers)
+    place = carriers.values / lattice.SPACING - lattice.dithers(secret, carriers.names) * 2.0 ** bits[:, None]
+    return float(np.cos(2 * np.pi * place[bits > 0]).mean())
 
 
 def test_without_the_secret_nothing_lies_on_a_lattice() -> None:
@@ -57,6 +69,16 @@ def test_without_the_secret_nothing_lies_on_a_lattice() -> None:
     assert abs(_fit(bytes(16), written)) < 4 / math.sqrt(len(written))
     place = written.values.ravel() / lattice.SPACING % 1
     assert kstest(place, "uniform").pvalue > 0.001
+
+
+def test_a_visible_gaussian_carries_less() -> None:
+    own = _own()
+    bits = _bits(own)
+    assert bits.max() == lattice.MAX_BITS
+    order = np.argsort(own.impact)
+    assert (np.diff(bits[order]) <= 0).all()
+    totals = [int(_bits(own, level).sum()) for level in range(lattice.LEVELS)]
+    assert totals == sorted(totals)
 
 
 def test_names_survive_the_rounding_of_spz() -> None:

@@ -1,4 +1,8 @@
-"""How much a model holds, and which carriers a payload gets: as few as it needs.
+"""How much a model holds, and where a payload goes: it should show and cost as little as possible.
+
+The variance that writing adds gives a payload away. It is least for each byte with one bit in each number
+(depth 1). So a payload gets a share of the carriers at that depth, as large as it needs; one that needs more
+gets all carriers, and the least depth and level that hold it.
 
 A payload that is small enough is written only where that leaves the model as likely as it was (`likeness`).
 """
@@ -6,24 +10,28 @@ A payload that is small enough is written only where that leaves the model as li
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from keyss.channels.colours.carriers import CELL, Carriers, Doubles, Numbers
-from keyss.channels.colours.header import SHARES, UNNOTICED, bucket_bytes, header_share
-from keyss.channels.colours.lattice import COLUMNS, SPACING
+from keyss.channels.colours.header import SHARES, UNNOTICED, Kind, bucket_bytes
+from keyss.channels.colours.lattice import COLUMNS, LEVELS, MAX_BITS, SPACING, bit_counts
 from keyss.channels.colours.likeness import Likeness
 from keyss.channels.colours.quiet import Quiet
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
+from keyss.rendering.difference import psnr_between
 
 _RATE = 0.42  # data bits for each bit of information that is expected to be read
 _GARBAGE = 0.02  # share of carriers whose name has changed although it seemed safe
 _COMFORTABLE = 0.8  # of the capacity of a share: the less, the more may be lost
+_ROBUST = 0.5  # the same of a payload that shows anyway
+SPREAD = 0.5  # dB by which writing may cost more than `Capacity.cost`
 _INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compress
 
 
@@ -31,8 +39,10 @@ _INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compre
 class Layout:
     """Where payloads go: each gets so many SHARES of the carriers."""
 
+    level: int  # see `bit_counts`
+    depth: int
     shares: tuple[int, ...]
-    likely: bool  # True if numbers keep their values where others would be less likely
+    likely: bool = False  # True if numbers keep their values where others would be less likely
 
 
 @dataclass(frozen=True)
@@ -41,31 +51,79 @@ class Capacity:
 
     model: Gaussians
     numbers: Numbers
+    strength: float  # dB PSNR that views keep
+    measured: dict[tuple[int, int], float] = field(default_factory=dict, compare=False)  # see `cost`
 
-    def bytes(self, *, likely: bool = False) -> int:
-        """The largest packed payload; 0 if none fits.
+    def bytes(self, depth: int, *, likely: bool = False) -> int:
+        """The largest packed payload with up to `depth` bits in a number; 0 if none fits.
 
-        `likely`: only where a new value leaves a number as likely as it was.
+        `likely`: only where a new value leaves a number as likely as it was, at depth 1.
         """
-        room = self._room(likely) if len(self.own) else 0.0
+        room = self._room(self._level(depth), depth, likely) if len(self.own) else 0.0
         largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 
     def layout(self, sizes: Sequence[int]) -> Layout | None:
         """For encrypted payloads of these sizes in bytes; None where they do not fit."""
-        buckets = [bucket_bytes(bucket_of(size)) for size in sizes]
+        level = self._level(1)
         for likely in (True, False):
             for comfort in (_COMFORTABLE, 1.0):
-                room = max(comfort * self._room(likely), 1e-3)
-                shares = tuple(max(1, math.ceil(SHARES * min(1e6, size / room))) for size in buckets)
+                shares = self._shares(sizes, level, 1, comfort, likely)
                 if sum(shares) <= SHARES:
-                    return Layout(shares, likely)
-        return None
+                    return Layout(level, 1, shares, likely)
+        for comfort in (_ROBUST, 1.0):
+            for depth in range(2, MAX_BITS + 1):
+                level = self._least_level(sizes, depth, comfort)
+                shares = self._shares(sizes, level, depth, comfort)
+                if sum(shares) <= SHARES and self.cost(level, depth) >= self.strength + SPREAD:
+                    return Layout(level, depth, _stretched(shares))
+        level = self._level(MAX_BITS)
+        shares = self._shares(sizes, level, MAX_BITS, 1.0)
+        return Layout(level, MAX_BITS, _stretched(shares)) if sum(shares) <= SHARES else None
 
-    def _room(self, likely: bool) -> float:
+    def cost(self, level: int, depth: int) -> float:
+        """PSNR in dB that views keep beside a payload in all carriers and its headers."""
+        if (level, depth) not in self.measured:
+            random, bits = np.random.default_rng(0), bit_counts(self.own, level, depth)
+            kind = Kind.of(depth)
+            bits[random.random(len(bits)) < self._headers(depth)] = kind.depth
+            steps = np.where((bits > 0) & ~self.alone[self.own_rows], SPACING * 2.0**bits, 0.0)
+            noise = random.uniform(-0.5, 0.5, (len(bits), COLUMNS)) * steps[:, None]
+            sh = self.model.sh.detach().clone()
+            sh[self.numbers.rows[self.own_rows], 0, 1:] += sh.new_tensor(noise)
+            self.measured[level, depth] = psnr_between(self.model, replace(self.model.detach(), sh=sh))
+        return self.measured[level, depth]
+
+    def _level(self, depth: int) -> int:
+        """The highest level of this depth that costs no more than `strength` allows, or the lowest one."""
+
+        def costs_more(level: int) -> bool:
+            return self.cost(level, depth) < self.strength + SPREAD
+
+        if not costs_more(LEVELS - 1):  # as mostly at depth 1
+            return LEVELS - 1
+        return max(0, bisect_left(range(LEVELS), True, key=costs_more) - 1)
+
+    def _least_level(self, sizes: Sequence[int], depth: int, comfort: float) -> int:
+        """The lowest level of this depth that holds payloads of these sizes, or the highest of all."""
+
+        def holds(level: int) -> bool:
+            return sum(self._shares(sizes, level, depth, comfort)) <= SHARES
+
+        return bisect_left(range(LEVELS - 1), True, key=holds)
+
+    def _shares(
+        self, sizes: Sequence[int], level: int, depth: int, comfort: float, likely: bool = False
+    ) -> tuple[int, ...]:
+        room = max(comfort * self._room(level, depth, likely), 1e-3)
+        buckets = [bucket_bytes(bucket_of(size)) for size in sizes]
+        return tuple(max(1, math.ceil(SHARES * min(1e6, size / room))) for size in buckets)
+
+    def _room(self, level: int, depth: int, likely: bool = False) -> float:
         """Bytes that all carriers hold."""
-        information = float(self._information(self.admission if likely else 1.0).sum())
-        return _RATE * (1 - self._headers) * COLUMNS * information / 8
+        information = self._information(self.admission if likely else 1.0)
+        bits = COLUMNS * float((bit_counts(self.own, level, depth) * information).sum())
+        return _RATE * (1 - self._headers(depth)) * bits / 8
 
     @cached_property
     def carriers(self) -> Carriers:
@@ -89,10 +147,9 @@ class Capacity:
         """[C] carriers that are left alone."""
         return self.quiet.left_alone()[self.numbers.rows]
 
-    @property
-    def _headers(self) -> float:
+    def _headers(self, depth: int) -> float:
         """Share of the carriers that headers take."""
-        return 1 - (1 - header_share(len(self.own))) ** UNNOTICED
+        return 1 - (1 - Kind.of(depth).share(len(self.own))) ** (UNNOTICED if depth == 1 else 1)
 
     @cached_property
     def likeness(self) -> Likeness:
@@ -132,3 +189,12 @@ class Capacity:
 def bucket_of(size: int) -> int:
     """The least bucket that holds `size` bytes, or the largest of all."""
     return next((each for each in range(255) if bucket_bytes(each) >= size), 255)
+
+
+def _stretched(shares: tuple[int, ...]) -> tuple[int, ...]:
+    """All SHARES, in the same proportion."""
+    left, stretched = SHARES, []
+    for index, share in enumerate(shares):
+        stretched.append(left * share // sum(shares[index:]))
+        left -= stretched[-1]
+    return tuple(stretched)

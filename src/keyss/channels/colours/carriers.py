@@ -104,6 +104,14 @@ class Carriers:
         moved = self.names - np.array([cells] * 3 + [0] * 2, np.int16)
         return Carriers(self.rows, moved, self.doubt, self.values)
 
+    @property
+    def impact(self) -> Doubles:
+        """[C] how much a change of colour shows, from the name: log of area times squared opacity."""
+        log_scales = np.sort((self.names[:, :3] + 0.5) * CELL, axis=1)
+        opacities = (self.names[:, 3] + 0.5) * _OPACITY_STEPS * OPACITY_STEP
+        impact: Doubles = log_scales[:, 1] + log_scales[:, 2] + 2 * np.log(opacities.clip(1e-3))
+        return impact
+
     def namesakes(self) -> npt.NDArray[np.int64]:
         """[C] how many carriers have the same name, itself included."""
         _, inverse, counts = np.unique(row_hashes(self.names), return_inverse=True, return_counts=True)

@@ -8,6 +8,7 @@ secrets there are, or that there are any.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ from keyss.channels.colours.header import (
     derived,
     written_header,
 )
-from keyss.channels.colours.lattice import seeds, write
+from keyss.channels.colours.lattice import MAX_BITS, seeds, write
 from keyss.channels.colours.reading import ASSOCIATED, ColoursReader
 from keyss.channels.colours.salts import SALTS, Salts, renewed, steady
 from keyss.channels.payloads import NOTICED, check_keys, pack_payload, randomness
@@ -41,14 +42,19 @@ from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt
+from keyss.rendering.difference import psnr_between
 
 _TOO_FEW = "this model has too few Gaussians to hide anything that survives other formats"
-_BITS_PER_GAUSSIAN = 0.5  # of room, about
+_LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
+_BITS_PER_GAUSSIAN = 1  # of room, about
 _OVERHEAD = METHOD_BYTES + 1  # bytes of a payload beside its data, at most
 
 
+@dataclass(frozen=True)
 class Colours:
-    """The channel; see `keyss.channels.base.Channel`."""
+    """The channel; see `keyss.channels.base.Channel`. Raises UsageError for a `strength` of 0 dB or less."""
+
+    strength: float = 45.0  # dB PSNR that views of a model keep at least, compared with those of the cover
 
     name = "colours"
     place = "colours"
@@ -56,11 +62,15 @@ class Colours:
     grows = False
     records = False
 
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.strength) and self.strength > 0):
+            raise UsageError(f"expected a `strength` above 0 dB, got {self.strength}")
+
     def prepare(self, cover: Gaussians) -> ColoursCover:
-        return ColoursCover(Capacity(cover, Numbers.of(cover)))
+        return ColoursCover(Capacity(cover, Numbers.of(cover), self.strength))
 
     def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
-        return RoomEstimate(gaussians, int(gaussians * _BITS_PER_GAUSSIAN / 8), _OVERHEAD)
+        return RoomEstimate(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _OVERHEAD)
 
     def reader(self, stego: Gaussians) -> ColoursReader:
         return ColoursReader(Numbers.of(stego))
@@ -73,7 +83,8 @@ COLOURS = Colours()
 class ColoursCover:
     """A cover whose room is known; see `keyss.channels.base.PreparedCover`.
 
-    Order and all numbers but some greens and blues stay.
+    Order and all numbers but some greens and blues stay. A payload changes as little as it needs; `strength`
+    is a limit.
     """
 
     room: Capacity
@@ -91,12 +102,12 @@ class ColoursCover:
     @property
     def capacity(self) -> int:
         """Bytes of one payload."""
-        return self.room.bytes()
+        return self.room.bytes(MAX_BITS)
 
     @property
     def unseen_capacity(self) -> int:
         """Bytes of one payload that leaves all numbers as likely as they were, and is hard to detect."""
-        return self.room.bytes(likely=True)
+        return self.room.bytes(1, likely=True)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Raises InputError for a model that can carry nothing, too."""
@@ -114,10 +125,16 @@ class ColoursCover:
             for (key, _), payload in zip(contents, payloads, strict=True)
         ]
         check_keys([each.check for each in writings])
-        writings += [_Writing.of_nobody(secret, index) for index in range(len(contents), UNNOTICED)]
+        # With more than one bit there is no room for another secret that would not be noticed.
+        if layouts[0].depth == 1:
+            writings += [_Writing.of_nobody(secret, index) for index in range(len(contents), UNNOTICED)]
         likely = [layouts[min(index, len(layouts) - 1)].likely for index in range(len(writings))]
-        headers = self._headers(layouts, sizes, secret)[: len(writings)]
-        return self._written(numbers, salts, writings, headers, likely, random)
+        for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
+            headers = self._headers(layouts, sizes, secret, lower)[: len(writings)]
+            stego = self._written(numbers, salts, writings, headers, likely, random)
+            if psnr_between(self.cover, stego) >= self.room.strength:
+                break
+        return stego
 
     def _layouts(self, sizes: Sequence[int]) -> list[Layout]:
         """Of each payload."""
@@ -128,8 +145,8 @@ class ColoursCover:
             together = self.room.layout(sizes)
             if together is None:
                 raise UsageError(
-                    f"expected payloads of {self.capacity:,} bytes in all, as this model holds, got "
-                    f"{sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
+                    f"expected payloads of {self.capacity:,} bytes in all, as this model holds at this "
+                    f"`strength`, got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
                 )
             layouts = [replace(together, shares=(share,)) for share in together.shares]
             noticed = len(sizes) > 1
@@ -137,16 +154,20 @@ class ColoursCover:
             warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
         return layouts
 
-    def _headers(self, layouts: Sequence[Layout], sizes: Sequence[int], secret: bytes) -> list[Header]:
+    def _headers(
+        self, layouts: Sequence[Layout], sizes: Sequence[int], secret: bytes, lower: int
+    ) -> list[Header]:
         """Of each payload, and of decoys without a key, which look the same."""
         partition = expand(secret, "colours/partition", 2)
         headers, first = [], 0
         for index in range(max(len(layouts), UNNOTICED)):
-            own = index < len(layouts)
-            (share,) = layouts[index].shares if own else (1,)
+            own, layout = index < len(layouts), layouts[min(index, len(layouts) - 1)]
+            (share,) = layout.shares
             header = Header(
                 file_key=expand(secret, f"colours/file-key/{index}", FILE_KEY_BYTES),
                 partition=partition,
+                level=max(0, layout.level - lower),
+                depth=layout.depth,
                 first=first if own else 0,
                 last=first + share - 1 if own else 0,
                 bucket=bucket_of(sizes[index]) if own else 0,
@@ -179,9 +200,9 @@ class ColoursCover:
         gaps = steady(numbers)
         index, own = Index(carriers), [header.own(carriers) for header in headers]
         holds, chosen = free.copy(), np.zeros(len(carriers), bool)  # written where that is likely
-        for writing in writings:
+        for header, writing in zip(headers, writings, strict=True):
             for secret in writing.secrets:
-                holds[index.rows(secret)] = False
+                holds[index.rows(secret, header.kind)] = False
         admission = [self.room.admission if each else 1.0 for each in likely]
         idle = [
             1 - share * float(holds[each].mean()) if each.any() else 0.0
@@ -200,9 +221,10 @@ class ColoursCover:
             if writing.payload is not None:
                 rows, key = np.flatnonzero(free & mine), data_key(writing.static, header)
                 encrypted = encrypt(key, writing.payload, ASSOCIATED, size=bucket_bytes(header.bucket))
-                code, words = Fountain(8 * len(encrypted)), seeds(key, "seeds", carriers.names[rows])
+                counts, code = header.bits(carriers[rows]), Fountain(8 * len(encrypted))
+                words = seeds(key, "seeds", carriers.names[rows], counts)
                 bits = code.encode(np.unpackbits(np.frombuffer(encrypted, np.uint8)), words)
-                values[rows], chosen[rows] = write(key, carriers[rows], bits), some
+                values[rows], chosen[rows] = write(key, carriers[rows], counts, bits), some
         return self._with_colours(values, chosen, random)
 
     def _with_colours(

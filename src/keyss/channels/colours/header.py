@@ -21,22 +21,31 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.colours.carriers import Carriers, Doubles
+from keyss.channels.colours.carriers import Carriers, Doubles, Names
 from keyss.channels.colours.fountain import NOISY, Bits, Fountain
-from keyss.channels.colours.lattice import COLUMNS, dithers, rank, read, seeds, write
+from keyss.channels.colours.lattice import (
+    COLUMNS,
+    MAX_BITS,
+    Counts,
+    bit_counts,
+    dithers,
+    rank,
+    read,
+    seeds,
+    write,
+)
 from keyss.channels.colours.salts import SALTS
 from keyss.channels.mixing import Words, mixed
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
 
 FILE_KEY_BYTES = 5
-PLACES = 64  # Gaussians of a header under each salt
-_PILOTS = 16  # numbers of these that are known beforehand
-UNNOTICED = 2  # secrets whose headers are always there, if only as noise
+_PILOTS = 16  # bits of a header under each salt that are known beforehand
+UNNOTICED = 2  # secrets whose headers are always there, if only as noise, unless one gets all carriers
 SHARES = 256  # parts of the carriers; a payload has some of them
 IDLE = 1 / 32  # unit of the share of carriers that were left alone
 _CHECK_BYTES = 2
-_FIELDS = (("reserved", 3), ("first", 8), ("last", 8), ("bucket", 8), ("idle", 5))
-_FIELD_BYTES = 4
+_FIELDS = (("level", 8), ("depth", 3), ("first", 8), ("last", 8), ("bucket", 8), ("idle", 5))
+_FIELD_BYTES = 5
 _PARTITION_BYTES = 2
 _BYTES = FILE_KEY_BYTES + _PARTITION_BYTES + _FIELD_BYTES + _CHECK_BYTES
 _ROUNDS = 20
@@ -48,10 +57,33 @@ _PUBLIC = hashlib.sha256(b"keyss/v1/colours-places").digest()
 _STATIC_SALT = hashlib.sha256(b"keyss/v1/colours-static").digest()[:SALT_BYTES]
 _PAD = np.uint64(0x9FB21C651E98DF25)
 
+
+@dataclass(frozen=True)
+class Kind:
+    """How headers are written."""
+
+    places: int  # Gaussians for each salt
+    depth: int  # bits of each of their numbers
+
+    @staticmethod
+    def of(depth: int) -> Kind:
+        """The kind for a payload of this depth: one that hardly shows, or one that shows anyway."""
+        return KINDS[min(len(KINDS), depth) - 1]
+
+    def share(self, carriers: int) -> float:
+        """Share of so many carriers that the headers of one secret take."""
+        return 1 - math.exp(-SALTS * self.places / max(1, carriers))
+
+    def bits(self, carriers: int) -> Counts:
+        """[C] bits of each of their numbers."""
+        return np.full(carriers, self.depth)
+
+
+KINDS = (Kind(64, 1), Kind(96, 2))
 # How likely a place, and the ones after it, hold what was written: in an ordinary model, and in two merged
 # ones, where half of the places are the other's.
-USUAL, MERGED = (0.65,), (0.4, 0.2)
-VIEWS = (USUAL, MERGED)
+_USUAL, _MERGED = (0.65,), (0.4, 0.2)
+VIEWS = ((KINDS[0], _USUAL), (KINDS[1], _USUAL), (KINDS[1], _MERGED))
 
 
 @dataclass(frozen=True)
@@ -60,11 +92,20 @@ class Header:
 
     file_key: bytes
     partition: bytes  # by which carriers are shared out; the same for all secrets of a file
+    level: int  # see `bit_counts`
+    depth: int
     first: int  # of SHARES that the payload has,
     last: int  # this one included
     bucket: int  # see `bucket_bytes`
     idle: int  # share of its carriers that hold nothing, in units of IDLE
-    reserved = 0
+
+    @property
+    def kind(self) -> Kind:
+        return Kind.of(self.depth)
+
+    def bits(self, carriers: Carriers) -> Counts:
+        """[C] bits of the payload in each number."""
+        return bit_counts(carriers, self.level, self.depth)
 
     def own(self, carriers: Carriers) -> npt.NDArray[np.bool_]:
         """[C] which carriers the payload has, by a hash of their names that holders of keys know."""
@@ -90,7 +131,7 @@ class Header:
         packed, numbers = int.from_bytes(plain[-_FIELD_BYTES:], "big"), {}
         for name, size in reversed(_FIELDS):
             numbers[name], packed = packed & ((1 << size) - 1), packed >> size
-        if numbers.pop("reserved") or numbers["last"] < numbers["first"]:
+        if not 1 <= numbers["depth"] <= MAX_BITS or numbers["last"] < numbers["first"]:
             return None
         return Header(plain[:FILE_KEY_BYTES], plain[FILE_KEY_BYTES:-_FIELD_BYTES], **numbers)
 
@@ -110,27 +151,30 @@ class Index:
         """How many names there are."""
         return len(self._rows)
 
-    def rows(self, secret: bytes, count: int = PLACES, behind: int = 0) -> npt.NDArray[np.int64]:
-        """[count] a carrier with each name that this secret's header is in, or those so many behind."""
-        return self._rows[self._places(secret, count, behind)]
+    def rows(self, secret: bytes, kind: Kind) -> npt.NDArray[np.int64]:
+        """[places] a carrier with each name that this secret's header is in."""
+        return self._rows[self._places(secret, kind.places, 0)]
 
     def _places(self, secret: bytes, count: int, behind: int) -> npt.NDArray[np.int64]:
         points = np.frombuffer(stream(secret, "colours/places", 8 * count), "<u8")
         places: npt.NDArray[np.int64] = (np.searchsorted(self._hashes, points) + behind) % len(self)
         return places
 
-    def parts(self, secrets: Sequence[bytes], view: Sequence[float], count: int = PLACES) -> Parts:
-        """What the first `count` Gaussians of each salt hold, if it is one."""
+    def parts(
+        self, secrets: Sequence[bytes], kind: Kind, view: Sequence[float], count: int | None = None
+    ) -> Parts:
+        """What the first `count` Gaussians of each salt hold, if it is one; by default all of them."""
+        count = kind.places if count is None else count
         every, hints = [], []
         for behind, sure in enumerate(view):
             places = np.stack([self._places(secret, count, behind) for secret in secrets])
             own = self._carriers[self._rows[places.ravel()]]
             names = own.names.reshape(*places.shape, -1)
             dither = np.concatenate([dithers(*each) for each in zip(secrets, names, strict=True)])
-            words = np.stack([_seeds(*each) for each in zip(secrets, names, strict=True)])
-            ratios = read(dither, own, np.zeros(len(own))).reshape(words.shape)
+            words = np.stack([_seeds(kind, *each) for each in zip(secrets, names, strict=True)])
+            ratios = read(dither, own, kind.bits(len(own)), np.zeros(len(own))).reshape(words.shape)
             certain = sure * (1 - own.doubt) / self._namesakes[places.ravel()]
-            hint = np.tanh(ratios / 2) * np.repeat(certain, COLUMNS).reshape(words.shape)
+            hint = np.tanh(ratios / 2) * np.repeat(certain, COLUMNS * kind.depth).reshape(words.shape)
             every.append(words)
             hints.append(hint * (1 - 2.0 * _pads(words)))
         both = np.stack(hints)
@@ -140,8 +184,8 @@ class Index:
         """Logarithm of how much likelier the pilots are with a header than without."""
         if not len(self) or not secrets:
             return -math.inf
-        odds = self.parts(secrets, USUAL, _PILOTS // COLUMNS).odds
-        return float(np.logaddexp(0, odds.clip(-50, 50)).sum())
+        odds = [self.parts(secrets, kind, _USUAL, _PILOTS // (COLUMNS * kind.depth)).odds for kind in KINDS]
+        return max(float(np.logaddexp(0, each.clip(-50, 50)).sum()) for each in odds)
 
 
 @dataclass(frozen=True)
@@ -163,21 +207,24 @@ def written_header(
     header: Header, check: bytes, secret: bytes, index: Index, carriers: Carriers, free: npt.NDArray[np.bool_]
 ) -> tuple[npt.NDArray[np.int64], Doubles]:
     """[P] those of the carriers that are `free` [C] which hold a header, and [P, 2] their new values."""
-    own = index.rows(secret)
-    words = _seeds(secret, carriers.names[own])
+    kind = header.kind
+    own = index.rows(secret, kind)
+    words = _seeds(kind, secret, carriers.names[own])
     bits = _fountain().encode(header.pack(check), words)
     bits[:_PILOTS] = 0
-    values = write(secret, carriers[own], bits ^ _pads(words))
+    values = write(secret, carriers[own], kind.bits(len(own)), bits ^ _pads(words))
     rows, first = np.unique(own, return_index=True)
     fine = free[rows]
     return rows[fine], values[first[fine]]
 
 
-def read_header(secrets: Sequence[bytes], check: bytes, index: Index, view: Sequence[float]) -> Header | None:
-    """The header whose parts lie under these secrets, if there is one."""
+def read_header(
+    secrets: Sequence[bytes], check: bytes, index: Index, kind: Kind, view: Sequence[float]
+) -> Header | None:
+    """The header of this kind whose parts lie under these secrets, if there is one."""
     if not len(index) or not secrets:
         return None
-    parts, fountain = index.parts(secrets, view), _fountain()
+    parts, fountain = index.parts(secrets, kind, view), _fountain()
     words, odds = parts.seeds.ravel(), parts.odds
     trusts = _trusts(odds)
     for _ in range(_TRIES):
@@ -196,14 +243,9 @@ def header_agreement(header: Header, check: bytes, secrets: Sequence[bytes], ind
     """How well the parts under these secrets agree with the header: 0 by chance."""
     if not len(index) or not secrets:
         return 0.0
-    parts = index.parts(secrets, USUAL)
+    parts = index.parts(secrets, header.kind, _USUAL)
     bits = _fountain().encode(header.pack(check), parts.seeds.ravel()).reshape(parts.seeds.shape)
     return float((parts.hints * (1 - 2.0 * bits)).sum() + parts.pilots.sum())
-
-
-def header_share(carriers: int) -> float:
-    """Share of so many carriers that the headers of one secret take."""
-    return 1 - math.exp(-SALTS * PLACES / max(1, carriers))
 
 
 def _trusts(odds: Doubles) -> Doubles:
@@ -244,8 +286,8 @@ def _derived(key: str, salt: bytes) -> DerivedKey:
     return DerivedKey(key, KeyDerivation(salt=salt))
 
 
-def _seeds(secret: bytes, names: npt.NDArray[np.int16]) -> Words:
-    return seeds(secret, "header-seeds", names)
+def _seeds(kind: Kind, secret: bytes, names: Names) -> Words:
+    return seeds(secret, "header-seeds", names, kind.bits(len(names)))
 
 
 def _pads(words: Words) -> Bits:

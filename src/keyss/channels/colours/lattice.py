@@ -1,16 +1,20 @@
 """Bits in numbers: dithered quantisation index modulation (Chen and Wornell 2001), read softly.
 
-A number that carries a bit is moved to the nearest point of one of two lattices of step 2 x SPACING. They lie
-SPACING apart and are shifted together by a *dither*, a number that only the key tells and that no two
+A number that carries b bits is moved to the nearest point of one of 2^b lattices of step 2^b x SPACING. They
+lie SPACING apart and are shifted together by a *dither*, a number that only the key tells and that no two
 Gaussians share. So without the key the change is independent noise, uniform over one step, of variance
 step^2 / 12, and no value is likelier than another.
 
-The change is so small that views keep about 49 dB in green and blue even if each pixel shows one Gaussian.
+The bits of a Gaussian follow from its *impact* and one *level* for all: one bit less for every factor of four
+in how much a change of its colour shows, so that all that carry something cost equally much.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import numpy.typing as npt
 
 from keyss.channels.colours.carriers import Carriers, Doubles, Names
 from keyss.channels.colours.fountain import Bits, Ratios
@@ -18,37 +22,63 @@ from keyss.channels.mixing import Words, encrypted_blocks, mixed
 from keyss.keys.derivation import expand
 
 COLUMNS = 2  # numbers of a Gaussian that are written
-SPACING = 0.0275  # between the points of both lattices
-STEP = 2 * SPACING
+MAX_BITS = 5  # of a number
+SPACING = 0.0275  # between neighbouring points
+LEVELS = 64
+_BIT = math.log(4)  # of impact; a level is a quarter of a bit
+_MIDDLE = 24  # level at which an impact of zero carries nothing any more
 _NOISE = 0.23  # standard deviation of a format's rounding, in spacings
 _BLOCK = 16
 _POINTS = np.array([-1.0, 0.0, 1.0, 2.0])  # that a number may have come from, from the one below on
 
-
-def seeds(secret: bytes, label: str, names: Names) -> Words:
-    """[2 C] the seeds of all numbers of Gaussians with these names, for `Fountain`."""
-    words = rank(secret, label, names)
-    return mixed((words[:, None] ^ mixed(np.arange(1, 1 + COLUMNS, dtype=np.uint64))).ravel())
+Counts = npt.NDArray[np.int64]
 
 
-def write(secret: bytes, carriers: Carriers, bits: Bits) -> Doubles:
-    """[C, 2] new values that carry `bits` [2 C]."""
-    points = dithers(secret, carriers.names) * STEP + bits.reshape(-1, COLUMNS) * SPACING
-    values: Doubles = np.round((carriers.values - points) / STEP) * STEP + points
-    return values
+def bit_counts(carriers: Carriers, level: int, depth: int) -> Counts:
+    """[C] bits of each of a carrier's numbers: at most `depth`, and more at a higher level (below LEVELS)."""
+    bits = np.floor((level - _MIDDLE) / 4 - carriers.impact / _BIT)
+    return bits.clip(0, depth).astype(np.int64)
 
 
-def read(dither: Doubles, carriers: Carriers, doubt: Doubles) -> Ratios:
-    """[2 C] logarithms of P(0) / P(1) of each bit.
+def seeds(secret: bytes, label: str, names: Names, bits: Counts) -> Words:
+    """[B] the seeds of all bits of Gaussians with these names, for `Fountain`; `bits` [C]: of each number."""
+    counts = COLUMNS * bits
+    order = np.arange(1, counts.sum() + 1) - np.repeat(np.cumsum(counts) - counts, counts)
+    return mixed(np.repeat(rank(secret, label, names), counts) ^ mixed(order.astype(np.uint64)))
+
+
+def write(secret: bytes, carriers: Carriers, bits: Counts, code: Bits) -> Doubles:
+    """[C, 2] new values that carry the bits `code` [B], `bits` [C] in each number."""
+    counts = np.repeat(bits, COLUMNS)
+    label, first = np.zeros(len(counts), np.int64), np.cumsum(counts) - counts
+    for bit in range(MAX_BITS):
+        rows = np.flatnonzero(counts > bit)
+        label[rows] = label[rows] << 1 | code[first[rows] + bit]
+    step, values = SPACING * 2.0**counts, carriers.values.ravel()
+    points = dithers(secret, carriers.names).ravel() * step + _ungray(label) * SPACING
+    nearest = np.round((values - points) / step) * step + points
+    return np.where(counts > 0, nearest, values).reshape(-1, COLUMNS)
+
+
+def read(dither: Doubles, carriers: Carriers, bits: Counts, doubt: Doubles) -> Ratios:
+    """[B] logarithms of P(0) / P(1) of each bit, of which each number has `bits` [C].
 
     `dither` [C, 2]: of `dithers`. `doubt` [C]: the chance that a carrier holds something else.
     """
-    place = np.mod(carriers.values / SPACING - 2 * dither, 2.0)[:, :, None]
+    counts, doubts = np.repeat(bits, COLUMNS), np.repeat(doubt, COLUMNS)
+    period = 1 << counts
+    place = np.mod(carriers.values.ravel() / SPACING - dither.ravel() * period, period)[:, None]
     points = np.floor(place) + _POINTS
     weight = np.exp(-((place - points) ** 2) / (2 * _NOISE**2))
-    ones = (weight * (points % 2)).sum(axis=2) / weight.sum(axis=2)
-    ones = ((1 - doubt[:, None]) * ones + doubt[:, None] / 2).clip(1e-9, 1 - 1e-9)
-    ratios: Ratios = np.log((1 - ones) / ones).astype(np.float32).ravel()
+    weight /= weight.sum(axis=1, keepdims=True)
+    label = points.astype(np.int64) % period[:, None]
+    label ^= label >> 1
+    ratios, ends = np.zeros(int(counts.sum()), np.float32), np.cumsum(counts)
+    for bit in range(MAX_BITS):  # from the last one on
+        rows = np.flatnonzero(counts > bit)
+        ones = (weight[rows] * (label[rows] >> bit & 1)).sum(axis=1)
+        ones = ((1 - doubts[rows]) * ones + doubts[rows] / 2).clip(1e-9, 1 - 1e-9)
+        ratios[ends[rows] - 1 - bit] = np.log((1 - ones) / ones)
     return ratios
 
 
@@ -69,3 +99,10 @@ def _random(secret: bytes, label: str, names: Names) -> Words:
     blocks[:, : names.shape[1]] = names
     key = expand(secret, f"colours/{label}", 32)
     return encrypted_blocks(key, blocks.view(np.uint8)).view("<u8").astype(np.uint64)
+
+
+def _ungray(code: Counts) -> Counts:
+    """The number whose Gray code, number xor half of it, is `code` (up to 8 bits)."""
+    for shift in (1, 2, 4):
+        code = code ^ code >> shift
+    return code

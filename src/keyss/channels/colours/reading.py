@@ -25,7 +25,7 @@ from keyss.channels.colours.header import (
     header_agreement,
     read_header,
 )
-from keyss.channels.colours.lattice import COLUMNS, dithers, read, seeds
+from keyss.channels.colours.lattice import COLUMNS, LEVELS, dithers, read, seeds
 from keyss.channels.colours.salts import Salts
 from keyss.channels.payloads import unpack_payload
 from keyss.channels.reed_solomon import LOST
@@ -42,7 +42,7 @@ _CELLS_SCALED = (0, 1, -1)  # in a model that was scaled
 _ALIGNMENTS = 7  # of borders of cells: in a model that was scaled names are wrong by a fifth at most
 _BEST = 3  # of all these, that are looked at more closely
 # What a key that opens nothing looks for.
-_NOTHING = Header(bytes(FILE_KEY_BYTES), bytes(2), 0, SHARES // 4 - 1, 64, 0)
+_NOTHING = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 1, 0, SHARES // 4 - 1, 64, 0)
 _REFINED = ((0.02, 0.004), (0.004, 0.001))  # where offsets are looked for once a header is found
 
 
@@ -64,7 +64,7 @@ class ColoursReader:
         best = [offset for _, offset in sorted(promises, reverse=True)[:_BEST]]
         indices = [Index(self.numbers.carriers(offset)) for offset in best]
         attempts = [  # all, as a key that opens nothing does
-            read_header(secrets, check, index, view) for index in indices for view in VIEWS
+            read_header(secrets, check, index, kind, view) for index in indices for kind, view in VIEWS
         ]
         headers = list(dict.fromkeys(header for header in attempts if header is not None))
         agreements = [
@@ -81,7 +81,7 @@ class ColoursReader:
         free = np.ones(len(carriers), bool)
         index = Index(carriers)
         for secret in secrets:
-            free[index.rows(secret)] = False
+            free[index.rows(secret, header.kind)] = False
         for changed in (_CHANGED, _MERGED):
             payload = _payload(header, static, carriers[free], changed)
             if payload is not None:
@@ -115,13 +115,13 @@ def _payload(
 ) -> bytes | None:
     """What the header's data key decrypts, or None."""
     own = carriers[header.own(carriers)]
-    size, key = bucket_bytes(header.bucket), data_key(static, header)
-    if not len(own) or 8 * size > _MAX_RATE * COLUMNS * len(own):
+    size, key, counts = bucket_bytes(header.bucket), data_key(static, header), header.bits(own)
+    if not len(own) or 8 * size > _MAX_RATE * COLUMNS * counts.sum():
         return None
     garbage = min(0.9, header.idle * IDLE + changed)
     doubt = 1 - (1 - garbage) * (1 - own.doubt) / own.namesakes()
-    ratios = read(dithers(key, own.names), own, doubt)
-    bits, _ = Fountain(8 * size).decode(seeds(key, "seeds", own.names), ratios, rounds)
+    ratios = read(dithers(key, own.names), own, counts, doubt)
+    bits, _ = Fountain(8 * size).decode(seeds(key, "seeds", own.names, counts), ratios, rounds)
     try:
         return decrypt(key, np.packbits(bits).tobytes(), ASSOCIATED)
     except InputError:

@@ -102,3 +102,11 @@ export function chosen({ names, doubt, values }: Carriers, rows: ArrayLike<numbe
   }
   return found;
 }
+
+/** How much a change of colour shows, from the name: log of area times squared opacity. */
+export function impact(names: Int16Array, row: number): number {
+  const [a, b, c] = [names[NAME * row], names[NAME * row + 1], names[NAME * row + 2]];
+  const two = a + b + c - Math.min(a, b, c) + 1; // halves of a cell are added
+  const seen = (names[NAME * row + 3] + 0.5) * OPACITY_STEPS * OPACITY_STEP;
+  return two * CELL + 2 * Math.log(Math.max(1e-3, seen));
+}

@@ -5,32 +5,40 @@
 import { chacha20 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
-import { ascii, viewOf } from '../../core/bytes.ts';
+import { ascii } from '../../core/bytes.ts';
 import { mixAt, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
 import { type Carriers, chosen } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
-import { COLUMNS, dithers, rank, readBits, seedsOf } from './lattice.ts';
+import { COLUMNS, dithers, MOST_BITS, rank, readBits, seedsOf } from './lattice.ts';
 
 export const FILE_KEY_BYTES = 5;
 export const SHARES = 256; // parts of the carriers, of which a payload has some
 export const IDLE = 1 / 32; // unit of the share of carriers that were left alone
 const PARTITION_BYTES = 2;
 const CHECK_BYTES = 2;
-export const HEADER_BYTES = 13;
+export const HEADER_BYTES = 14;
 const ROUNDS = 20;
 const TRIES = 3; // to tell salts that were lost
 const [LEAST_TRUST, MOST_TRUST] = [0.02, 0.95];
 const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
-const PLACES = 64; // Gaussians of a header under each salt
 const PILOTS = 16; // numbers of each salt's part that are known beforehand
 const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
 const PUBLIC = sha256(ascii('keyss/v1/colours-places'));
 const [PAD_LOW, PAD_HIGH] = [0x1e98df25, 0x9fb21c65];
 
+/** How headers are written: in how many Gaussians for each salt, with how many bits in each of their numbers. */
+export interface Kind {
+  readonly places: number;
+  readonly depth: number;
+}
+
+const KINDS: readonly Kind[] = [{ places: 64, depth: 1 }, { places: 96, depth: 2 }];
 // How likely a place, and the ones after it, hold what was written: in an ordinary model; in two merged ones.
 const [USUAL, MERGED] = [[0.65], [0.4, 0.2]];
-export const VIEWS: readonly (readonly number[])[] = [USUAL, MERGED];
+export const VIEWS: readonly (readonly [Kind, readonly number[]])[] = [
+  [KINDS[0], USUAL], [KINDS[1], USUAL], [KINDS[1], MERGED],
+];
 
 const fountain = new Fountain(8 * HEADER_BYTES, NOISY);
 
@@ -38,11 +46,18 @@ const fountain = new Fountain(8 * HEADER_BYTES, NOISY);
 export interface Header {
   readonly fileKey: Uint8Array;
   readonly partition: Uint8Array; // by which carriers are shared out
+  readonly level: number; // of `bitCounts`
+  readonly depth: number;
   readonly first: number; // of SHARES that the payload has,
   readonly last: number; // this one included
   readonly bucket: number;
   readonly idle: number; // share of its carriers that hold nothing, in units of IDLE
   readonly bits: Uint8Array; // of all this, as they were read
+}
+
+/** The kind of the header of a payload. */
+export function kindOf(header: Header): Kind {
+  return KINDS[Math.min(KINDS.length, header.depth) - 1];
 }
 
 /** Rows of the carriers that the payload has. */
@@ -61,12 +76,12 @@ export function bucketBytes(bucket: number): number {
   return (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1);
 }
 
-/** The header whose parts lie under these secrets, if there is one. */
+/** The header of this kind whose parts lie under these secrets, if there is one. */
 export function readHeader(
-  secrets: readonly Uint8Array[], check: Uint8Array, index: Index, view: readonly number[],
+  secrets: readonly Uint8Array[], check: Uint8Array, index: Index, kind: Kind, view: readonly number[],
 ): Header | null {
   if (!index.size || !secrets.length) return null;
-  const parts = index.parts(secrets, view);
+  const parts = index.parts(secrets, kind, view);
   const seeds = Uint32Array.from(parts.flatMap((part) => [...part.seeds]));
   const odds = oddsOf(parts, secrets.length);
   let trusts = odds.map(trust);
@@ -88,7 +103,7 @@ export function readHeader(
 export function headerAgreement(header: Header, secrets: readonly Uint8Array[], index: Index): number {
   if (!index.size) return 0;
   const sum = (values: Float64Array): number => values.reduce((before, each) => before + each, 0);
-  return index.parts(secrets, USUAL).reduce((before, { seeds, hints, pilots }) => {
+  return index.parts(secrets, kindOf(header), USUAL).reduce((before, { seeds, hints, pilots }) => {
     return before + sum(pilots) + sum(signed(hints, fountain.encode(header.bits, seeds)));
   }, 0);
 }
@@ -104,17 +119,20 @@ function unpackHeader(bits: Uint8Array, check: Uint8Array): Header | null {
   const plain = data.subarray(0, HEADER_BYTES - CHECK_BYTES);
   const tag = hmac(sha256, check, plain);
   if (data[HEADER_BYTES - 2] !== tag[0] || data[HEADER_BYTES - 1] !== tag[1]) return null;
-  const fields = viewOf(data).getUint32(FILE_KEY_BYTES + PARTITION_BYTES); // 3 bits are unused
+  const [level, b, c, d, e] = data.subarray(FILE_KEY_BYTES + PARTITION_BYTES);
   const found = {
     fileKey: data.slice(0, FILE_KEY_BYTES),
     partition: data.slice(FILE_KEY_BYTES, FILE_KEY_BYTES + PARTITION_BYTES),
-    first: (fields >>> 21) & 255,
-    last: (fields >>> 13) & 255,
-    bucket: (fields >>> 5) & 255,
-    idle: fields & 31,
+    // 8 bits of level, 3 of depth, 8 each of first, last and bucket, 5 of idle
+    level,
+    depth: b >> 5,
+    first: ((b & 31) << 3) | (c >> 5),
+    last: ((c & 31) << 3) | (d >> 5),
+    bucket: ((d & 31) << 3) | (e >> 5),
+    idle: e & 31,
     bits: bits.slice(),
   };
-  return fields >>> 29 !== 0 || found.last < found.first ? null : found;
+  return found.depth < 1 || found.depth > MOST_BITS || found.last < found.first ? null : found;
 }
 
 /** Bytes of bits, the highest first. */
@@ -166,20 +184,21 @@ export class Index {
     return found;
   }
 
-  /** [PLACES] a carrier with each name that this secret's header is in. */
-  rows(secret: Uint8Array): Uint32Array {
-    return this.places(secret, PLACES, 0).map((place) => this.first[place]);
+  /** [places] a carrier with each name that this secret's header is in. */
+  rows(secret: Uint8Array, kind: Kind): Uint32Array {
+    return this.places(secret, kind.places, 0).map((place) => this.first[place]);
   }
 
   /** What the first `count` Gaussians of each salt hold, if it is one. */
-  parts(secrets: readonly Uint8Array[], view: readonly number[], count = PLACES): Part[] {
+  parts(secrets: readonly Uint8Array[], kind: Kind, view: readonly number[], count = kind.places): Part[] {
+    const bits = new Uint8Array(count).fill(kind.depth);
     return view.flatMap((sure, behind) => secrets.map((secret, salt) => {
       const places = this.places(secret, count, behind);
       const own = chosen(this.carriers, places.map((place) => this.first[place]));
-      const words = seedsOf(rank(secret, 'header-seeds', own.names));
-      const read = readBits(dithers(secret, own.names), own, new Float64Array(count));
+      const words = seedsOf(rank(secret, 'header-seeds', own.names), bits);
+      const read = readBits(dithers(secret, own.names), own, bits, new Float64Array(count));
       const hints = Float64Array.from(read, (ratio, bit) => {
-        const at = Math.floor(bit / COLUMNS);
+        const at = Math.floor(bit / (COLUMNS * kind.depth));
         const certain = (sure * (1 - own.doubt[at])) / this.alike[places[at]];
         return Math.tanh(ratio / 2) * certain * (isPadded(words, bit) ? -1 : 1);
       });
@@ -190,8 +209,10 @@ export class Index {
   /** How much likelier the pilots are with a header than without: a logarithm. */
   promise(secrets: readonly Uint8Array[]): number {
     if (!this.size || !secrets.length) return -Infinity;
-    const odds = oddsOf(this.parts(secrets, USUAL, PILOTS / COLUMNS), secrets.length);
-    return odds.reduce((sum, each) => sum + Math.log1p(Math.exp(Math.max(-50, Math.min(50, each)))), 0);
+    return Math.max(...KINDS.map((kind) => {
+      const odds = oddsOf(this.parts(secrets, kind, USUAL, PILOTS / (COLUMNS * kind.depth)), secrets.length);
+      return odds.reduce((sum, each) => sum + Math.log1p(Math.exp(Math.max(-50, Math.min(50, each)))), 0);
+    }));
   }
 
   /** The first place whose hash is at least this word; `size` where there is none. */

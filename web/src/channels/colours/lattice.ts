@@ -3,40 +3,72 @@
  * `keyss.channels.colours.lattice` on the other side.
  */
 import { ecb } from '@noble/ciphers/aes.js';
-import { mixed, type Words, wordsOf } from '../../core/words.ts';
+import { mixAt, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
-import type { Carriers } from './carriers.ts';
+import { type Carriers, impact } from './carriers.ts';
 
 export const COLUMNS = 2; // numbers of a Gaussian that are written
-const SPACING = 0.0275; // between the points of both lattices
+export const MOST_BITS = 5; // of a number
+const SPACING = 0.0275; // between neighbouring points
+export const LEVELS = 64;
+const BIT = Math.log(4); // of impact; a level is a quarter of a bit
+const MIDDLE = 24; // level at which an impact of zero carries nothing any more
 const NOISE = 0.23; // standard deviation of a format's rounding, in spacings
 
-/** [2 C] the seeds of all numbers of Gaussians, for the fountain; `numbers` [C]: of `rank`. */
-export function seedsOf(numbers: Words): Words {
-  const found = new Uint32Array(COLUMNS * numbers.length);
-  const orders = mixed(Uint32Array.of(1, 0, 2, 0));
-  for (let to = 0; to < found.length; to++) {
-    found[to] = numbers[2 * Math.floor(to / (2 * COLUMNS)) + (to & 1)] ^ orders[to % (2 * COLUMNS)];
-  }
-  return mixed(found);
+/** [C] bits of each of a carrier's numbers: at most `depth`, and more at a higher level (below LEVELS). */
+export function bitCounts({ count, names }: Carriers, level: number, depth: number): Uint8Array {
+  return Uint8Array.from({ length: count }, (_, row) => {
+    return Math.max(0, Math.min(depth, Math.floor((level - MIDDLE) / 4 - impact(names, row) / BIT)));
+  });
 }
 
-/** [2 C] logarithms of P(0) / P(1); `dither` [C, 2]; `doubt` [C]: chance that a carrier holds something else. */
-export function readBits(dither: Float64Array, { values }: Carriers, doubt: Float64Array): Float32Array {
-  return Float32Array.from(values, (value, at) => {
-    const off = value / SPACING - 2 * dither[at];
-    const place = off - 2 * Math.floor(off / 2);
-    const first = Math.floor(place) - 1;
-    let [ones, sum] = [0, 0];
-    for (let point = first; point < first + 4; point++) {
-      const weight = Math.exp(-((place - point) ** 2) / (2 * NOISE ** 2));
-      sum += weight;
-      if (point & 1) ones += weight;
+/** [B] the seeds of all bits of Gaussians, for the fountain; `numbers` [C]: of `rank`; `bits` [C]: of each number. */
+export function seedsOf(numbers: Words, bits: Uint8Array): Words {
+  const found = new Uint32Array(2 * COLUMNS * sum(bits));
+  const order = new Uint32Array(2);
+  let to = 0;
+  bits.forEach((count, row) => {
+    for (let bit = 1; bit <= COLUMNS * count; bit++, to++) {
+      [order[0], order[1]] = [bit, 0];
+      mixAt(order, 0);
+      found[2 * to] = numbers[2 * row] ^ order[0];
+      found[2 * to + 1] = numbers[2 * row + 1] ^ order[1];
+      mixAt(found, to);
     }
-    const sure = 1 - doubt[Math.floor(at / COLUMNS)];
-    const chance = Math.max(1e-9, Math.min(1 - 1e-9, (sure * ones) / sum + (1 - sure) / 2));
-    return Math.log((1 - chance) / chance);
   });
+  return found;
+}
+
+/** [B] logarithms of P(0) / P(1); `dither` [C, 2]; `bits`, `doubt` [C]: of each number; chance that it holds something else. */
+export function readBits(dither: Float64Array, { values }: Carriers, bits: Uint8Array, doubt: Float64Array): Float32Array {
+  const found = new Float32Array(COLUMNS * sum(bits));
+  const [weights, labels] = [new Float64Array(4), new Uint8Array(4)]; // of the points around a number
+  let to = 0;
+  values.forEach((value, at) => {
+    const row = Math.floor(at / COLUMNS);
+    const period = 2 ** bits[row];
+    const off = value / SPACING - dither[at] * period;
+    const place = off - Math.floor(off / period) * period;
+    let all = 0;
+    for (let each = 0; each < 4; each++) {
+      const point = Math.floor(place) - 1 + each;
+      weights[each] = Math.exp(-((place - point) ** 2) / (2 * NOISE ** 2));
+      labels[each] = (point & (period - 1)) ^ ((point & (period - 1)) >> 1);
+      all += weights[each];
+    }
+    for (let bit = bits[row] - 1; bit >= 0; bit--) {
+      let ones = 0;
+      for (let each = 0; each < 4; each++) if ((labels[each] >> bit) & 1) ones += weights[each];
+      const chance = Math.max(1e-9, Math.min(1 - 1e-9, ((1 - doubt[row]) * ones) / all + doubt[row] / 2));
+      found[to++] = Math.log((1 - chance) / chance);
+    }
+  });
+  return found;
+}
+
+/** The sum of counts. */
+export function sum(counts: Uint8Array): number {
+  return counts.reduce((before, each) => before + each, 0);
 }
 
 /** [C, 2] numbers in [0, 1) that only the secret tells. */

@@ -15,10 +15,10 @@ import { unpackPayload } from '../packing.ts';
 import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
 import { Fountain } from './fountain.ts';
 import {
-  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, Index, ownRows, packBits, readHeader, SHARES,
-  VIEWS,
+  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, Index, kindOf, ownRows, packBits, readHeader,
+  SHARES, VIEWS,
 } from './header.ts';
-import { COLUMNS, dithers, rank, readBits, seedsOf } from './lattice.ts';
+import { bitCounts, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf, sum } from './lattice.ts';
 import { saltsOf } from './salts.ts';
 
 const ASSOCIATED = ascii('keyss/v1/colours');
@@ -71,8 +71,8 @@ export class ColoursReader implements Reader {
     const best = promises.slice(0, BEST).map(({ offset }) => ({ offset, index: new Index(carriersOf(this.numbers, offset)) }));
     const found = new Map<string, Header>();
     for (const { index } of best) {
-      for (const view of VIEWS) {
-        const header = readHeader(secrets, check, index, view);
+      for (const [kind, view] of VIEWS) {
+        const header = readHeader(secrets, check, index, kind, view);
         if (header !== null) found.set(header.bits.join(''), header);
       }
     }
@@ -90,7 +90,7 @@ export class ColoursReader implements Reader {
     }
     const carriers = this.refined(header, secrets, offset);
     const index = new Index(carriers);
-    const taken = new Set(secrets.flatMap((each) => [...index.rows(each)]));
+    const taken = new Set(secrets.flatMap((each) => [...index.rows(each, kindOf(header))]));
     const free = chosen(carriers, Uint32Array.from({ length: carriers.count }, (_, row) => row).filter((row) => !taken.has(row)));
     for (const changed of CHANGED) {
       const data = await payload(header, derived.fixed, free, changed, ROUNDS);
@@ -133,6 +133,8 @@ export class ColoursReader implements Reader {
 const NOTHING: Header = {
   fileKey: new Uint8Array(FILE_KEY_BYTES),
   partition: new Uint8Array(2),
+  level: LEVELS - 1,
+  depth: 1,
   first: 0,
   last: SHARES / 4 - 1,
   bucket: 64,
@@ -146,12 +148,13 @@ async function payload(
 ): Promise<Uint8Array | null> {
   const own = chosen(carriers, ownRows(header, carriers));
   const [size, key] = [bucketBytes(header.bucket), expand(joined(fixed, header.fileKey), 'colours/data-key', 32)];
-  if (!own.count || 8 * size > MOST_RATE * COLUMNS * own.count) return null;
+  const counts = bitCounts(own, header.level, header.depth);
+  if (!own.count || 8 * size > MOST_RATE * COLUMNS * sum(counts)) return null;
   const garbage = Math.min(0.9, header.idle * IDLE + changed);
   const alike = namesakes(rank(header.partition, 'partition', own.names));
   const doubt = own.doubt.map((each, row) => 1 - ((1 - garbage) * (1 - each)) / alike[row]);
-  const ratios = readBits(dithers(key, own.names), own, doubt);
-  const bits = new Fountain(8 * size).likeliest(seedsOf(rank(key, 'seeds', own.names)), ratios, rounds);
+  const ratios = readBits(dithers(key, own.names), own, counts, doubt);
+  const bits = new Fountain(8 * size).likeliest(seedsOf(rank(key, 'seeds', own.names), counts), ratios, rounds);
   try {
     return await decrypted(key, packBits(bits.subarray(0, 8 * size)), ASSOCIATED);
   } catch (error) {
