@@ -29,7 +29,6 @@ from keyss.fitting import PlainRun, load_checkpoint, mean_psnr, save_checkpoint
 from keyss.keys import random_embeddings
 from keyss.measure import opacity_pruning, stealth_statistics
 from keyss.methods import PlacedScene
-from keyss.methods.keyss.method import published
 
 import torch
 
@@ -96,7 +95,7 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
         meta["seconds"] = time.process_time() - started
         save_checkpoint(trained, tensors, meta)
     found = {"cost": meta["seconds"] / seconds}
-    stego, secrets = published(run, bytes(32))
+    stego, secrets = run.publish(bytes(32))
 
     def psnr(model: Gaussians, index: int) -> float:
         return mean_psnr(model, placed[index].scene.test, placed[index].scene.background)

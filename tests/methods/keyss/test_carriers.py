@@ -13,10 +13,10 @@ import torch
 from fitting.test_plain import InterruptAt
 from keyss import Gaussians, KeyssOptions, WrongKeyError, read_model
 from keyss.channels import LOW_BITS, Payload
-from keyss.core import InputError, Interrupted, UsageError
+from keyss.core import InputError, Interrupted, Similarity, UsageError
 from keyss.keys import random_embeddings
 from keyss.measure import search_embeddings
-from keyss.methods import RowSecret, registry
+from keyss.methods import PlacedScene, RowSecret, registry
 from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, row_kinds, secret_tables
 from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
 from methods.keyss.hiding import EMBEDDINGS, FIT, KEYS, cover_with_zeros, written
@@ -70,7 +70,9 @@ def test_every_secret_comes_back_as_coded(secrets: int, count: int) -> None:
         ]
         degree = coded[0].sh_degree
         expected = Gaussians.cat([part.with_sh_degree(degree) for part in coded if len(part)])
-        assert same(secret.decode(stego, secret.embedding), expected)
+        decoded = secret.decode(stego, secret.embedding)
+        by_x = (model[model.means[:, 0].argsort()] for model in (decoded, expected))
+        assert same(*by_x)
         other = made[1 - index].embedding if secrets == 2 else EMBEDDINGS[2]
         assert secret.decode(stego, other) is stego
 
@@ -180,6 +182,28 @@ def test_a_cover_without_harmonics_is_refused() -> None:
     options = replace(OPTIONS, fit=replace(FIT, iterations=1))
     with pytest.raises(InputError, match="train longer"):
         hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2])
+
+
+def test_a_share_of_pruned_steps_is_one() -> None:
+    with pytest.raises(UsageError, match="pruned_steps"):
+        KeyssOptions(pruned_steps=1.5)
+
+
+def test_rows_are_in_the_order_in_which_plain_3dgs_makes_them() -> None:
+    """Its own points first, and what grew later at the end."""
+    scenes, models = three_scenes()
+    both = zip(scenes[:2], models[:2], strict=True)
+    placed = [PlacedScene.of(scene, model, Similarity.identity()) for scene, model in both]
+    run = OPTIONS.settings.training(placed, [EMBEDDINGS[0]], OPTIONS, torch.device("cpu"))
+    start = run.scene_gaussians(0).detach().means.clone()
+    for _ in range(60):
+        run.step()
+    born = run.density["born"]
+    assert 0 < (born > 0).sum() < len(born)
+    stego, _ = run.publish(bytes(32))
+    old = (born == 0) & (run.scene_gaussians(0).opacities >= OPTIONS.fit.prune_opacity)
+    assert torch.equal(stego.means[: int(old.sum())], run.scene_gaussians(0).detach().means[old])
+    assert not torch.equal(stego.means[: int(old.sum())], start[old])
 
 
 def test_files_of_this_version_stay_readable() -> None:

@@ -179,7 +179,7 @@ def test_options_override_the_design() -> None:
         chosen = KeyssOptions(design=name).settings
         assert replace(options, design=name).settings == replace(chosen, mask=("op",), common_poses=0.5)
     assert options.settings.shape(3).hidden == (64, 128)
-    with pytest.raises(UsageError, match="`mask` is for designs with a network"):
+    with pytest.raises(UsageError, match="`mask`: the design carriers has no such setting"):
         replace(options, design="carriers")
 
 

@@ -14,20 +14,17 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from keyss.channels import APPENDED, LOW_BITS, check_payload_fits
 from keyss.core.errors import KeyssError, KeyssWarning, UsageError
-from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.keys import DerivedKey, KeyDerivation
-from keyss.keys.derivation import SALT_BYTES, stream
+from keyss.keys.derivation import SALT_BYTES
 from keyss.methods.base import Capabilities, Context, Source, Stego
 from keyss.methods.joint import train_jointly
 from keyss.methods.keyss.clip_keys import MODEL, ClipKeys
-from keyss.methods.keyss.designs.base import DesignTraining, Secret
+from keyss.methods.keyss.designs.base import DesignTraining
 from keyss.methods.keyss.options import KeyssOptions
 from keyss.methods.keyss.secret import unpack
 from keyss.methods.plan import Plan
@@ -92,22 +89,12 @@ class KeyssMethod:
         return _embedded(run, keys, context.entropy or os.urandom(32))
 
 
-def published(run: DesignTraining, entropy: bytes) -> tuple[Gaussians, Sequence[Secret]]:
-    """All Gaussians in a random order, before anything is in their low bits, and what reveals each secret.
-
-    In training, an order can tell the scenes apart.
-    """
-    stego, secrets = run.publish(entropy)
-    numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
-    return stego[torch.from_numpy(numbers.argsort(kind="stable"))], secrets
-
-
 def _embedded(run: DesignTraining, keys: Sequence[str], entropy: bytes) -> Stego:
     """The published model with the payload of each secret under its key.
 
     Warns (KeyssWarning) where the low bits have no room, in which case payloads are in appended Gaussians.
     """
-    stego, secrets = published(run, entropy)
+    stego, secrets = run.publish(entropy)
     payloads = [secret.payload() for secret in secrets]
     keyed = list(zip(keys, payloads, strict=True))
     details: dict[str, Any] = {}

@@ -66,6 +66,7 @@ class KeyssOptions(JointOptions):
     at_cap: Literal["wait", "freeze"] | None = None
     prune_by: Literal["all", "cover"] | None = None
     growth: Literal["largest", "even"] | None = None
+    pruned_steps: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,8 +94,8 @@ class KeyssOptions(JointOptions):
         given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}
         if foreign := [name for name in given if not hasattr(chosen, name)]:
             raise UsageError(
-                f"`{foreign[0]}` is for designs with a network; {self.design} has none: "
-                'leave it out or set `design="mlp"`'
+                f"`{foreign[0]}`: the design {self.design} has no such setting: leave it out or set another "
+                "`design`"
             )
         return replace(chosen, **given)
 

@@ -221,7 +221,7 @@ def row_kinds(model: Gaussians) -> list[RowKind]:
 
 
 def carrying(cover: Gaussians) -> list[RowKind]:
-    """The rows of each kind that can be written without near-equal values being missed.
+    """The rows of each kind that can be written without equal values being missed, the opaque ones first.
 
     Clones that training hardly moved apart agree in harmonics, such as those of a saturated colour: here in
     three in a row of one colour, in all bits above the low ones.
@@ -230,7 +230,13 @@ def carrying(cover: Gaussians) -> list[RowKind]:
     windows = words[:, :-6] << np.uint64(38) | words[:, 3:-3] << np.uint64(19) | words[:, 6:]
     values, counts = np.unique(windows, return_counts=True)
     apart = ((counts[np.searchsorted(values, windows)] == 1) | (windows == 0)).all(axis=1)
-    return [RowKind(kind.rows[apart[kind.rows]], kind.columns[apart[kind.rows]]) for kind in row_kinds(cover)]
+    by_opacity = cover.opacity_logits.argsort(descending=True, stable=True).numpy()
+    found = []
+    for kind in row_kinds(cover):
+        chosen = apart[kind.rows]
+        ranks = by_opacity.argsort()[kind.rows[chosen]].argsort()
+        found.append(RowKind(kind.rows[chosen][ranks], kind.columns[chosen][ranks]))
+    return found
 
 
 def _carriers(sh_degree: int) -> list[int]:

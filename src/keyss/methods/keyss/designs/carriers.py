@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.config import FitConfig
@@ -49,8 +49,7 @@ from keyss.methods.poses import PlacedScene
 from keyss.methods.records.quantise import Codec
 from keyss.rendering.view import contributions
 
-# After density control, so often a step is rendered without so many of the faintest Gaussians of each scene.
-PRUNED_STEPS, PRUNED_SHARE = 0.3, 0.25
+PRUNED_SHARE = 0.25  # of each scene's Gaussians, the faintest, in steps that render without them
 T = TypeVar("T")
 
 _EMPTY = -8.0  # opacity logit of a place without a Gaussian
@@ -59,7 +58,15 @@ _VIEWS = 64  # that tell how much a Gaussian of a secret contributes
 
 @dataclass(frozen=True, kw_only=True)
 class CarriersDesign(Design):
-    """Nothing but the training can be set."""
+    """Rows that are a Gaussian of each scene."""
+
+    # Share of the steps after density control that render without the faintest quarter of each scene: what
+    # pruning then costs, against a share of faint Gaussians that plain models do not have.
+    pruned_steps: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pruned_steps <= 1:
+            raise UsageError(f"`pruned_steps`: expected 0 to 1, got {self.pruned_steps}")
 
     def training(
         self,
@@ -68,7 +75,7 @@ class CarriersDesign(Design):
         options: JointOptions,
         device: torch.device,
     ) -> CarriersTraining:
-        return CarriersTraining(scenes, embeddings, options, device)
+        return CarriersTraining(scenes, embeddings, options, device, self.pruned_steps)
 
     def payload_bytes(self, sh_degree: int, secrets: int) -> int:
         secret_tables(sh_degree, secrets)
@@ -87,8 +94,9 @@ class CarriersTraining(DesignTraining):
         embeddings: Sequence[Tensor],  # [64] of each secret's key
         options: JointOptions,
         device: torch.device,
+        pruned_steps: float,
     ) -> None:
-        self.embeddings, self.pruned = embeddings, False
+        self.embeddings, self.pruned, self.pruned_steps = embeddings, False, pruned_steps
         self.tables = secret_tables(options.fit.sh_degree, len(embeddings))
         super().__init__(scenes, options, device, common_poses=0.0, network_rate=0.0)
 
@@ -117,7 +125,7 @@ class CarriersTraining(DesignTraining):
 
     def step(self) -> None:
         grown = self.iteration >= self.strategy.refine_stop_iter
-        self.pruned = grown and float(torch.rand((), generator=self.generator)) < PRUNED_STEPS
+        self.pruned = grown and float(torch.rand((), generator=self.generator)) < self.pruned_steps
         super().step()
         self.pruned = False
 
@@ -140,10 +148,10 @@ class CarriersTraining(DesignTraining):
             set_rates(numbers_of(self.optimizers, scene), self.iteration / self.iterations)
 
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[RowSecret]]:
-        # Every scene's Gaussians in order: pruning faint rows takes away what no scene needs.
         least = self.options.fit.prune_opacity
-        cover = without_faint(self.scene_gaussians(0).detach().to("cpu"), least)
-        cover = cover[cover.opacity_logits.argsort(descending=True, stable=True)]
+        # The rows in the order of plain 3DGS, which appends what grows.
+        model = self.scene_gaussians(0).detach().to("cpu")
+        cover = without_faint(model[self.density["born"].cpu().argsort(stable=True)], least)
         counts = [len(kind.rows) for kind in carrying(cover)][: len(self.tables)]
         if not counts[0]:
             raise InputError(
@@ -210,6 +218,11 @@ class DeadPlaces(CappedStrategy):
         super().__init__(fit)
         self.extents, self.generator = extents, generator
 
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """`born`: [N] the step of the cover's Gaussian in each row."""
+        state: dict[str, Any] = super().initialize_state(scene_scale)
+        return state | {"born": torch.zeros(self.max_gaussians)}
+
     def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
         return self.by_scene(renders, count, len(self.extents), dim=0)
 
@@ -231,7 +244,9 @@ class DeadPlaces(CappedStrategy):
         left = (self.refine_stop_iter - 1 - step) // self.refine_every + 1
         gradients = state["grad2d"] / state["count"].clamp_min(1)
         for scene, extent in enumerate(self.extents):
-            self._grow(numbers_of(params, scene), optimizers, scene, gradients[scene], extent, left)
+            grown = self._grow(numbers_of(params, scene), optimizers, scene, gradients[scene], extent, left)
+            if scene == 0:
+                state["born"][grown.to(state["born"].device)] = step
         state["grad2d"], state["count"] = None, None
 
     def _grow(
@@ -242,8 +257,11 @@ class DeadPlaces(CappedStrategy):
         gradients: Tensor,  # [N]
         extent: float,
         left: int,
-    ) -> None:
-        """Clone small Gaussians and split large ones into dead places, the largest gradients first."""
+    ) -> Tensor:
+        """Clone small Gaussians and split large ones into dead places, the largest gradients first.
+
+        Returns the rows of new Gaussians.
+        """
         model = to_gaussians(params).detach()
         dead = model.opacities < self.prune_opa
         places = dead.nonzero()[:, 0]
@@ -268,3 +286,4 @@ class DeadPlaces(CappedStrategy):
                 for key, moment in optimizers[full].state[parameter].items():
                     if key != "step":
                         moment[rows[fresh]] = 0
+        return torch.cat([source[large], target])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.losses import photometric_loss
 from keyss.fitting.parameters import Optimizers, Parameters, to_gaussians
-from keyss.keys.derivation import random_embeddings
+from keyss.keys.derivation import random_embeddings, stream
 from keyss.methods.base import check_above_zero
 from keyss.methods.joint import Picture, Pose
 from keyss.methods.joint_options import JointOptions
@@ -176,7 +177,10 @@ class NetworkTraining(DesignTraining):
         return to_gaussians(self.parameters).detach()
 
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[HiddenSecret]]:
+        # In a random order: in training, the points of each scene lie together.
         stego = self.gaussians().to("cpu")
+        numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
+        stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
         anchors = choose_anchors(stego, torch.Generator().manual_seed(self.options.fit.known_seed))
         secrets = []
         for decoder, placed in zip(self.decoders, self.scenes[1:], strict=True):
