@@ -75,6 +75,8 @@ class CellFolder:
         Raises InputError, and BackendError for measures that need packages which are not installed.
         """
         check_extras(measures)
+        if models[0] is not None:  # a plain fit of the same folder
+            options = options.for_fitted_cover()
         cell = Cell(
             name=name,
             cover=sources[0],

@@ -159,6 +159,10 @@ class MethodOptions:
         """Options of other variants that a comparison adds, by name."""
         return {}
 
+    def for_fitted_cover(self) -> Self:
+        """The same for a cover that keyss fits, which may be changed until it can carry."""
+        return self
+
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))

@@ -26,6 +26,7 @@ _TYPICAL = 0.9  # quantile of the distances above which a distance is a gap in t
 _SAMPLE = 20_000  # Gaussians
 _UNIT = 1e-5  # the largest difference between 1 and the length of a unit quaternion
 _FAINT = 1e-3  # standard deviation of new harmonics
+_LOOSE = {"log_scales": 0.01, "quats": 0.01, "opacity_logits": 0.01, "sh": _FAINT}  # standard deviations
 
 Floats = npt.NDArray[np.float32]
 
@@ -65,6 +66,29 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     # Scaled before they are rounded: a product of single precision keeps a trace of its factor.
     noise = _FAINT * torch.randn(len(model), count // 3, 3, generator=generator, dtype=torch.float64)
     return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
+
+
+def loosened(model: Gaussians, usable: npt.NDArray[np.bool_], entropy: bytes) -> Gaussians:
+    """`model` with small noise on the numbers of all Gaussians that are not `usable` [N]; positions stay.
+
+    After few steps of training, many Gaussians still have equal scales, grey colours or no harmonics, so that
+    their low bits cannot be replaced. Quaternions stay where most of them have unit length.
+    """
+    rows = torch.from_numpy(np.flatnonzero(~usable))
+    seed = int.from_bytes(stream(entropy, "dither/loosened", 8), "little") >> 1
+    generator = torch.Generator().manual_seed(seed)
+    lengths = model.quats.detach().cpu().double().norm(dim=1)
+    unit = float((lengths - 1).abs().median()) < _UNIT
+    changed = {}
+    for name, size in _LOOSE.items():
+        values = getattr(model, name).detach().cpu().clone()
+        noise = size * torch.randn(values[rows].shape, generator=generator, dtype=torch.float64)
+        if name == "sh":
+            noise[:, 0] = 0
+        if not (name == "quats" and unit):
+            values[rows] = (values[rows] + noise).to(values)
+        changed[name] = values
+    return replace(model, **changed)
 
 
 def _is_natural(values: Floats) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -175,6 +176,19 @@ def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) ->
     assert (len(revealed),) == result.metrics.secret_gaussians
     with pytest.raises(UsageError, match="scenes in memory"):
         keyss.evaluate(tmp_path / "run", [KEY])
+
+
+@pytest.mark.parametrize(("steps", "views"), [(5, 16), (15, 3)])
+def test_however_short_its_training_a_fitted_cover_carries(steps: int, views: int) -> None:
+    """After few steps most Gaussians are round and grey, and the low bits of such numbers say something."""
+    scene = tiny_scene(0, views)
+    points = torch.randn(1500, 3, generator=torch.Generator().manual_seed(0))
+    cover = replace(scene, points=points, colors=(255 * points.sigmoid()).to(torch.uint8))
+    options = CarryOptions(fit=FitConfig(iterations=steps, max_gaussians=1500, evaluate_every=0, seed=0))
+    secret = Secret(random_gaussians(300), KEY)
+    result = keyss.hide(cover, [secret], method=options, width=24)
+    assert result.metrics.secret_gaussians == (300,)
+    assert result.metrics.against_plain[0].psnr > 40
 
 
 def test_a_given_model_of_a_scene_is_used() -> None:

@@ -43,8 +43,8 @@ class CarryMethod:
         if degree is None:
             degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
         options = options.with_fit(sh_degree=degree)
-        if cover.given is None and options.place.records:  # whose low bits may not be random
-            options = replace(options, dither=True)
+        if cover.given is None:
+            options = options.for_fitted_cover()
         room = room_for(cover.given, options)
         options = replace(options, max_secret_degree=room.max_secret_degree)
         secret_sizes = _secret_sizes(secrets, options)

@@ -63,6 +63,10 @@ class CarryOptions(MethodOptions):
         """The refits."""
         return (Training(), *map(Training, self.refits or (0,) * (scenes - 1)))
 
+    def for_fitted_cover(self) -> Self:
+        """Low bits of channels that need random ones; after few steps those of a fit may not be."""
+        return replace(self, dither=True) if self.place.records else self
+
     def with_fit(self, **changes: Any) -> Self:
         """The same with changed fields of `fit`; `iterations` also changes those of refits."""
         found = super().with_fit(**changes)

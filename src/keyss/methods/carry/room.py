@@ -16,13 +16,14 @@ from keyss.channels import (
     LowBitsRoom,
     PreparedCover,
     Room,
+    usable_carriers,
 )
 from keyss.channels.low_bits.bits import Layout
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.dither import dither_model, raised
+from keyss.methods.dither import dither_model, loosened, raised
 from keyss.methods.points import divided
 from keyss.methods.records.embedding import largest_degree, record_request, shares
 from keyss.methods.records.precision import least_bytes, most_visible, pruned
@@ -201,7 +202,11 @@ def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
     except InputError:
         if entropy is None:
             raise
-    return LOW_BITS.prepare(dither_model(cover, entropy))
+    cover = dither_model(cover, entropy)
+    try:
+        return LOW_BITS.prepare(cover)
+    except InputError:
+        return LOW_BITS.prepare(loosened(cover, usable_carriers(cover), entropy))
 
 
 def of_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
