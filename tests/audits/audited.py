@@ -69,10 +69,8 @@ def found_in(run: Path) -> dict[str, Any]:
     return data
 
 
-def run_with(run: Path, folder: Path, data: object, *, published: bool = False) -> Path:
-    """A copy of a run's audit in a folder, with other JSON; `published`: of what is published, too."""
-    if published:
-        shutil.copytree(run / "publish", folder / "publish")
+def run_with(run: Path, folder: Path, data: object) -> Path:
+    """A copy of a run's audit in a folder, with other JSON."""
     if not (folder / "private" / "audit").exists():
         shutil.copytree(run / "private" / "audit", folder / "private" / "audit")
     (folder / "private" / "audit" / "audit.json").write_text(json.dumps(data))

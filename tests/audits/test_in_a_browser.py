@@ -22,10 +22,7 @@ NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "chromium-brows
 PROGRAM = next((path for name in NAMES if (path := shutil.which(name))), None)
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason=f"none of {', '.join(NAMES)} on PATH")
 
-SWITCHES = [
-    *("--no-sandbox", "--disable-dev-shm-usage"),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
-]
+SWITCHES = ["--no-sandbox", "--disable-dev-shm-usage"]
 RED, GREEN, BLUE = (220, 30, 30), (30, 160, 60), (30, 60, 220)
 SLIDER = ".stage input >> nth=0"
 PATIENCE = 60_000  # milliseconds for any one answer: other work may share the machine
@@ -89,31 +86,6 @@ def test_it_opens_from_disk_without_complaints_or_requests(
     assert [url for url in requests if not url.startswith("data:")] == [report.as_uri()]
     assert page.title() == "treasure and map, hidden in garden · keyss"
     assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth > 0)")
-    assert page.evaluate("[...document.querySelectorAll('svg')].every((svg) => svg.clientHeight > 100)")
-    page.close()
-
-
-def test_the_published_model_is_drawn_in_it(chromium: playwright.Browser, run_folder: Path) -> None:
-    audit(run_folder, report_only=True)
-    report = run_folder / "private" / "report.html"
-    page = chromium.new_page()
-    page.set_default_timeout(PATIENCE)
-    complaints: list[str] = []
-    requests: list[str] = []
-    page.on("console", lambda each: complaints.append(each.text) if each.type == "error" else None)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on("request", lambda request: requests.append(request.url))
-    page.goto(report.as_uri())
-    page.click(".viewer summary")
-    viewer = page.frame_locator(".viewer iframe")
-    viewer.locator("main[data-picture=settled]").wait_for()
-    assert "stego.ply" in viewer.locator("#facts").inner_text()
-    before = viewer.locator("#picture").screenshot()
-    viewer.locator("#picture").press("ArrowLeft")
-    page.wait_for_timeout(1500)
-    assert viewer.locator("#picture").screenshot() != before
-    assert complaints == []
-    assert all(url.startswith((report.as_uri(), "data:", "blob:", "about:")) for url in requests), requests
     page.close()
 
 
@@ -189,7 +161,7 @@ def test_dark_and_light(page: playwright.Page) -> None:
         channels = [float(number) for number in re.findall(r"[\d.]+", color)[:3]]
         return sum(channels) / 3 / 255
 
-    text, page_ = ("svg text", "fill"), ("body", "backgroundColor")
+    text, page_ = ("body", "color"), ("body", "backgroundColor")
     assert brightness(*text) < 0.5 < brightness(*page_)
     page.emulate_media(color_scheme="dark")
     assert brightness(*page_) < 0.2

@@ -13,19 +13,15 @@ from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
-from markupsafe import Markup
 
 from audits.audited import found_in, run_with, with_all_texts
 from audits.pages import Parsed
-from keyss.audits import audit, figures, page as page_module
+from keyss.audits import audit
 from keyss.core import InputError, OutputError
-from keyss.files.layout import usual_up
-from keyss.viewer.page import embedding_rules, page_with
 
 SECTIONS = [
     "verdict",
     "pictures",
-    "published",
     "images",
     "wrong-keys",
     "leaks",
@@ -58,12 +54,6 @@ def parsed(run: Path) -> Parsed:
     return Parsed(write_report(run).read_text())
 
 
-@pytest.fixture
-def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures take most of the time; what is drawn is tested elsewhere."""
-    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Markup(""))
-
-
 @pytest.fixture(scope="module")
 def page(run_folder: Path) -> Parsed:
     return parsed(run_folder)
@@ -73,7 +63,6 @@ def sections_of(page: Parsed) -> list[str]:
     return [name for name in page.values("id") if name in SECTIONS]
 
 
-@pytest.mark.usefixtures("without_drawing")
 def test_every_section_is_there_once_and_linked(
     data: dict[str, Any], run_folder: Path, tmp_path: Path
 ) -> None:
@@ -113,76 +102,37 @@ def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> 
     assert "half floats bits a number – 16.0" in page.text  # of low bits nothing is left
 
 
-def test_pictures_and_figures_are_in_the_file(page: Parsed, data: dict[str, Any]) -> None:
+def test_pictures_are_in_the_file(page: Parsed, data: dict[str, Any]) -> None:
     named = [file for files in data["images"]["pictures"].values() for file in files]
     leaks = [row["picture"] for attacks in data["leaks"] for row in attacks]
     assert page.tags.count("img") == len(named) + len(leaks)
-    assert page.tags.count("svg") == 2  # losses of two secrets
     assert all(alt for alt in page.values("alt"))
 
 
 def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> None:
     assert page.loads() == []
-    html = without_viewer((run_folder / "private" / "report.html").read_text())
+    html = (run_folder / "private" / "report.html").read_text()
     assert "@import" not in html
     assert all(url.startswith("#") for url in re.findall(r"url\(([^)]*)\)", html))
-    assert set(re.findall(r"https?://[^\"' <]*", html)) == {
-        "http://www.w3.org/2000/svg",
-        "http://www.w3.org/1999/xlink",
-    }
+    assert "http://" not in html
+    assert "https://" not in html
 
 
 def test_the_policy_allows_the_one_script_and_nothing_else(page: Parsed) -> None:
     (policy,) = (value for value in page.values("content") if "default-src" in value)
     (script,) = page.scripts
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    viewer = embedding_rules()
-    assert f"script-src 'sha256-{digest}' {viewer['script-src']};" in policy
-    assert policy.startswith("default-src 'none'; img-src blob: data:;")
-    assert "connect-src" not in policy  # what is in the page, the viewer included, can ask nobody
+    assert f"script-src 'sha256-{digest}';" in policy
+    assert policy.startswith("default-src 'none'; img-src data:;")
+    assert "connect-src" not in policy
     assert page.handlers() == []
 
 
-def without_viewer(html: str) -> str:
-    return re.sub(r'srcdoc="[^"]*"', "", html)
-
-
-def test_the_viewer_is_in_it_with_the_published_model(page: Parsed, run_folder: Path) -> None:
-    (viewer,) = page.values("srcdoc")
-    stego = run_folder / "publish" / "stego.ply"
-    assert viewer.encode() == page_with(
-        stego.read_bytes(), stego.name, usual_up(found_in(run_folder)["run"]["cover"])
-    )
-    assert page.values("sandbox") == ["allow-scripts allow-downloads"]
-
-
-@pytest.mark.usefixtures("without_drawing")
-def test_models_that_are_too_large_or_elsewhere_are_not_in_it(
-    run_folder: Path, data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = run_with(run_folder, tmp_path, data, published=True)
-    stego = run / "publish" / "stego.ply"
-    monkeypatch.setattr(page_module, "MAX_EMBEDDED", stego.stat().st_size - 1)
-    page = parsed(run)
-    assert "keyss view RUN/publish/stego.ply shows it." in page.text
-    harmless(page)
-    (policy,) = (value for value in page.values("content") if "default-src" in value)
-    assert "wasm" not in policy
-    monkeypatch.undo()
-    stego.unlink()
-    stego.symlink_to(run_folder / "publish" / "stego.ply")
-    monkeypatch.setattr(figures, "_figure", lambda *_, **__: Markup(""))
-    page = parsed(run)
-    assert "It was not in RUN/publish" in page.text
-    harmless(page)
-
-
 def test_the_same_audit_gives_the_same_bytes(run_folder: Path, tmp_path: Path) -> None:
-    again = run_with(run_folder, tmp_path, found_in(run_folder), published=True)
+    again = run_with(run_folder, tmp_path, found_in(run_folder))
     assert write_report(again).read_bytes() == write_report(run_folder).read_bytes()
 
 
-@pytest.mark.usefixtures("without_drawing")
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_that_did_not_run_is_left_out(
     run_folder: Path, data: dict[str, Any], tmp_path: Path, name: str
@@ -193,11 +143,10 @@ def test_a_part_that_did_not_run_is_left_out(
     assert "KEY measures it" in page.text
 
 
-@pytest.mark.usefixtures("without_drawing")
 def test_an_empty_audit_says_how_to_fill_it(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     page = parsed(run_with(run_folder, tmp_path, {k: v for k, v in data.items() if k not in PARTS}))
-    assert sections_of(page) == ["published", "not-measured", "configuration"]
-    assert page.tags.count("li") == 3 + len(PARTS)  # links to the sections, and every measure
+    assert sections_of(page) == ["not-measured", "configuration"]
+    assert page.tags.count("li") == 2 + len(PARTS)  # links to the sections, and every measure
     assert "keyss audit RUN --key-file KEY measures it" in page.text
 
 
@@ -210,7 +159,6 @@ def test_a_broken_audit_leaves_the_old_report(run_folder: Path, data: dict[str, 
     assert sorted(path.name for path in (run / "private").iterdir()) == ["audit", "report.html"]
 
 
-@pytest.mark.usefixtures("without_drawing")
 def test_a_report_that_cannot_be_written(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     run = run_with(run_folder, tmp_path, data)
     (run / "private" / "report.html").mkdir()
@@ -218,7 +166,6 @@ def test_a_report_that_cannot_be_written(run_folder: Path, data: dict[str, Any],
         write_report(run)
 
 
-@pytest.mark.usefixtures("without_drawing")
 def test_a_configuration_may_be_nested_but_not_without_end(
     run_folder: Path, data: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -247,11 +194,10 @@ ATTACKS = [
 
 @pytest.mark.parametrize("text", ATTACKS)
 def test_texts_of_others_stay_text(run_folder: Path, data: dict[str, Any], tmp_path: Path, text: str) -> None:
-    """Every text and every free name of the audit, all at once, figures included."""
+    """Every text and every free name of the audit, all at once."""
     data = with_all_texts(data, text, lambda name: name in ("picture", "pictures"))
     files = [file for files in data["images"]["pictures"].values() for file in files.values()]
     data["images"]["pictures"] = {text: {text: files[0], "other": files[1]}}
-    data["parameters"]["distances"] = {text: data["parameters"]["distances"]["opacity"]}
     data["run"]["config"] = {text: {text: text}}
     page = parsed(run_with(run_folder, tmp_path, data))
     harmless(page)
@@ -287,7 +233,6 @@ ANYTHING = st.recursive(
 )
 
 
-@pytest.mark.usefixtures("without_drawing")
 @settings(
     max_examples=150,
     deadline=None,

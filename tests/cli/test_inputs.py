@@ -112,7 +112,6 @@ def test_foreign_files_are_called_what_they_are(keyss: Keyss, world: Path, tmp_p
         *(("a.spz", b"\x1f\x8b\x08\0" * 9), ("a.sog", b"PK\x03\x04" * 9), ("a.splat", bytes(65))),
         *(
             ("a.glb", b"glTF" * 9),
-            ("meta.json", b"{}"),
             ("archive", b"PK\x03\x04" * 9),
         ),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,12 +28,13 @@ def test_what_the_page_does_not_read_is_converted_and_said(
     keyss: Callable[..., Said], tmp_path: Path
 ) -> None:
     text = write_in_text(tmp_path / "text.ply", random_gaussians(5))
-    folder = write_sog_folder(tmp_path / "scene", random_gaussians(5))
-    for model, name in ((text, "text.ply"), (folder, "scene.sog")):
+    gltf = tmp_path / "scene.glb"
+    write_model(gltf, random_gaussians(5))
+    for model, name in ((text, "text.ply"), (gltf, "scene.ply")):
         out = tmp_path / f"{name}-page"
         said = keyss("view", model, "-o", out)
         assert said.status == 0, said.err
-        assert f"the page does not read {'a .ply in text' if model == text else 'a SOG'}" in said.err
+        assert f"the page does not read {'a .ply in text' if model == text else 'a .glb'}" in said.err
         assert read_model(out / name).digest() == read_model(model).digest()
 
 
@@ -45,13 +45,6 @@ def write_in_text(path: Path, model: Gaussians) -> Path:
     lines = "\n".join(" ".join(f"{each:.9g}" for each in row) for row in values)
     path.write_bytes(header.replace(b"binary_little_endian", b"ascii") + f"end_header\n{lines}\n".encode())
     return path
-
-
-def write_sog_folder(folder: Path, model: Gaussians) -> Path:
-    write_model(folder.with_suffix(".sog"), model)
-    with zipfile.ZipFile(folder.with_suffix(".sog")) as archive:
-        archive.extractall(folder)
-    return folder / "meta.json"
 
 
 def test_a_page_is_written_and_not_over_another(keyss: Callable[..., Said], tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from keyss import measure
 
 SCRIPT = """
 import sys, keyss.measure
-heavy = {"torch", "scipy", "sklearn", "ot", "matplotlib"} & sys.modules.keys()
+heavy = {"torch", "scipy", "sklearn", "ot"} & sys.modules.keys()
 assert not heavy, heavy
 import keyss.measure.two_sample, keyss.measure.sinkhorn
 heavy = {"sklearn", "ot"} & sys.modules.keys()

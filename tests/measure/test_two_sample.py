@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import torch
 from sklearn.metrics import roc_auc_score
 
 from keyss.core import Gaussians, UsageError
-from keyss.measure import Auc, beside_controls, delong, two_sample_auc
+from keyss.measure import Auc, auc_beside_controls, delong, features, two_sample_auc
 from measure.lifelike import (
     doubled_scales,
     lifelike,
@@ -84,16 +85,42 @@ def test_delong_is_what_it_is_defined_as() -> None:
 def test_against_plain_models() -> None:
     plain = [lifelike(300, seed).with_sh_degree(0) for seed in (1, 2)]
     model = tripled_positions(lifelike(300).with_sh_degree(0))
-    found = beside_controls(two_sample_auc, model, plain, plain[0])
+    found = auc_beside_controls(model, plain, plain[0])
     assert len(found.stego) == 2
     assert found.stego[1] == two_sample_auc(plain[1], model)
     assert found.control == (two_sample_auc(*plain),)
     assert found.original == (two_sample_auc(plain[0], plain[0]), two_sample_auc(plain[1], plain[0]))
     assert min(each.auc for each in found.stego) > 0.85 > 0.6 > found.control[0].auc
-    assert beside_controls(two_sample_auc, model, plain).original == ()
+
+
+def test_another_way_to_write_the_same_gaussians_has_the_same_features() -> None:
+    """Negated quaternions; axes in another order, which a turn by 90 degrees about one of them makes good."""
+    w, x, y, z = MODEL.quats.unbind(1)
+    turned = torch.stack([w - z, x + y, y - x, w + z], dim=1)  # q (1, 0, 0, 1): x and y change places
+    reordered = replace(MODEL, quats=turned, log_scales=MODEL.log_scales[:, [1, 0, 2]])
+    for other in (replace(MODEL, quats=-MODEL.quats), reordered):
+        for name, values in features(other).items():
+            np.testing.assert_allclose(values, features(MODEL)[name], atol=1e-5, err_msg=name)
+
+
+def test_round_gaussians_have_no_rotation() -> None:
+    ball = replace(MODEL, log_scales=MODEL.log_scales[:, :1].expand(-1, 3))
+    assert not features(random_rotations(ball))["rotation"].any()
+
+
+def test_values_that_are_not_finite_give_finite_features() -> None:
+    logits = MODEL.opacity_logits.clone()
+    logits[:3] = torch.tensor([math.nan, math.inf, -math.inf])
+    found = features(replace(MODEL, opacity_logits=logits, quats=0 * MODEL.quats))
+    assert all(np.isfinite(values).all() for values in found.values())
+    assert found["opacity"][:3, 0].tolist() == [-16, 16, -16]
 
 
 def test_too_little_is_refused() -> None:
+    with pytest.raises(UsageError, match="empty"):
+        features(MODEL[:0])
+    with pytest.raises(UsageError, match="two control models"):
+        auc_beside_controls(MODEL, [OTHER], MODEL)
     with pytest.raises(UsageError, match="at least 100"):
         two_sample_auc(MODEL, MODEL[:99])
     with pytest.raises(UsageError, match="too few places"):

@@ -21,7 +21,6 @@ from keyss.audits.record import (
 )
 from keyss.audits.subject import AuditSubject
 from keyss.files.images import picture_names
-from keyss.measure.distances import against_controls, beside_controls
 from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
 from keyss.measure.leaks.attacks import decoder_attack, file_attacks, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
@@ -30,7 +29,7 @@ from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import SpeedResult, measure_speed
 from keyss.measure.stealth.judging import StealthResult, judge
 from keyss.measure.stegexpose import stegexpose_auc
-from keyss.measure.two_sample import two_sample_auc
+from keyss.measure.two_sample import auc_beside_controls
 from keyss.runs.files import stego_in
 
 PICTURED_VIEWS = 3
@@ -76,19 +75,17 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
 
 
 def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ParametersResult]:
-    """Distances of the parameters from plain models: 3D-Sinkhorn as published, Wasserstein, a classifier."""
+    """Distances of the parameters from plain models: 3D-Sinkhorn as published, and a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
-    progress(0, 3)
+    progress(0, 2)
     sinkhorn = sinkhorn_3d(original, stego)
     between = tuple(sinkhorn_3d(original, control) for control in controls)
     quality = subject.run.metrics
     secret_psnr = fmean(secret.psnr for secret in quality.secrets)
     score = composite_score(quality.cover.psnr, secret_psnr, sinkhorn.sum)
-    progress(1, 3)
-    distances = against_controls(stego, controls, original=original, seed=seed)
-    progress(2, 3)
-    two_sample = beside_controls(partial(two_sample_auc, seed=seed), stego, controls, original)
-    return PartResult(ParametersResult(sinkhorn, between, score, distances, two_sample))
+    progress(1, 2)
+    two_sample = auc_beside_controls(stego, controls, original, seed=seed)
+    return PartResult(ParametersResult(sinkhorn, between, score, two_sample))
 
 
 def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[StealthResult]:
@@ -146,7 +143,7 @@ def robustness(
 
 
 def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[SpeedResult]:
-    """Times, sizes, and whether third-party programs read the files."""
+    """Rendering and revealing times, and file sizes."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]
     result = measure_speed(

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import InputError
-from keyss.measure.auc import Auc
-from keyss.measure.distances import AttributeDistance, Beside
 from keyss.measure.hiding import WrongKeys
 from keyss.measure.images import ImageComparison
 from keyss.measure.leaks.looking import AttackResult
@@ -17,6 +15,7 @@ from keyss.measure.sinkhorn import Sinkhorn3D
 from keyss.measure.speed import SpeedResult
 from keyss.measure.stealth.judging import StealthResult
 from keyss.measure.stegexpose import StegExposeAuc
+from keyss.measure.two_sample import TwoSampleAucs
 from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
@@ -38,7 +37,6 @@ class AuditedRun:
     standard: bool = True  # whether a 3DGS model is published
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
-    up: str = "-y"  # the way up in the cover: "-y", "z" or "y"
 
 
 @dataclass(frozen=True)
@@ -68,8 +66,7 @@ class ParametersResult:
     sinkhorn: Sinkhorn3D  # as published, from the cover's plain model
     sinkhorn_controls: tuple[Sinkhorn3D, ...]
     score: float  # composite score (KeySS, eq. 10)
-    distances: dict[str, AttributeDistance]
-    two_sample: Beside[Auc]
+    two_sample: TwoSampleAucs
 
 
 @dataclass(frozen=True)

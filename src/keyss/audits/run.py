@@ -26,17 +26,16 @@ from keyss.audits.record import (
 from keyss.audits.subject import AuditSubject, subject_of
 from keyss.core import Interrupted, UsageError, import_extra, signal_of
 from keyss.files.atomic import write_bytes
-from keyss.files.layout import usual_up
 from keyss.fitting import Reporter, SilentReporter
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import REPORT, stego_in, writers
+from keyss.runs.files import REPORT, writers
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.opening import HidingRun, open_run
 from keyss.runs.sources import PathLike
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
-EXTRA = ("jinja2", "matplotlib", "ot", "sklearn")
+EXTRA = ("jinja2", "ot", "sklearn")
 KEPT = ("hide", "demo", "controls")  # stages of a run whose files an audit keeps
 
 
@@ -124,19 +123,17 @@ def audit(
         )
         files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
         there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **files}))
-        folder.write(writers({REPORT: report_bytes(result, there, stego_in(opened.folder))}))
+        folder.write(writers({REPORT: report_bytes(result, there)}))
     return result
 
 
 def _report(run: Path) -> Audit:
     """Write the report of the audit that a run has; nothing else of the run changes."""
     import_extra("jinja2", "audit", "write a report")
-    import_extra("matplotlib", "audit", "write a report")
     from keyss.audits.page import report_bytes
 
     result = read_audit(run)
-    data = report_bytes(result, run, stego_in(run))
-    write_again(run, "audit", REPORT, partial(write_bytes, data=data))
+    write_again(run, "audit", REPORT, partial(write_bytes, data=report_bytes(result, run)))
     return result
 
 
@@ -163,6 +160,5 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         gaussians=len(run.stego),
         standard=registry.get(run.config.method).capabilities.standard,
         config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as reading gives it back
-        up=usual_up(cover),
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

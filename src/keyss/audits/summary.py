@@ -1,7 +1,7 @@
 """The summary of an audit: a verdict for each measure.
 
 *fine*: within the limit. *visible*: without the key it may be visible that something is hidden, or what.
-*missed*: nothing is visible, but the quality is lower than it should be. *not measured*: a tool was missing.
+*missed*: nothing is visible, but the quality is lower than it should be.
 All limits are here, except those of leaks, which are in `keyss.measure.leaks.scores`.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from keyss.audits.numbers import decibel, difference, number, numbered, significant, times
+from keyss.audits.numbers import decibel, difference, number, numbered, significant
 from keyss.audits.record import Audit
 from keyss.measure.auc import Auc
 from keyss.measure.leaks.looking import AttackResult
@@ -20,7 +20,6 @@ from keyss.measure.leaks.scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference
 IDENTICAL = 119.9  # dB; a given model has 120 against its own renders
-DISTANCE_RATIO = 1.5  # distance from controls / distance between controls
 TWO_SAMPLE_AUC = 0.6  # of the classifier between the Gaussians of two models
 AUC_TOLERANCE = 0.01  # above the AUC of the cover's own plain model
 UNUSUAL = 0.01  # p, corrected for the number of statistics
@@ -29,7 +28,7 @@ WRONG_KEY = 1.0  # dB above chance level
 PRUNING, PRUNED = "random pruning", 0.25  # the attack, and its share of the Gaussians
 PRUNING_LOSS = 1.5  # dB that the secret may lose more than the cover
 
-Word = Literal["fine", "visible", "missed", "not measured"]
+Word = Literal["fine", "visible", "missed"]
 
 
 @dataclass(frozen=True)
@@ -51,27 +50,22 @@ def verdicts(audit: Audit) -> list[Verdict]:
         *_wrong_keys(audit),
         *_leaks(audit),
         *_stealth(audit),
-        *_distances(audit),
         *_two_sample(audit),
         *_renders(audit),
         *_pruning(audit),
-        *_readers(audit),
     ]
 
 
 def headline(lines: Sequence[Verdict]) -> str:
     """The summary in one or two sentences."""
-    judged = [line for line in lines if line.word != "not measured"]
-    if not judged:
+    if not lines:
         return "Nothing was measured that could be judged."
-    fine = sum(line.word == "fine" for line in judged)
-    if fine == len(judged) == 1:
-        parts = ["The one measure is within its limit."]
-    elif fine == len(judged):
+    fine = sum(line.word == "fine" for line in lines)
+    if fine == len(lines):
         parts = [f"All {fine} measures are within their limits."]
     else:
-        parts = [f"{fine} of {len(judged)} measures are within their limits."]
-    for word in ("visible", "missed", "not measured"):
+        parts = [f"{fine} of {len(lines)} measures are within their limits."]
+    for word in ("visible", "missed"):
         names = [line.measure for line in lines if line.word == word]
         if names:
             parts.append(f"{word.capitalize()}: {', '.join(names)}.")
@@ -87,12 +81,6 @@ def worst_leak(attacks: Iterable[AttackResult]) -> AttackResult | None:
     """The attack without the key that shows the most of the secret."""
     without_key = (attack for attack in attacks if not attack.with_key)
     return max(without_key, key=lambda attack: attack.best_leak.evidence(), default=None)
-
-
-def missing_readers(audit: Audit) -> dict[str, str]:
-    """Readers that are not installed, and how to install them."""
-    readers = audit.speed.readers if audit.speed else ()
-    return {each.reader: each.note or "not installed" for each in readers if each.loads is None}
 
 
 def _word(within: bool, otherwise: Word = "visible") -> Word:
@@ -164,20 +152,6 @@ def _stealth(audit: Audit) -> Iterator[Verdict]:
         yield Verdict("guessing the secret", value, beside, limit, word, "stealth")
 
 
-def _distances(audit: Audit) -> Iterator[Verdict]:
-    distances = audit.parameters.distances if audit.parameters else {}
-    judged = {name: each for name, each in distances.items() if each.ratio is not None}
-    if not judged:
-        return
-    limits = {name: max(DISTANCE_RATIO, 1.01 * (each.original or 0)) for name, each in judged.items()}
-    name, worst = max(judged.items(), key=lambda item: (item[1].ratio or 0) / limits[item[0]])
-    own = "" if worst.original is None else f"; the cover's plain model {times(worst.original)}"
-    value, beside = f"{name} {times(worst.ratio)}", f"1×, between plain models{own}"
-    limit = f"at most {DISTANCE_RATIO}×, or as the plain model's"
-    word = _word((worst.ratio or 0) <= limits[name])
-    yield Verdict("attributes of the Gaussians", value, beside, limit, word, "statistics")
-
-
 def _two_sample(audit: Audit) -> Iterator[Verdict]:
     if audit.parameters is None:
         return
@@ -213,17 +187,3 @@ def _pruning(audit: Audit) -> Iterator[Verdict]:
         value = f"secret {difference(-worst)} dB" if opens else "the secret does not open"
         beside = f"cover {difference(-change.cover.loss)} dB"
         yield Verdict(measure, value, beside, f"at most {decibel(PRUNING_LOSS, 1)} more", word, "robustness")
-
-
-def _readers(audit: Audit) -> Iterator[Verdict]:
-    tried = [each for each in (audit.speed.readers if audit.speed else ()) if each.loads is not None]
-    if tried:
-        failing = dict.fromkeys(each.reader for each in tried if not each.loads)
-        reading = dict.fromkeys(each.reader for each in tried if each.reader not in failing)
-        parts = [f"by {', '.join(reading)}"] if reading else []
-        parts += [f"not by {', '.join(failing)}"] if failing else []
-        word = _word(not failing, "missed")
-        yield Verdict("reading by other programs", "; ".join(parts), "", "by all", word, "speed")
-    if missing := missing_readers(audit):
-        measure = f"reading by {', '.join(missing)}"
-        yield Verdict(measure, "not installed", "", "by all", "not measured", "not-measured")

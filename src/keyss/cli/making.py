@@ -163,9 +163,9 @@ def convert(
 ) -> None:
     """Convert a model to another format, and report the cost.
 
-    The suffix of OUT selects the format: .ply, .compressed.ply, .spz, .sog, .glb or .splat; the
-    meta.json of a SOG folder can only be read. All formats but .ply round values, which destroys what is
-    hidden in low bits, and most reorder Gaussians. The cost is the PSNR between renders before and after.
+    The suffix of OUT selects the format: .ply, .compressed.ply, .spz, .sog, .glb or .splat. All formats
+    but .ply round values, which destroys what is hidden in low bits, and most reorder Gaussians. The cost
+    is the PSNR between renders before and after.
 
     example: keyss convert cover.ply cover.spz
 

@@ -30,6 +30,7 @@ _KINDS = (
     _Kind("a glTF file", _MODEL, (".glb",), (b"glTF",)),
     _Kind("a .ksplat model", CONVERT, (".ksplat",)),
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
+    _Kind("an unpacked SOG model", CONVERT, ("meta.json",)),
     _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),
     _Kind("a table", _EXPORT, (".csv", ".tsv")),
     _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),

@@ -42,7 +42,7 @@ class ModelFormat:
     suffixes: tuple[str, ...]  # lower case, with the dot; the first is the usual one
     magic: tuple[bytes, ...]  # possible first bytes; empty: recognised by name only
     read: Callable[[BinaryIO], Gaussians]  # onto the CPU; raises InputError
-    write: Callable[[Gaussians, BinaryIO], None] | None  # raises OutputError
+    write: Callable[[Gaussians, BinaryIO], None]  # raises OutputError
     is_exact: bool = False  # True if all numbers are kept to the last bit
 
 
@@ -82,18 +82,12 @@ def _read_any_ply(file: BinaryIO) -> Gaussians:
     return _reader("compressed_ply")(file) if has_packed_header(file) else read_ply(file)
 
 
-def _read_sog_folder(file: BinaryIO) -> Gaussians:
-    model: Gaussians = _format("sog").read_sog_folder(file)
-    return model
-
-
 # A file name belongs to the first format with a fitting suffix.
 FORMATS = [
     ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer("compressed_ply")),
     ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, is_exact=True),
     ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz"), _writer("spz")),
     ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog"), _writer("sog")),
-    ModelFormat("SOG", ("meta.json",), (), _read_sog_folder, None),
     ModelFormat("glTF", (".glb",), (b"glTF",), _reader("glb"), _writer("glb")),
     ModelFormat(".splat", (".splat",), (), _reader("splat"), _writer("splat")),
 ]
@@ -173,7 +167,7 @@ def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path]
 
 
 def known_suffixes() -> str:
-    """The suffixes of all formats that can be read, for messages."""
+    """The suffixes of all formats, for messages."""
     return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)
 
 
@@ -183,11 +177,10 @@ def _by_suffix(path: Path | str) -> ModelFormat | None:
 
 
 def _for_writing(path: Path | str) -> ModelFormat:
-    """The format of the suffix. Raises UsageError if it is unknown or cannot be written."""
+    """The format of the suffix. Raises UsageError if it is unknown."""
     found = _PLY if is_standard(path) else _by_suffix(path)
-    if found is None or found.write is None:
-        known = ", ".join(suffix for each in FORMATS if each.write for suffix in each.suffixes)
-        raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known}")
+    if found is None:
+        raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known_suffixes()}")
     return found
 
 
@@ -204,7 +197,6 @@ def _writer_for(path: Path | str, model: Gaussians) -> Callable[[Gaussians, Bina
             f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
             "use a name that ends in .ply"
         )
-    assert found.write is not None
     return found.write
 
 

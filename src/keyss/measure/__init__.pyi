@@ -1,12 +1,4 @@
 from .auc import Auc as Auc, auc_between as auc_between, delong as delong
-from .distances import (
-    AttributeDistance as AttributeDistance,
-    Beside as Beside,
-    against_controls as against_controls,
-    attribute_distances as attribute_distances,
-    beside_controls as beside_controls,
-    features as features,
-)
 from .hiding import (
     BaselineQuality as BaselineQuality,
     HidingQuality as HidingQuality,
@@ -79,4 +71,8 @@ from .stegexpose import (
     steganalyze as steganalyze,
     stegexpose_auc as stegexpose_auc,
 )
-from .two_sample import two_sample_auc as two_sample_auc
+from .two_sample import (
+    auc_beside_controls as auc_beside_controls,
+    features as features,
+    two_sample_auc as two_sample_auc,
+)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,8 +23,6 @@ from keyss.measure.robustness.conversions import find_package, transform
 from keyss.measure.robustness.survival import Opener, reveal_changed
 from keyss.rendering import render
 
-Columns = dict[str, np.ndarray[Any, Any]]
-
 
 @dataclass(frozen=True)
 class RenderTime:
@@ -40,7 +37,6 @@ class ReaderResult:
     """Whether a third-party program reads a file."""
 
     reader: str
-    file: str
     loads: bool | None  # whether all values are equal to the last bit; None: not tried
     gaussians: int | None = None  # number that it reads
     note: str | None = None  # why it fails or was not tried
@@ -48,12 +44,11 @@ class ReaderResult:
 
 @dataclass(frozen=True)
 class SpeedResult:
-    """Times, sizes and readers of the published model ("stego") and of the revealed ones ("secret N")."""
+    """Times and sizes of the published model ("stego") and of the revealed ones ("secret N")."""
 
     render: dict[str, RenderTime]
     reveal_seconds: tuple[float, ...]  # from file to file for each secret, key derivation included
     bytes: dict[str, int]
-    readers: tuple[ReaderResult, ...]
 
 
 def measure_speed(
@@ -72,7 +67,6 @@ def measure_speed(
     open.
     """
     times: dict[str, RenderTime] = {}
-    readings: list[ReaderResult] = []
     with tempfile.TemporaryDirectory() as folder:
         files, seconds = {"stego": stego}, []
         for number, opener in enumerate(openers, start=1):
@@ -84,9 +78,8 @@ def measure_speed(
                 progress(number, len(files))
             model = read_model(files[name]).to(device)
             times[name] = render_time(model, plain.to(device), scene, rounds=rounds)
-            readings += [replace(reading, file=name) for reading in readers(files[name])]
         sizes = {name: file.stat().st_size for name, file in files.items()}
-    return SpeedResult(times, tuple(seconds), sizes, tuple(readings))
+    return SpeedResult(times, tuple(seconds), sizes)
 
 
 @torch.no_grad()
@@ -126,63 +119,36 @@ def reveal_seconds(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) 
 
 
 def readers(path: Path) -> list[ReaderResult]:
-    """Whether plyfile, gsply and splat-transform read a model file."""
-    programs = {"plyfile": _plyfile, "gsply": _gsply, "splat-transform": _splat_transform}
+    """Whether plyfile, gsply and splat-transform read a model file: compares the copies that they write."""
+    programs = {"plyfile": _plyfile, "gsply": _gsply, "splat-transform": transform}
     if path.name.endswith(DECODED_SUFFIX):
         note = "a network renders it: it is not a 3DGS model"
-        return [ReaderResult(name, path.name, False, note=note) for name in programs]
+        return [ReaderResult(name, False, note=note) for name in programs]
     if path.suffix != ".ply" or is_compressed(path):
         note = "only a .ply of floats stores every number exactly"
-        return [ReaderResult(name, path.name, None, note=note) for name in programs]
-    expected = _columns_of(read_model(path))
+        return [ReaderResult(name, None, note=note) for name in programs]
+    expected = read_model(path)
     results: list[ReaderResult] = []
-    for name, read in programs.items():
-        try:
-            columns = read(path)
-        except BackendError as error:
-            results.append(ReaderResult(name, path.name, None, note=f"{error}"))
-        except (KeyssError, OSError, ValueError, KeyError) as error:
-            results.append(ReaderResult(name, path.name, False, note=f"{error}"))
-        else:
-            equal = all(np.array_equal(columns[key], values) for key, values in expected.items())
-            results.append(ReaderResult(name, path.name, equal, len(columns["means"])))
+    with tempfile.TemporaryDirectory() as folder:
+        for name, copied in programs.items():
+            try:
+                model = read_model(copied(path, Path(folder) / f"{name}.ply"))
+            except BackendError as error:
+                results.append(ReaderResult(name, None, note=f"{error}"))
+            except (KeyssError, OSError, ValueError, KeyError) as error:
+                results.append(ReaderResult(name, False, note=f"{error}"))
+            else:
+                equal = model.digest() == expected.digest()
+                results.append(ReaderResult(name, equal, len(model)))
     return results
 
 
-def _columns_of(model: Gaussians) -> Columns:
-    return {name: values.numpy() for name, values in vars(model).items()}
+def _plyfile(source: Path, target: Path) -> Path:
+    find_package("plyfile").PlyData.read(source).write(target)
+    return target
 
 
-def _plyfile(path: Path) -> Columns:
-    vertices = find_package("plyfile").PlyData.read(path)["vertex"]
-
-    def columns(*names: str) -> np.ndarray[Any, Any]:
-        return np.stack([vertices[name] for name in names], axis=1)
-
-    rest = sum(field.name.startswith("f_rest_") for field in vertices.properties)
-    constant = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-    higher = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else constant[:, :0, 0]
-    return {
-        "means": columns("x", "y", "z"),
-        "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        "log_scales": columns("scale_0", "scale_1", "scale_2"),
-        "opacity_logits": np.asarray(vertices["opacity"]),
-        "sh": np.concatenate([constant, higher.reshape(len(constant), 3, -1).transpose(0, 2, 1)], axis=1),
-    }
-
-
-def _gsply(path: Path) -> Columns:
-    data = find_package("gsply").plyread(path)
-    count = len(data.means)
-    return {
-        "means": data.means,
-        "quats": data.quats,
-        "log_scales": data.scales,
-        "opacity_logits": data.opacities.reshape(count),
-        "sh": np.concatenate([data.sh0[:, None], data.shN.reshape(count, -1, 3)], axis=1),
-    }
-
-
-def _splat_transform(path: Path) -> Columns:
-    with tempfile.TemporaryDirectory() as folder:
-        return _columns_of(read_model(transform(path, Path(folder) / "copy.ply")))
+def _gsply(source: Path, target: Path) -> Path:
+    gsply = find_package("gsply")
+    gsply.plywrite(target, gsply.plyread(source))
+    return target

@@ -1,9 +1,4 @@
 from .live import LiveTraining as LiveTraining
-from .page import (
-    asset as asset,
-    embedding_rules as embedding_rules,
-    export_html as export_html,
-    page_with as page_with,
-)
+from .page import asset as asset, export_html as export_html, page_with as page_with
 from .serving import ModelServer as ModelServer
 from .showing import is_readable as is_readable

@@ -61,12 +61,6 @@ def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
     )
 
 
-def embedding_rules() -> dict[str, str]:
-    """Sources by directive that the policy of a page with `page_with` in a frame has to allow."""
-    script = f"{_hash(asset(SCRIPT).decode())} {_WASM}"
-    return {"script-src": script, "worker-src": "blob:", "img-src": "blob: data:"}
-
-
 def export_html(
     model: Path | str, out: Path | str, *, up: str = "-y", overwrite: bool = False
 ) -> tuple[Path, ...]:

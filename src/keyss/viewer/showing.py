@@ -46,8 +46,6 @@ def readable(model: Path) -> Readable:
     name, kind = f"{model.stem}.ply", f"a {model.suffix}"
     if header.startswith(b"ply"):
         kind = "a .ply in text"
-    elif model.name.lower() == "meta.json":
-        name, kind = f"{model.absolute().parent.name or 'model'}.sog", "a SOG folder"
     data = model_bytes(name, gaussians)
     warnings.warn(
         f"{model}: the page does not read {kind}; it shows a lossless copy, {name}",

@@ -180,20 +180,6 @@ def test_a_meta_json_that_lies(change: Callable[[dict], object], words: str) -> 
     refused("a.sog", with_meta(change), words)
 
 
-def test_a_sog_folder_refers_only_to_files_in_it(tmp_path: Path) -> None:
-    for name, content in contents(model_bytes("a.sog", MODEL)).items():
-        (tmp_path / name).write_bytes(content)
-    assert len(read_model(tmp_path / "meta.json")) == len(MODEL)
-    (tmp_path / "inside").mkdir()
-    meta = json.loads((tmp_path / "meta.json").read_text())
-    meta["quats"]["files"] = ["../quats.webp"]
-    for name in contents(model_bytes("a.sog", MODEL)):
-        (tmp_path / "inside" / name).write_bytes((tmp_path / name).read_bytes())
-    (tmp_path / "inside" / "meta.json").write_text(json.dumps(meta))
-    with pytest.raises(InputError, match=r"there is no '\.\./quats\.webp' beside it"):
-        read_model(tmp_path / "inside" / "meta.json")
-
-
 # --- versions, and numbers that are none -----------------------------------------------------------------
 
 

@@ -123,16 +123,6 @@ def test_we_read_splat_transforms_glb(splat_transform: Transform, tmp_path: Path
     assert_close(found, model, 1e-6)
 
 
-def test_a_folder_of_sog(splat_transform: Transform, tmp_path: Path) -> None:
-    write_model(tmp_path / "in.ply", model_of(300, 1))
-    (tmp_path / "sog").mkdir()
-    meta = splat_transform(tmp_path / "in.ply", tmp_path / "sog" / "meta.json", "-i", "1")
-    whole = splat_transform(tmp_path / "in.ply", tmp_path / "a.sog", "-i", "1")
-    found, expected = read_model(meta), read_model(whole)
-    assert_close(found.with_sh_degree(0), expected.with_sh_degree(0), 1e-6)
-    assert float((found.sh - expected.sh).abs().max()) < 0.2  # its search for a palette is random
-
-
 def of_gsply(data: gsply.GSData, *, turned: bool = False) -> Gaussians:
     """A model from gsply; `turned` rotates it from the frame of an .spz to that of a .ply."""
     n = len(data.means)

@@ -212,8 +212,5 @@ def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[
         made.result.metrics.secrets[0].psnr, abs=0.1
     )
     assert found.speed is not None
-    ours = [each for each in found.speed.readers if each.file == "secret 1"]
-    assert ours
-    assert not any(each.loads for each in ours)
     assert main(["audit", str(made.out), "--report-only"]) == 0
     assert ("not publish a 3DGS model" in (made.out / "private" / "report.html").read_text()) != standard

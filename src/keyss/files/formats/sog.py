@@ -7,10 +7,8 @@ files into codes and back; `sog_bundle` handles the archive and its images.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -70,15 +68,10 @@ class SogCodes(Codes):
 
 def parse(data: bytes) -> SogCodes:
     """The codes of a .sog. Raises InputError if it is not a complete SOG of version 2."""
-    with bundle.opened(data) as archive:
-        return parse_files(bundle.member(archive), len(data))
-
-
-def parse_files(file: Callable[[str], bytes], size: int) -> SogCodes:
-    """The codes of a meta.json and its images. `file` reads one of them by name; `size` is their total."""
+    file = bundle.opened(data)
     meta = bundle.read_meta(file("meta.json"))
     n = meta.count
-    check_count(n, size)
+    check_count(n, len(data))
 
     def image(names: list[str], index: int = 0) -> Bytes:
         """[N, 4] the first N pixels, RGBA."""
@@ -219,15 +212,6 @@ def read_sog(data: bytes) -> CodedGaussians:
     """The model in a .sog. Raises InputError."""
     codes = parse(data)
     return CodedGaussians.of(dequantise(codes), codes)
-
-
-def read_sog_folder(file: BinaryIO) -> Gaussians:
-    """The model of an open meta.json and the images beside it. Raises InputError."""
-    meta = Path(getattr(file, "name", ""))
-    if not meta.is_file():
-        raise InputError("expected a meta.json with its images beside it")
-    size = sum(image.stat().st_size for image in meta.parent.glob("*.webp"))
-    return dequantise(parse_files(bundle.beside(meta), size))
 
 
 def write_sog(model: Gaussians) -> bytes:

@@ -8,7 +8,6 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -16,8 +15,6 @@ from PIL import Image
 
 from keyss.core.errors import InputError
 from keyss.files.formats.common import Bytes, reason
-from keyss.files.reading import read_file
-from keyss.files.streams import MAX_BYTES
 
 _MAX_META_BYTES = 1 << 20
 _MAX_MEMBERS = 64
@@ -95,19 +92,17 @@ def read_meta(data: bytes) -> Meta:
     return meta
 
 
-def opened(data: bytes) -> zipfile.ZipFile:
-    """The archive. Raises InputError."""
+def opened(data: bytes) -> Callable[[str], bytes]:
+    """A function that reads a file of the archive by name, unpacked to at most twice the archive's size.
+
+    Raises InputError, as the function does.
+    """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except _BROKEN as error:
         raise InputError(f"not a whole SOG: {reason(error)}") from error
     if len(archive.infolist()) > _MAX_MEMBERS:
         raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(archive.infolist()):,}")
-    return archive
-
-
-def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
-    """A function that reads a file of the archive by name, unpacked to at most twice the archive's size."""
     size = sum(info.compress_size for info in archive.infolist())
 
     def read(name: str) -> bytes:
@@ -126,18 +121,6 @@ def member(archive: zipfile.ZipFile) -> Callable[[str], bytes]:
             ) from error
         except _BROKEN as error:
             raise InputError(f"damaged SOG: {name[:80]!r}: {reason(error)}") from error
-
-    return read
-
-
-def beside(meta: Path) -> Callable[[str], bytes]:
-    """A function that reads a file of the meta.json's folder by name."""
-
-    def read(name: str) -> bytes:
-        path = meta if name == "meta.json" else meta.parent / name
-        if Path(name).name != name or "\0" in name or not path.is_file():
-            raise InputError(f"not a whole SOG: there is no {name[:80]!r} beside it")
-        return read_file(path, _MAX_META_BYTES if path is meta else MAX_BYTES)
 
     return read
 

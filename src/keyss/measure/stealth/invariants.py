@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.distances import space_cells
 from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
 from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Words, doubles
+from keyss.measure.two_sample import space_cells
 
 _UNIT = 5e-7  # error of a length normalised in float32
 _MOVED, _AROUND = 2e-4, 2e-3  # how far embedding moves a length; the range that gives the smooth density

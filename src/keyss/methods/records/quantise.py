@@ -29,6 +29,7 @@ import torch
 from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
+from keyss.files.formats.common import from_smallest_three, smallest_three, unit
 from keyss.methods.records.lines import (
     COLOUR,
     EVEN,
@@ -75,10 +76,12 @@ class Codec:
     def codes(self, gaussians: Gaussians) -> list[Codes]:
         """Codes [N, columns] for each entry of `table.layout`."""
         outlier = outliers(gaussians)
-        left_out, three = _three_smallest(_doubles(gaussians.quats))
+        quats = _doubles(gaussians.quats)
+        quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
+        left_out, three = smallest_three(unit(quats))
         columns = [
             outlier[:, None].astype(np.uint32),
-            left_out,
+            left_out[:, None].astype(np.uint32),
             _QUAT_LINE.encode(three, self.table.bits[2]),
         ]
         every = zip(self.lines, _bits(self.table), _numbers(gaussians), strict=True)
@@ -196,24 +199,9 @@ def _numbers(gaussians: Gaussians) -> Iterator[Floats]:
         first += count
 
 
-def _three_smallest(quats: Floats) -> tuple[Codes, Floats]:
-    """[N, 1] the index of the largest component, and [N, 3] the others, with signs that make it positive."""
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    turned = length > _MIN_LENGTH
-    unit = np.where(turned, quats / np.where(turned, length, 1), [1.0, 0, 0, 0])
-    largest = np.abs(unit).argmax(axis=1)[:, None]
-    unit = unit * np.where(np.take_along_axis(unit, largest, 1) < 0, -1.0, 1.0)
-    others = np.arange(3) + (np.arange(3) >= largest)
-    return largest.astype(np.uint32), np.take_along_axis(unit, others, 1)
-
-
 def _whole_quats(largest: Codes, three: Floats) -> Floats:
     """[N, 4] unit quaternions, also for codes that no quaternion has."""
-    index = largest.astype(np.int64)
-    quats = np.empty((len(three), 4))
-    np.put_along_axis(quats, np.arange(3) + (np.arange(3) >= index), three, 1)
-    rest = np.sqrt((1 - np.square(three).sum(axis=1, keepdims=True)).clip(0))
-    np.put_along_axis(quats, index, rest, 1)
+    quats = from_smallest_three(largest[:, 0].astype(np.uint8), three)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True).clip(0.5)
     return quats
 
