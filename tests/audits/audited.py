@@ -16,6 +16,7 @@ import pytest
 import keyss
 from keyss import KeyssOptions, Secret
 from keyss.audits import Audit, audit
+from keyss.core import KeyssWarning
 from keyss.measure import Change, converters, half_floats, random_pruning
 from keyss.measure.robustness import survival
 from test_api import CONFIG, write_nerfstudio
@@ -37,7 +38,7 @@ def audited_run(root: Path) -> None:
         for seed, (scene, key) in enumerate(zip(scenes[1:], KEYS, strict=True), start=1)
     ]
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*appended Gaussians")
+        warnings.simplefilter("ignore", KeyssWarning)  # of secrets that are large for their cover
         keyss.hide(
             scenes[0],
             secrets,
