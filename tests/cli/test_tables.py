@@ -70,7 +70,7 @@ class TestNumbers:
 
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)
-        assert ["Test views: photos held out of training. PSNR, bound, loss and start in dB."] in rows
+        assert ["Test views: photos held out of training. PSNR, bound and loss in dB."] in rows
         assert ["Bound: plain 3DGS of as many Gaussians and as many training steps."] in rows
         assert any(row[0].startswith("Chance level: PSNR of the stego model itself") for row in rows)
         alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
@@ -82,6 +82,17 @@ class TestNumbers:
         assert any("8-bit renders of the given models" in row[0] for row in rows)
         (line,) = (row[0] for row in self.table(replace(METRICS, photos=(True, False))) if "Test" in row[0])
         assert "photos held out of training; for secret 8-bit renders of the given model" in line
+
+    def test_models_that_nothing_trained_have_neither_steps_nor_bounds(self) -> None:
+        rows = self.table(replace(METRICS, photos=(False, False)))
+        assert rows[0] == ["on test views", "PSNR", "SSIM", "Gaussians"]
+        assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
+        assert not any("training steps" in cell for row in rows for cell in row)
+
+    def test_what_is_left_of_a_secret_is_said(self) -> None:
+        baseline = replace(METRICS.baseline, gaussians=(10, 8406))
+        rows = self.table(replace(METRICS, baseline=baseline, secret_gaussians=(2480,)))
+        assert ["The secret kept 2,480 of 8,406 Gaussians, 31.0 dB."] in rows
 
     def test_a_baseline_of_another_size_has_its_number_of_gaussians_beside_it(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(152_746, None))

@@ -53,6 +53,7 @@ from keyss.runs.records import read_record, record_bytes
 from keyss.runs.sources import Background, PathLike, as_scene, path_of
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
+MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit
 _BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; empty renders of dark or small objects can have a high PSNR
 
 
@@ -97,8 +98,9 @@ def hide(
     says which baselines had fewer steps. `dry_run`: check arguments, and return only the plan.
 
     At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
-    below `min_psnr` (dB), or no better than that of empty pictures, nothing is published, and QualityError is
-    raised; checkpoints stay. Of several processes of torchrun the first one writes, measures and reports.
+    below `min_psnr` (dB; below 25, for secrets that were pruned without a refit, unless `min_psnr` is below
+    20), or no better than that of empty pictures, nothing is published, and QualityError is raised;
+    checkpoints stay. Of several processes of torchrun the first one writes, measures and reports.
     Raises other KeyssErrors too, and Interrupted on Ctrl-C.
     """
     if any(secret.file is not None for secret in secrets):
@@ -193,11 +195,13 @@ def hide(
         stego = chosen.hide(sources[0], sources[1:], options, context)
         shown: list[Shown] = []
         if ranks.first:
+            read = _as_read(stego, keys, folder)
             shown = [
                 show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
-                for model, each in zip(_as_read(stego, keys, folder), sources, strict=True)
+                for model, each in zip(read, sources, strict=True)
             ]
-            _check_quality(shown, min_psnr)
+            pruned = [len(model) < len(each.model) for model, each in zip(read, sources, strict=True)]
+            _check_quality(shown, min_psnr, [each and not options.trains for each in pruned])
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
         if ranks.first:
@@ -252,13 +256,14 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
     return [model, *(each.reveal(model) for each in opened)]
 
 
-def _check_quality(shown: Sequence[Shown], min_psnr: float) -> None:
+def _check_quality(shown: Sequence[Shown], min_psnr: float, pruned: Sequence[bool]) -> None:
     """Raise QualityError if the cover or a secret is too far from its plain model."""
     for index, each in enumerate(_fidelity(shown)):
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
-        if each.psnr < min_psnr:
+        limit = max(min_psnr, MIN_PRUNED_PSNR) if pruned[index] and min_psnr >= MIN_PSNR else min_psnr
+        if each.psnr < limit:
             raise QualityError(
-                f"{who} is at {each.psnr:.1f} dB PSNR to its plain model, below {min_psnr:g} dB: nothing was "
+                f"{who} is at {each.psnr:.1f} dB PSNR to its plain model, below {limit:g} dB: nothing was "
                 "published; `min_psnr` sets the limit, and `resume=True` skips the training that is done"
             )
         if min_psnr > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):

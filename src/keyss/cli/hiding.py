@@ -46,7 +46,12 @@ class Details:
         optional("FILE", "Plain 3DGS model of a secret of photos, one for each secret.", "fitted"),
     ] = ()
     min_psnr: Annotated[
-        float, arg(metavar="DB", help="Fail if cover or secret is further from its plain model than this.")
+        float,
+        arg(
+            metavar="DB",
+            help="Fail if cover or secret is further from its plain model than this; from 20 on, secrets "
+            "that --prune-to-fit cuts need 25 at least.",
+        ),
     ] = 20.0
     bound: Annotated[
         bool,

@@ -59,7 +59,7 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     console = console or Console()
     print_table(heads, [[row.get(head, "") for head in heads] for row in rows], console=console)
     for line in _explanations(metrics, ["cover", *secrets], heads):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, highlight=False, markup=False)
     for name, value in metrics.details.items():
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False, markup=False)
 
@@ -69,8 +69,9 @@ def _scene_rows(metrics: HideMetrics, names: Sequence[str]) -> list[dict[str, st
     baseline, unknown = metrics.baseline, (None,) * len(names)
     sizes = [metrics.gaussians, *metrics.secret_gaussians]
     rows = []
-    for name, own, plain, equal, size, plain_size, steps, plain_steps in zip(
+    for name, photos, own, plain, equal, size, plain_size, steps, plain_steps in zip(
         names,
+        metrics.photos,
         [metrics.cover, *metrics.secrets],
         [baseline.cover, *baseline.secrets],
         baseline.equal or unknown,
@@ -82,6 +83,8 @@ def _scene_rows(metrics: HideMetrics, names: Sequence[str]) -> list[dict[str, st
     ):
         row = {"on test views": name, "PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
         row["Gaussians"] = f"{size:,}"
+        if not photos:  # the test views are renders of the given model, which is no bound of training
+            plain = steps = None
         if steps is not None:
             row["steps"] = f"{steps:,}"
         if plain is not None and equal:
@@ -141,7 +144,9 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
         views = "8-bit renders of the given models"
     elif rendered:
         views += f"; for {', '.join(rendered)} 8-bit renders of the given model"
-    lines = [f"Test views: {views}. PSNR, bound, loss and start in dB."]
+    units = [head for head in ("PSNR", "bound", "loss", "start") if head in heads]
+    listed = units[0] if len(units) == 1 else f"{', '.join(units[:-1])} and {units[-1]}"
+    lines = [f"Test views: {views}. {listed} in dB."]
     size = "as many Gaussians"
     if _sizes_differ(metrics):
         size = "its own number of Gaussians" if _sizes_differ(metrics, 0.02) else "about as many Gaussians"
@@ -158,6 +163,16 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
         )
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
     lines.append(f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB.")
+    kept = zip(
+        names[1:],
+        metrics.secret_gaussians,
+        metrics.baseline.gaussians[1:],
+        metrics.against_plain[1:],
+        strict=True,
+    )
+    for name, count, before, each in kept:
+        of = "" if before is None else f" of {before:,}"
+        lines.append(f"The {name} kept {count:,}{of} Gaussians, {each.psnr:.1f} dB.")
     return lines
 
 

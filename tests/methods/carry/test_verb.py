@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -198,6 +199,35 @@ def test_a_given_model_of_a_scene_is_used() -> None:
     assert keyss.reveal(result.stego, "wrong", decoy=True) is not None
     with pytest.raises(WrongKeyError):
         keyss.reveal(result.stego, "wrong")
+
+
+def test_a_pruned_secret_that_is_not_recognised_is_refused(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--publish", "spz", "--prune-to-fit")
+    status, out, err = run(*hide, "-o", tmp_path / "out")
+    assert status == 7
+    assert "below 25 dB: nothing was published; --min-psnr sets the limit" in err
+    status, out, _ = run(*hide, "-o", tmp_path / "out", "--min-psnr", 0)
+    assert status == 0
+    assert "of 6,000 Gaussians, " in out
+
+
+@pytest.mark.parametrize("unit", [False, True])
+def test_the_degree_that_a_refusal_names_works(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path, unit: bool
+) -> None:
+    cover = trained_like(3000, sh_degree=0)
+    if unit:
+        cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats, dim=1))
+    write_model(tmp_path / "flat.ply", cover)
+    hide = (*HIDE, "--cover", tmp_path / "flat.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
+    status, _, err = run(*hide)
+    assert status == 2
+    (degree,) = re.findall(r"--sh-degree (\d)", err)
+    status, out, _ = run(*hide, "--sh-degree", degree, "--prune-to-fit", "--min-psnr", 0)
+    assert status == 0
+    assert "of 900 Gaussians, " in out
 
 
 def test_pruning_keeps_what_is_visible() -> None:
