@@ -19,7 +19,7 @@ from files.scene_files import write_nerfstudio
 from keyss import load_scene, write_model
 from keyss.api import filming
 from keyss.core import Camera, Gaussians, UsageError
-from keyss.rendering import around, circle, look_at, middle_and_radius, render, through
+from keyss.rendering import around, circle, look_at, middle_and_radius, render
 from tiny_scenes import random_gaussians
 
 Run = Callable[..., Said]
@@ -81,9 +81,8 @@ def test_a_wipe_from_one_model_to_the_other_and_back(keyss: Run, files: Path, tm
         assert frames[index][:, 47:49].mean() > 200
 
 
-@pytest.mark.parametrize("path", ["around", "through"])
-def test_with_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path, path: str) -> None:
-    scene = ("--cameras", files / "scene", "--path", path)
+def test_with_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path) -> None:
+    scene = ("--cameras", files / "scene")
     said = keyss("render", files / "a.ply", *scene, "--video", tmp_path / "s.mp4", "--seconds", 0.2)
     assert said.status == 0, said.err
     cameras = sorted((view.camera for view in load_scene(files / "scene").views), key=lambda each: each.name)
@@ -92,19 +91,9 @@ def test_with_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path, pa
     assert [frame.shape for frame in frames] == [(height - height % 2, width - width % 2, 3)] * 5
 
 
-def test_a_path_goes_through_its_cameras() -> None:
-    cameras = circle(random_gaussians(50), 32, 5)
-    path = through(cameras[::-1], 9)  # by their names, whatever the order
-    for index, camera in enumerate(cameras):
-        torch.testing.assert_close(path[2 * index].viewmat, camera.viewmat, atol=1e-5, rtol=0)
-    for camera in path:
-        rotation = camera.viewmat[:3, :3]
-        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
-    middle = (path[2].position + path[4].position) / 2
-    torch.testing.assert_close(path[3].position, middle, atol=1e-5, rtol=0)
-    assert through(cameras[:1], 3) == [cameras[0]] * 3
-    with pytest.raises(UsageError):
-        through([], 3)
+def test_a_path_needs_cameras() -> None:
+    with pytest.raises(UsageError, match="found none"):
+        around([], 3)
 
 
 def test_a_circle_looks_at_the_middle_from_above() -> None:
@@ -175,7 +164,6 @@ def test_wipes() -> None:
         (("--video", "film.mp4", "--wipe", "none.ply"), 4, "none.ply"),
         (("--video", "there.mp4"), 5, "--overwrite"),
         (("--wipe", "b.ply", "--cameras", "scene", "-o", "x"), 2, "give --video"),
-        (("--path", "through", "--cameras", "scene", "-o", "x"), 2, "give --video"),
         (("-o", "x"), 2, "--cameras SCENE"),
         ((), 2, "--video FILE"),
     ],

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,12 +20,11 @@ from keyss.fitting.reporting import Reporter, SilentReporter
 from keyss.rendering import Backend, render, resolve_device
 from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.orbit import IMAGE_SIZE
-from keyss.rendering.paths import around, circle, through
+from keyss.rendering.paths import around, circle
 from keyss.runs.sources import PathLike, as_model, as_scene
 
 FPS = 25
 MAX_SECONDS = 600.0
-CameraPath = Literal["around", "through"]
 
 _LINE = 2  # pixels between the two sides of a wipe
 
@@ -38,7 +36,6 @@ def write_film(
     views: ViewOptions,
     *,
     wipe: PathLike | Gaussians | None,
-    path: CameraPath,
     seconds: float,
     device: Backend,
     overwrite: bool,
@@ -46,8 +43,6 @@ def write_film(
 ) -> None:
     """Write a video of a model; see `keyss.render`."""
     check_video(out)
-    if path not in ("around", "through"):
-        raise UsageError(f"`path`: expected 'around' or 'through', got {path!r}")
     inputs = [Path(each) for each in (model, wipe) if isinstance(each, str | Path)]
     check_not_an_input(out, inputs)
     check_output_file(out, overwrite)
@@ -64,8 +59,8 @@ def write_film(
         paths = [circle(each, size - size % 2, count) for each in models]
     else:
         scene = as_scene(cameras, views)
-        color, way = scene.background, around if path == "around" else through
-        paths = [[_even(camera) for camera in way([view.camera for view in scene.views], count)]]
+        color = scene.background
+        paths = [[_even(camera) for camera in around([view.camera for view in scene.views], count)]]
         paths *= len(models)
     reporter = reporter or SilentReporter()
     reporter.start(f"video {Path(out).name}", count, 0)

@@ -10,7 +10,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from keyss.api.filming import CameraPath, write_film
+from keyss.api.filming import write_film
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View, ViewOptions
@@ -39,7 +39,6 @@ def render(
     skip_missing: bool = False,
     video: PathLike | None = None,
     wipe: PathLike | Gaussians | None = None,
-    path: CameraPath = "around",
     seconds: float = 8.0,
     device: Backend = "auto",
     out: PathLike | None = None,
@@ -52,10 +51,10 @@ def render(
     gets a PNG for each camera.
 
     With `video` (an .mp4 of 25 frames a second) it writes that instead, and returns no images. The camera
-    circles the model; with `cameras`, it circles what they look at, at their height, or with the path
-    "through" moves from one to the next in the order of their names. `wipe`: a second model, which is
-    uncovered from the left and covered again; without `cameras` each model has a circle of its own. `width`
-    is then 400 pixels by default, and sizes are rounded to even numbers. Raises KeyssError and its children.
+    circles the model; with `cameras`, it circles what they look at, at their height. `wipe`: a second model,
+    which is uncovered from the left and covered again; without `cameras` each model has a circle of its own.
+    `width` is then 400 pixels by default, and sizes are rounded to even numbers. Raises KeyssError and its
+    children.
     """
     views = ViewOptions.of(width, background, skip_missing)
     if video is not None:
@@ -65,7 +64,6 @@ def render(
             cameras,
             views,
             wipe=wipe,
-            path=path,
             seconds=seconds,
             device=device,
             overwrite=overwrite,

@@ -70,10 +70,6 @@ def render(
     out: Annotated[Path | None, optional("FOLDER", "Folder for the images.", aliases=["-o"])] = None,
     split: Annotated[Literal["test", "train", "all"], arg(help="Which cameras of the scene.")] = "test",
     video: Annotated[Path | None, optional("FILE", "Write a video (.mp4) instead of images.")] = None,
-    path: Annotated[
-        Literal["around", "through"],
-        arg(help="Camera path of a video: around what the cameras look at, or from one to the next."),
-    ] = "around",
     wipe: Annotated[
         Path | None, optional("FILE", "Second model, which a wipe uncovers in the video.")
     ] = None,
@@ -103,7 +99,6 @@ def render(
             **vars(photos),
             video=video,
             wipe=wipe,
-            path=path,
             seconds=seconds,
             device=device,
             overwrite=overwrite,
@@ -113,8 +108,8 @@ def render(
         return
     if cameras is None or out is None:
         raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
-    if wipe is not None or seconds != 8.0 or path != "around":
-        raise UsageError("--path, --wipe and --seconds are for videos: give --video FILE")
+    if wipe is not None or seconds != 8.0:
+        raise UsageError("--wipe and --seconds are for videos: give --video FILE")
     images = keyss.render(
         model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
     )

@@ -8,7 +8,7 @@ from .orbit import (
     middle_and_radius as middle_and_radius,
     scene_of_model as scene_of_model,
 )
-from .paths import around as around, circle as circle, through as through
+from .paths import around as around, circle as circle
 from .rasterize import rasterization as rasterization
 from .view import (
     contributions as contributions,

@@ -1,4 +1,4 @@
-"""Camera paths for videos: around a model, around the focus of a scene, or through its cameras."""
+"""Camera paths for videos: around a model, or around the focus of a scene."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
-from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from keyss.core.alignment import up_direction
@@ -45,7 +43,9 @@ def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     photographed arc instead. Lens and size are those of the first camera by name. Raises UsageError if there
     are no cameras.
     """
-    first = _in_order(cameras)[0]
+    if not cameras:
+        raise UsageError("expected a scene with cameras, found none")
+    first = min(cameras, key=lambda camera: camera.name)
     middle, up = focus_point(cameras), up_direction(cameras)
     if up is None:
         up = -first.viewmat[1, :3].double()
@@ -73,34 +73,3 @@ def _angles(seen: Tensor, frames: int) -> list[float]:
         return [start + 2 * math.pi * index / frames for index in range(frames)]
     arc = 2 * math.pi - float(gaps[widest])
     return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * index / frames)) for index in range(frames)]
-
-
-def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A path through `cameras` in the order of their names, with equal time between neighbours.
-
-    Positions are interpolated linearly, rotations by slerp; lens and size are those of the first camera.
-    Raises UsageError if there are no cameras.
-    """
-    ordered = _in_order(cameras)
-    first = ordered[0]
-    if len(ordered) == 1:
-        return [first] * frames
-    poses = np.stack([camera.viewmat.double().numpy() for camera in ordered])
-    turns = Rotation.from_matrix(poses[:, :3, :3])
-    places = np.stack([camera.position.double().numpy() for camera in ordered])
-    stops, times = np.arange(len(ordered)), np.linspace(0, len(ordered) - 1, frames)
-    rotations = Slerp(stops, turns)(times).as_matrix()
-    positions = np.stack([np.interp(times, stops, places[:, axis]) for axis in range(3)], axis=1)
-    found = []
-    for index, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-        pose = torch.from_numpy(viewmat).float()
-        found.append(replace(first, viewmat=pose, name=f"path_{index:04d}.png"))
-    return found
-
-
-def _in_order(cameras: Sequence[Camera]) -> list[Camera]:
-    if not cameras:
-        raise UsageError("expected a scene with cameras, found none")
-    return sorted(cameras, key=lambda camera: camera.name)
