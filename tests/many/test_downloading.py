@@ -17,7 +17,7 @@ from cli.conftest import keyss as keyss
 from cli.said import Said
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss.core import BackendError, InputError
-from keyss.many.paper import scenes
+from keyss.many import scenes
 
 
 class Quiet(SimpleHTTPRequestHandler):

@@ -44,13 +44,20 @@ def run(table: str, folders: list[Path], out: Path, **options: Any) -> Reproduct
     return found
 
 
+def run_of(cell: str, out: Path) -> Path:
+    """The folder of the results of a cell by its name."""
+    (path,) = (path for path in out.glob("cells/*/cell.json") if json.loads(path.read_text())["name"] == cell)
+    return path.parent / "run"
+
+
 def test_a_table_lies_beside_the_papers(out: Path) -> None:
     found = json.loads((out / "pruning.json").read_text())
     assert found["pairs"] == ["a-b"]
-    (row,) = found["rows"]
+    row, ours = found["rows"]
     here = row["here"]
-    (place,) = out.glob("cells/*/run/publish")
-    metrics = json.loads((place.parent / "private" / "metrics.json").read_text())
+    assert ours["here"].keys() == here.keys()
+    assert ours["published"] == {}
+    metrics = json.loads((run_of("KeySS, a-b", out) / "private" / "metrics.json").read_text())
     assert here["whole, cover"] == pytest.approx(metrics["cover"]["psnr"], abs=0.05)
     assert here["whole, secret"] == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.05)
     assert None not in here.values()
@@ -58,7 +65,7 @@ def test_a_table_lies_beside_the_papers(out: Path) -> None:
     assert metrics["steps"] == [20, 20]  # as many as plain 3DGS
     assert metrics["baseline"]["equal"] == [True, True]
     assert {each["verdict"] for each in found["claims"]} <= {"holds", "holds in part", "does not hold here"}
-    assert "| whole, cover | 25.98 |" in (out / "pruning.md").read_text()
+    assert "| whole, cover | 25.98 / " in (out / "pruning.md").read_text()
 
 
 def test_what_is_done_is_not_done_again(
@@ -91,7 +98,7 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
 
     monkeypatch.setattr(performing, "hide", failing)
     found = run("speed", folders, out)
-    assert found.failures == {f"{name}, a-b": "not today" for name in ("3dgs", "gs-hider", "watergs")}
+    assert found.failures == {f"{name}, a-b": "not today" for name in ("3DGS", "GS-Hider", "WaterGS")}
     verdicts = [each.verdict for each in found.claims]
     assert verdicts[0] in ("holds", "holds in part", "does not hold here")  # from the first run
     assert verdicts[1] == "not measured"
@@ -109,7 +116,7 @@ def test_the_command(keyss: Callable[..., Said], out: Path, folders: list[Path],
     assert planned.status == 0, planned.err
     assert not (tmp_path / "new").exists()
     assert [line.split()[1].strip(",") for line in planned.out.splitlines()[1:6]] == [
-        *("plain", "plain", "keyss-op", "keyss-op-ro", "keyss"),
+        *("plain", "plain", "op", "op,ro", "op,ro,sc,xyz"),
     ]
     assert "5 to do" in planned.out
     assert keyss("reproduce", "single", folders[0], "-o", tmp_path / "new").status == 2
@@ -131,8 +138,7 @@ def test_the_papers_scenes_have_its_sizes_and_pairs(
 
 
 def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
-    (place,) = out.glob("cells/*/run/publish/stego.ply")
-    stego = read_model(place)
+    stego = read_model(run_of("KeySS, a-b", out) / "publish" / "stego.ply")
     own = measures.own_gaussians(stego)
     assert 0 < len(own) <= 150 < len(stego)
     for change in (random_pruning(0.25), opacity_pruning(0.25)):

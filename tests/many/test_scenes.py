@@ -9,23 +9,22 @@ import pytest
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss import load_scene, reproduce
 from keyss.core import InputError, UsageError
-from keyss.many.paper import published, scenes
+from keyss.many import paper, reproducing, scenes
 
 SHRUNK = WIDTH // 4
 
 
 def test_every_scene_hides_the_next() -> None:
-    assert scenes.groups_of(["a", "b"], 1) == [("a", "b"), ("b", "a")]
-    assert scenes.groups_of(["a", "b", "c"], 2) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
-    for names, secrets in ((["a"], 1), (["a", "b"], 2), ([], 1)):
-        with pytest.raises(UsageError, match="at least"):
-            scenes.groups_of(names, secrets)
+    groups_of = reproducing.groups_of
+    assert groups_of(["a", "b"], 1, (), None) == [("a", "b"), ("b", "a")]
+    assert groups_of(["a", "b", "c"], 2, (), None) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
 
 
 def test_the_papers_scenes_are_those_of_its_tables() -> None:
-    assert tuple(scenes.BENCHMARK) == (*published.COVERS, "playroom")
-    assert {name for pair in published.PAIRS for name in pair} == set(scenes.BENCHMARK)
-    assert {name for triple in published.TRIPLES for name in triple} <= set(scenes.BENCHMARK)
+    pairs, triples = paper.PAPER.pairs, paper.PAPER.triples
+    assert tuple(scenes.BENCHMARK) == (*(cover for cover, _ in pairs), "playroom")
+    assert {name for pair in pairs for name in pair} == set(scenes.BENCHMARK)
+    assert {name for triple in triples for name in triple} <= set(scenes.BENCHMARK)
 
 
 @pytest.mark.parametrize(
@@ -33,6 +32,8 @@ def test_the_papers_scenes_are_those_of_its_tables() -> None:
     [
         ({"table": "singel", "scenes": ["a", "b"]}, "did you mean single"),
         ({"table": "single"}, "at least 2 scenes"),
+        ({"table": "single", "scenes": ["a"]}, "at least 2 scenes"),
+        ({"table": "multi", "scenes": ["a", "b"]}, "at least 3 scenes"),
         ({"table": "single", "scenes": ["a", "x/a"]}, "different names"),
         ({"table": "single", "scenes": ["a", "b"], "data": "d"}, "leave out the others"),
         ({"table": "single", "scenes": ["a", "b"], "pairs": ["a,c"]}, "no scene is called 'c'"),

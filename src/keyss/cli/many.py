@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -19,8 +19,8 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
-from keyss.many.paper.tables import TableName
 
+TableName = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
 QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
 DryRun = Annotated[bool, switch("Print the runs with estimates of time and memory; write nothing.")]
 
@@ -138,7 +138,7 @@ def reproduce(
     from keyss.cli.tables import print_files, print_forecast, print_table
     from keyss.core.errors import InputError, UsageError
     from keyss.many import Forecast
-    from keyss.many.paper.layout import cells, verdicts
+    from keyss.many.paper import reproduction_notes, reproduction_rows
     from keyss.progress import reporter
 
     if download and (dry_run or data is None):
@@ -162,7 +162,7 @@ def reproduce(
     if isinstance(reproduction, Forecast):
         print_forecast(reproduction, 1)
         return
-    heads, *rows = cells(reproduction)
+    heads, *rows = reproduction_rows(reproduction)
     print_table(heads, rows)
     means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
     described = {
@@ -170,7 +170,7 @@ def reproduce(
         f"{table}.json": "the same, for programs",
         "cells": "the runs, which other tables share",
     }
-    print(*verdicts(reproduction), means, sep="\n")
+    print(*reproduction_notes(reproduction), means, sep="\n")
     print_files(out, described)
     if reproduction.failures:
         raise InputError(f"{len(reproduction.failures)} run(s) failed")

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.errors import InputError, OutputError
 from keyss.core.extras import import_extra
-from keyss.core.nearest import did_you_mean
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 
 TEST_EVERY = 8
-Group = tuple[str, ...]  # names of a cover and of its secrets
 
 # Number of photos, and the folder of those that count: a quarter of their size outdoors, half indoors.
 BENCHMARK: Mapping[str, tuple[int, str]] = {
@@ -92,27 +90,3 @@ def link(data: Path, name: str, folder: Path) -> Path:
             f"found {counted[0]}, {counted[1]} for testing"
         )
     return scene
-
-
-def groups_of(names: Sequence[str], secrets: int) -> list[Group]:
-    """Each scene hides the next ones, the last ones the first again. Raises UsageError for too few."""
-    if len(names) <= secrets:
-        raise UsageError(f"expected at least {secrets + 1} scenes, got {len(names)}")
-    twice = [*names, *names]
-    return [tuple(twice[index : index + secrets + 1]) for index in range(len(names))]
-
-
-def parsed_groups(pairs: Sequence[str], names: Sequence[str], secrets: int) -> list[Group]:
-    """The groups COVER,SECRET or COVER,SECRET,SECRET. Raises UsageError."""
-    found = []
-    for text in pairs:
-        group = tuple(name.strip() for name in text.split(","))
-        if len(group) != secrets + 1 or len(set(group)) < len(group):
-            raise UsageError(
-                f"`pairs`: expected a cover and {secrets} secret(s) of different names, got {text!r}"
-            )
-        for name in group:
-            if name not in names:
-                raise UsageError(f"`pairs`: no scene is called {name!r}; {did_you_mean(name, names)}")
-        found.append(group)
-    return found
