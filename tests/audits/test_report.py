@@ -68,8 +68,9 @@ def test_every_section_is_there_once_and_linked(
 ) -> None:
     page = parsed(run_with(run_folder, tmp_path, data))
     ids = page.values("id")
-    assert sections_of(page) == SECTIONS
-    assert [link[1:] for link in page.values("href")][: len(SECTIONS)] == SECTIONS
+    expected = [name for name in SECTIONS if name != "not-measured"]
+    assert sections_of(page) == expected
+    assert [link[1:] for link in page.values("href")][: len(expected)] == expected
     assert {link[1:] for link in page.values("href")} <= set(ids)
 
 
@@ -99,7 +100,7 @@ def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> 
     shown += [f"{robustness[1]['secrets'][1]['psnr']:.2f}"]
     shown += [f"{data['speed']['render']['stego']['ratio']:.2f}×", "does not open", "Mean over 3 seeds."]
     assert [number for number in shown if number.replace("-", "−") not in page.text] == []
-    assert "half floats bits a number – 16.0" in page.text  # of low bits nothing is left
+    assert "16 bits a number" in page.text
 
 
 def test_pictures_are_in_the_file(page: Parsed, data: dict[str, Any]) -> None:

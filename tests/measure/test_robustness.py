@@ -1,4 +1,4 @@
-"""Losses of cover and secrets after changes of published models, and breakdown points."""
+"""Losses of cover and secrets after changes of published models."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
 from keyss.fitting import mean_psnr
 from keyss.measure import (
-    BreakdownPoint,
     ChangedQuality,
-    ChangeResult,
-    breakdown_points,
     default_changes,
     half_floats,
     measure_robustness,
@@ -92,36 +89,6 @@ def test_a_lost_secret_looks_like_the_cover_from_the_secrets_cameras(scene: Scen
         measure_robustness(model, [], scene, [scene], changes=[])
     with pytest.raises(WrongKeyError):
         measure_robustness(model[:5], [opener], scene, [elsewhere], changes=[])
-
-
-def row(attack: str, strength: float, cover: float, *secrets: tuple[float, bool]) -> ChangeResult:
-    after = [ChangedQuality(30 - loss, loss, opens) for loss, opens in ((cover, True), *secrets)]
-    return ChangeResult(attack, strength, "u", "", cover=after[0], secrets=tuple(after[1:]))
-
-
-@pytest.mark.parametrize(
-    ("losses", "secret_at", "cover_at", "excess"),
-    [
-        ([(1, 2), (3, 6.5), (7, 9)], 1, 2, 3.5),
-        ([(1, 0), (6, 5), (7, 9)], 2, 1, -1),
-        ([(1, 2), (7, 6)], 1, 1, 1),
-        ([(1, 2), (3, 3.5)], None, None, 1),
-        ([(8, 9)], 0, 0, None),
-    ],
-)
-def test_breakdown_points(
-    losses: list[tuple[float, float]], secret_at: int | None, cover_at: int | None, excess: float | None
-) -> None:
-    rows = [row("a", strength, cover, (secret, True)) for strength, (cover, secret) in enumerate(losses)]
-    (point,) = breakdown_points([row("none", 0, 0, (0, True)), *rows])
-    assert point == BreakdownPoint("a", "u", cover_at, secret_at, excess)
-
-
-def test_breakdown_takes_the_worst_secret_and_counts_a_lost_one_as_broken() -> None:
-    first, second = breakdown_points(
-        [row("a", 1, 1.5, (1, True), (3, True)), row("b", 1, 0, (0.1, False), (0, True))]
-    )
-    assert (first.excess, first.secret, second.secret) == (1.5, None, 1)
 
 
 def test_a_secret_that_one_seed_loses_does_not_open(scene: Scene) -> None:

@@ -19,7 +19,6 @@ from keyss.audits.summary import auc_text, headline, verdicts, worst_leak
 from keyss.audits.untrusted import AuditPictures, check_bounds, clean
 from keyss.core import InputError, import_extra
 from keyss.measure.images import ImageComparison
-from keyss.measure.robustness.survival import breakdown_points
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -77,7 +76,6 @@ def report_bytes(audit: Audit, folder: Path) -> bytes:
             comparisons=_comparisons(models),
             worst_leak=worst_leak,
             all_photos=all(model.photos for model in models),
-            breakdown_points=breakdown_points(audit.robustness or ()),
             style=Markup("".join(map(_asset, _STYLES))),
             script=Markup(script),
             policy=_policy(script),

@@ -42,10 +42,8 @@ from .robustness.conversions import (
     transform as transform,
 )
 from .robustness.survival import (
-    BreakdownPoint as BreakdownPoint,
     ChangedQuality as ChangedQuality,
     ChangeResult as ChangeResult,
-    breakdown_points as breakdown_points,
     default_changes as default_changes,
     measure_robustness as measure_robustness,
     reveal_changed as reveal_changed,

@@ -1,4 +1,4 @@
-"""PSNR that cover and secrets lose when the published model changes, and where they break down."""
+"""PSNR that cover and secrets lose when the published model changes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from keyss.methods.opened import Opened
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
 SEEDS = 3  # of each random removal; results vary by a dB or two
-BROKEN_LOSS = 6.0  # dB: four times the squared error
 UNCHANGED = "none"
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
@@ -51,20 +50,6 @@ class ChangeResult:
     skipped: str | None = None  # which tool is missing; `cover` and `secrets` are unset then
     cover: ChangedQuality | None = None
     secrets: tuple[ChangedQuality, ...] = ()
-
-
-@dataclass(frozen=True)
-class BreakdownPoint:
-    """The first strength of an attack that breaks the cover and the secret; None: no strength tried does.
-
-    A scene is broken if it has lost 6 dB or more, and a secret also if it does not open.
-    """
-
-    attack: str
-    unit: str
-    cover: float | None = None
-    secret: float | None = None  # the first that breaks any of the secrets
-    excess: float | None = None  # dB: the maximum that a secret loses more than the unbroken cover
 
 
 def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
@@ -150,26 +135,6 @@ def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
         return secret.reveal(stego)
     except InputError:  # positions changed: it seems to be another model
         return secret.reveal(stego, force=True)
-
-
-def breakdown_points(results: Sequence[ChangeResult]) -> list[BreakdownPoint]:
-    """For each attack among `results`, the first strength that breaks the cover and the secrets."""
-    points: dict[str, BreakdownPoint] = {}
-    for result in results:
-        if result.attack == UNCHANGED or result.cover is None:
-            continue
-        point = points.get(result.attack, BreakdownPoint(result.attack, result.unit))
-        loss = result.cover.loss
-        secret_loss = max((each.loss for each in result.secrets), default=0.0)
-        if point.cover is None and loss >= BROKEN_LOSS:
-            point = replace(point, cover=result.strength)
-        opens = all(each.opens for each in result.secrets)
-        if point.secret is None and (secret_loss >= BROKEN_LOSS or not opens):
-            point = replace(point, secret=result.strength)
-        if loss < BROKEN_LOSS and (point.excess is None or secret_loss - loss > point.excess):
-            point = replace(point, excess=secret_loss - loss)
-        points[result.attack] = point
-    return list(points.values())
 
 
 def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
