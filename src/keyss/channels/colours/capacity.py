@@ -85,10 +85,11 @@ class Capacity:
         """PSNR in dB that views keep beside a payload in all carriers and its headers."""
         if (level, depth) not in self.measured:
             random, bits = np.random.default_rng(0), bit_counts(self.own, level, depth)
+            places = random.uniform(-0.5, 0.5, (len(bits), COLUMNS))  # in steps
             kind = Kind.of(depth)
             bits[random.random(len(bits)) < self._headers(depth)] = kind.depth
             steps = np.where((bits > 0) & ~self.alone[self.own_rows], SPACING * 2.0**bits, 0.0)
-            noise = random.uniform(-0.5, 0.5, (len(bits), COLUMNS)) * steps[:, None]
+            noise = places * steps[:, None]
             sh = self.model.sh.detach().clone()
             sh[self.numbers.rows[self.own_rows], 0, 1:] += sh.new_tensor(noise)
             self.measured[level, depth] = psnr_between(self.model, replace(self.model.detach(), sh=sh))
