@@ -132,3 +132,16 @@ def test_from_python(files: Path, tmp_path: Path) -> None:
     assert found.bytes_after == (tmp_path / "a.sog").stat().st_size
     assert (found.bytes_before, found.secrets, found.keeps_low_bits) == (None, (), False)
     assert torch.equal(found.gaussians.means, read_model(tmp_path / "a.sog").means)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o644])
+def test_others_can_read_what_is_made_of_what_they_can_read(
+    keyss: Callable[..., Said], tmp_path: Path, mode: int
+) -> None:
+    write_model(tmp_path / "m.ply", random_gaussians(50))
+    (tmp_path / "m.ply").chmod(mode)
+    assert keyss("convert", tmp_path / "m.ply", tmp_path / "m.spz").status == 0
+    assert keyss("view", tmp_path / "m.ply", "-o", tmp_path / "page.html").status == 0
+    assert keyss("view", tmp_path / "m.ply", "-o", tmp_path / "page").status == 0
+    made = [tmp_path / "m.spz", tmp_path / "page.html", *(tmp_path / "page").iterdir()]
+    assert {path.stat().st_mode & 0o777 for path in made} == {mode}

@@ -114,5 +114,5 @@ def test_nor_does_the_demo_show_more(
     said = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
     assert said.status == 0, said.err
     assert published(tmp_path) == {"demo/publish/stego.ply"}
-    assert readable_by_others(tmp_path) == {"demo/publish/stego.ply"}
+    assert readable_by_others(tmp_path) == {"demo/publish/stego.ply", "demo/index.html"}
     assert stat.S_IMODE((tmp_path / "demo" / "private").stat().st_mode) == 0o700

@@ -10,7 +10,7 @@ import torch
 
 from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.files.atomic import write_bytes
+from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.models import (
     check_model_output,
     keeps_low_bits,
@@ -67,9 +67,9 @@ def convert(
     """Write a model in the format of the suffix of `out`, and measure what that costs.
 
     If a secret that one of `keys` opens would be lost, QualityError is raised and nothing is written, unless
-    with `force`. `dry_run` writes nothing at all. Without keys, the result does not tell whether something is
-    hidden. Raises WrongKeyError for a key that opens nothing, InputError, OutputError, and UsageError for an
-    unknown suffix.
+    with `force`. Others can read the file if they can read `model`. `dry_run` writes nothing at all. Without
+    keys, the result does not tell whether something is hidden. Raises WrongKeyError for a key that opens
+    nothing, InputError, OutputError, and UsageError for an unknown suffix.
     """
     target = resolve_device(device)
     source = None if isinstance(model, Gaussians) else Path(model)
@@ -95,7 +95,8 @@ def convert(
     if is_standard(path):
         write_standard_output(data)
     else:
-        write_bytes(path, data)
+        mode = 0o600 if source is None or is_standard(source) else mode_like(source)
+        write_bytes(path, data, mode)
     return result
 
 

@@ -304,7 +304,7 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
     )
     for file in files:
         print(f"{file.name}: {file.stat().st_size:,} bytes, revealed again from the published file")
-    print(f"PSNR of the cover's views to those before: {result.psnr:.0f} dB")
+    print(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
     print_files(
         asked.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(asked.publish, channel).survives])
     )

@@ -15,7 +15,7 @@ DRAWN_OPACITY = 1 / 255  # 3DGS rasterizers skip Gaussians below it
 MAX_COORDINATE, MAX_LOG_SCALE, MAX_LENGTH, MAX_COLOUR = 1e15, 40.0, 1.8e19, 1e12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gaussians:
     """N 3D Gaussians in the raw parameterisation that 3DGS optimises and its PLY files store.
 
@@ -39,6 +39,9 @@ class Gaussians:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"<{len(self):,} Gaussians of SH degree {self.sh_degree} on {self.means.device}>"
 
     @property
     def scales(self) -> Tensor:

@@ -13,6 +13,7 @@ from PIL import Image
 import keyss
 from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
 from keyss.files import load_scene
+from keyss.files.atomic import public_mode
 from keyss.fitting import FitConfig, Reporter, mean_psnr
 from keyss.many.sheet import contact_sheet
 from keyss.methods import CarryOptions
@@ -88,6 +89,7 @@ def run_demo(
             viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, up="z")
             files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
             results.write(writers(files | {VIEWER: viewer}))
+        (out / VIEWER).chmod(public_mode())  # it holds the published model
         return DemoResult(metrics, refused)
     except BaseException as error:
         clear(out)

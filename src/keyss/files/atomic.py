@@ -15,13 +15,13 @@ from keyss.core.errors import OutputError, UsageError
 
 
 @contextmanager
-def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
+def atomic_write(path: Path | str, mode: int = 0o600) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; on success fsync it and rename it to `path`.
 
     On failure the temporary file is removed and `path` is unchanged; the next write reuses a temporary file
-    that a killed process left. Files have mode 0600, since most of them are secrets or tell of one. Raises
-    OutputError when the system refuses (disk full, no permission, missing folder), and when another process
-    is writing the same file.
+    that a killed process left. Files have `mode`, by default 0600, since most of them are secrets or tell of
+    one. Raises OutputError when the system refuses (disk full, no permission, missing folder), and when
+    another process is writing the same file.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.unfinished")
@@ -37,7 +37,7 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
         raise OutputError(f"cannot write {path}: {temporary} is in the way")
     try:
         with os.fdopen(descriptor, "wb") as file:
-            os.fchmod(descriptor, 0o600)
+            os.fchmod(descriptor, mode)
             os.ftruncate(descriptor, 0)
             yield file
             file.flush()
@@ -50,10 +50,22 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
         raise
 
 
-def write_bytes(path: Path | str, data: bytes) -> None:
+def write_bytes(path: Path | str, data: bytes, mode: int = 0o600) -> None:
     """Atomically write `data` to `path`. Raises OutputError."""
-    with atomic_write(path) as file:
+    with atomic_write(path, mode) as file:
         file.write(data)
+
+
+def public_mode() -> int:
+    """The mode of files for everybody, as the umask sets it."""
+    umask = os.umask(0)
+    os.umask(umask)
+    return 0o666 & ~umask
+
+
+def mode_like(source: Path) -> int:
+    """The mode of what is made from the file `source`: `public_mode` if others can read that, else 0600."""
+    return public_mode() if source.stat().st_mode & stat.S_IROTH else 0o600
 
 
 @contextmanager

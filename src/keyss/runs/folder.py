@@ -20,7 +20,7 @@ import msgspec
 
 from keyss._version import __version__
 from keyss.core.errors import InputError, OutputError, UsageError
-from keyss.files.atomic import check_not_an_input, held_by, lock
+from keyss.files.atomic import check_not_an_input, held_by, lock, public_mode
 from keyss.runs.records import read_record, write_record
 
 PUBLISH, PRIVATE = "publish", "private"
@@ -206,7 +206,7 @@ class RunFolder:
                 staged = self.path / _STAGING / name
                 _make_parents(self.path, name)
                 if name.startswith(f"{PUBLISH}/"):
-                    staged.chmod(0o666 & ~_umask())
+                    staged.chmod(public_mode())
                 os.replace(staged, self.path / name)
         except BaseException:
             _remove(self.path, self._names)
@@ -382,12 +382,6 @@ def _differences(old: Any, new: Any, between: str = ", ", after_name: str = " ")
         )
     shown = ["none" if value is None else msgspec.json.encode(value).decode() for value in (old, new)]
     return "not the same" if max(map(len, shown)) > _MAX_SHOWN else f"{shown[0]} then, {shown[1]} now"
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from keyss.core.errors import InputError, OutputError, UsageError
-from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
+from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
 from keyss.viewer.showing import readable
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -68,8 +68,8 @@ def export_html(
 
     The file opens from disk; a folder, for larger models, needs a web server. `up`: "-y" as in COLMAP's
     scenes, "z" or "y". A model in a format that the page does not read is converted, with a KeyssWarning.
-    Returns the paths written. Raises UsageError for a model that is too large, InputError if it is not a
-    model, OutputError.
+    Others can read what is written if they can read `model`. Returns the paths written. Raises UsageError
+    for a model that is too large, InputError if it is not a model, OutputError.
     """
     model, out = Path(model), Path(out)
     file = readable(model)
@@ -80,6 +80,7 @@ def export_html(
             data = opened.read()
     except OSError as error:
         raise InputError(f"{model}: cannot be read: {error.strerror}") from error
+    mode = mode_like(model)
     if out.suffix.lower() in (".html", ".htm"):
         if len(data) > MAX_IN_ONE_FILE:
             raise UsageError(
@@ -87,7 +88,7 @@ def export_html(
                 "name an output folder instead, and put it on a web server"
             )
         check_not_an_input(out, [model])
-        write_bytes(check_output_file(out, overwrite), page_with(data, file.name, up))
+        write_bytes(check_output_file(out, overwrite), page_with(data, file.name, up), mode)
         return (out,)
     contents = {INDEX: served_page("keyss-model", quote(file.name), up), file.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
@@ -101,7 +102,7 @@ def export_html(
         check_not_an_input(out / name, [model])
         check_output_file(out / name, overwrite)
     for name, content in contents.items():
-        write_bytes(out / name, content)
+        write_bytes(out / name, content, mode)
     return tuple(out / name for name in contents)
 
 
