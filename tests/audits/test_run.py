@@ -45,7 +45,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def speed(subject: Any, seed: int, progress: Any) -> PartResult[SpeedResult]:
         called.append("speed")
         progress(1, 2)
-        result = SpeedResult({}, (), {"stego": len(subject.stego)}, ())
+        result = SpeedResult({}, (), {"stego": len(subject.stego)})
         return PartResult(result, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)})
 
     def leaks(subject: Any, seed: int, progress: Any) -> PartResult[Any]:

@@ -1,4 +1,3 @@
 from .live import LiveTraining as LiveTraining
 from .page import asset as asset, export_html as export_html, page_with as page_with
 from .serving import ModelServer as ModelServer
-from .showing import is_readable as is_readable

@@ -36,7 +36,7 @@ def readable(model: Path) -> Readable:
             size = file.seek(0, 2)
     except OSError:
         header, size = b"", 0  # read_model raises the InputError
-    if is_readable(model.name, header):
+    if _is_readable(model.name, header):
         return Readable(model.name, lambda: model.open("rb"), size)
 
     from keyss.files import read_model  # imports torch, which the page itself does not need
@@ -55,7 +55,7 @@ def readable(model: Path) -> Readable:
     return Readable(name, lambda: BytesIO(data), len(data))
 
 
-def is_readable(name: str, start: bytes) -> bool:
+def _is_readable(name: str, start: bytes) -> bool:
     """True if the page reads the format of a file with this name and these first bytes."""
     if start.startswith(b"ply"):
         return b"\nformat ascii" not in start[:_MAX_HEADER].partition(b"end_header")[0]
