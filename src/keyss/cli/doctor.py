@@ -10,6 +10,7 @@ from functools import partial
 from importlib import metadata
 from typing import Annotated
 
+from keyss._version import __version__
 from keyss.cli.arguments import Device, switch
 from keyss.core.errors import BackendError, KeyssError
 
@@ -23,11 +24,8 @@ EXTRAS = {
     "video": ("av", "keyss render --video"),
 }
 LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
+OPTIONAL = ("GPU", "kernel cache", "splat-transform", *(f"[{name}]" for name in EXTRAS))
 _TOLERANCE = 1e-4  # of a pixel's value from 0 to 1
-
-
-class _Missing(Exception):
-    """An optional component is not there."""
 
 
 def doctor(
@@ -42,12 +40,20 @@ def doctor(
 
     example: keyss doctor
     """
-    checks: dict[str, Callable[[], str]] = {"keyss": _keyss}
-    checks |= {name: partial(_library, name) for name in LIBRARIES}
-    checks |= {"cores": _cores, "GPU": _gpu, "kernel cache": _cache, "test frame": partial(_frame, device)}
-    checks |= {f"[{name}]": partial(_extra, name) for name in EXTRAS}
-    checks |= {"splat-transform": _splat_transform}
-    results = {name: _result(check) for name, check in checks.items()}
+    checks: dict[str, Callable[[], str]] = {
+        "keyss": lambda: f"{__version__}, Python {platform.python_version()}, {platform.platform()}",
+        **{name: partial(_version, name, f"pip install {name}") for name in LIBRARIES},
+        "cores": _cores,
+        "GPU": _gpu,
+        "kernel cache": _cache,
+        "test frame": partial(_frame, device),
+        **{
+            f"[{name}]": partial(_version, package, f"for {purpose}: pip install 'keyss[{name}]'")
+            for name, (package, purpose) in EXTRAS.items()
+        },
+        "splat-transform": _splat_transform,
+    }
+    results = {name: _result(name, check) for name, check in checks.items()}
     if json_:
         from keyss.cli.tables import print_json
 
@@ -60,37 +66,21 @@ def doctor(
         raise BackendError(f"required components do not work: {', '.join(broken)} (see above)")
 
 
-def _result(check: Callable[[], str]) -> tuple[str, str]:
+def _result(name: str, check: Callable[[], str]) -> tuple[str, str]:
     """The state of a component ("ok", "missing" if it is optional, "broken" otherwise) and a description."""
     try:
         return "ok", check()
-    except _Missing as error:
-        return "missing", str(error)
     except KeyssError as error:
-        return "broken", str(error)
+        return "missing" if name in OPTIONAL else "broken", str(error)
     except Exception as error:
         return "broken", f"{type(error).__name__}: {error}"
 
 
-def _keyss() -> str:
-    from keyss import __version__
-
-    return f"{__version__}, Python {platform.python_version()}, {platform.platform()}"
-
-
-def _library(package: str) -> str:
+def _version(package: str, advice: str) -> str:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
-        raise BackendError(f"pip install {package}") from None
-
-
-def _extra(name: str) -> str:
-    package, purpose = EXTRAS[name]
-    try:
-        return f"{package} {_library(package)}, for {purpose}"
-    except BackendError:
-        raise _Missing(f"for {purpose}: pip install 'keyss[{name}]'") from None
+        raise BackendError(advice) from None
 
 
 def _cores() -> str:
@@ -105,7 +95,7 @@ def _gpu() -> str:
     import torch
 
     if not torch.cuda.is_available():
-        raise _Missing("torch finds no CUDA GPU; the CPU is used")
+        raise BackendError("torch finds no CUDA GPU; the CPU is used")
     properties = torch.cuda.get_device_properties(0)
     return f"{properties.name}, {properties.total_memory / 1e9:.0f} GB, CUDA {torch.version.cuda}"
 
@@ -115,7 +105,7 @@ def _cache() -> str:
 
     folder = cache_folder()
     if folder is None:
-        raise _Missing("no writable folder: every command compiles the kernels again, 10 to 20 s")
+        raise BackendError("no writable folder: every command compiles the kernels again, 10 to 20 s")
     return str(folder)
 
 
@@ -126,23 +116,24 @@ def _frame(device: Device) -> str:
     from keyss.core import SH_C0, Camera, Gaussians
     from keyss.rendering import render, resolve_device
 
-    size, color, target = 65, torch.tensor([0.9, 0.5, 0.1]), resolve_device(device)
+    target = resolve_device(device)
     model = Gaussians(
         means=torch.tensor([[0.0, 0.0, 4.0]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         log_scales=torch.full((1, 3), -1.5),
         opacity_logits=torch.tensor([2.0]),
-        sh=((color - 0.5) / SH_C0)[None, None],
-    )
-    K = torch.tensor([[80.0, 0, size / 2], [0, 80.0, size / 2], [0, 0, 1]])
-    camera = Camera(torch.eye(4), K, size, size, "doctor.png")
+        sh=torch.tensor([[[1.0, 0.0, -1.0]]]),
+    ).to(target)
+    K = torch.tensor([[80.0, 0, 32.5], [0, 80.0, 32.5], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, 65, 65, "doctor.png")
     with torch.no_grad():
-        render(model.to(target), camera)  # compiles the kernels, unless they are cached
+        render(model, camera)  # compiles the kernels, unless they are cached
         start = time.perf_counter()
-        image = render(model.to(target), camera).cpu()
+        image = render(model, camera).cpu()
         seconds = time.perf_counter() - start
-    errors = image[size // 2, size // 2] - color * model.opacities, image[0, 0]
-    if max(float(error.abs().max()) for error in errors) > _TOLERANCE:
+    expected = (0.5 + SH_C0 * model.sh[0, 0]) * model.opacities
+    middle, corner = image[32, 32] - expected.cpu(), image[0, 0]
+    if torch.cat([middle, corner]).abs().max() > _TOLERANCE:
         raise BackendError(f"the render on {target} is wrong")
     backend = "gsplat" if target.type == "cuda" else "the CPU rasterizer"
     return f"rendered by {backend} on {target} in {1e3 * seconds:.1f} ms"
@@ -151,7 +142,4 @@ def _frame(device: Device) -> str:
 def _splat_transform() -> str:
     from keyss.measure.robustness.conversions import find_splat_transform
 
-    try:
-        return find_splat_transform()
-    except BackendError as error:
-        raise _Missing(f"for conversions in audits: {error}") from error
+    return find_splat_transform()
