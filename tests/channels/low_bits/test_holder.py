@@ -29,7 +29,7 @@ def _seen(own: int, others: Sequence[int], draw: int) -> dict[str, float]:
         records = Records("test", os.urandom(HEADER), data, plan, np.arange(plan.copies))
         contents.append((keys(10 * draw + index), records))
     stego = prepared.embed_derived(contents, entropy=os.urandom(32))
-    return seen_by_holder(stego, keys(10 * draw)[0])
+    return seen_by_holder(stego, keys(10 * draw)[prepared.fresh_salts[0]])
 
 
 @pytest.mark.parametrize("others", [[500], [1500, 900]])

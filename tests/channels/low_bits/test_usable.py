@@ -178,3 +178,26 @@ def test_a_cover_that_was_changed_in_place_is_looked_at_again() -> None:
     after = LOW_BITS.prepare(cover)
     assert not after.usable[:10].any()
     assert (after.names[:10] != before.names[:10]).any()
+
+
+def test_saturated_opacities_stay_as_they_are() -> None:
+    """Logits whose sigmoid has no gradient stay equal in clones of which everything else was trained."""
+    model = trained_like(2000, 3)
+    model.opacity_logits[:200] = torch.linspace(16.0001, 19, 200) * 1.0001
+    model.opacity_logits[200:400] = -model.opacity_logits[:200]
+    usable = usable_carriers(model)
+    assert not usable[:200].any()
+    assert usable[200:].mean() > 0.9
+
+
+@pytest.mark.parametrize("shared", [[0, 1], [6, 7], list(range(15))])
+def test_gaussians_that_share_harmonics_of_one_channel_stay_as_they_are(shared: list[int]) -> None:
+    """As where the colour of a channel is clamped: its harmonics are frozen, and all others are trained."""
+    model = trained_like(2000, 4)
+    for row in range(60):
+        for coefficient in shared:
+            model.sh[row, 1 + coefficient, row % 3] = model.sh[1000 + row, 1 + coefficient, row % 3]
+    usable = usable_carriers(model)
+    assert not usable[:60].any()
+    assert not usable[1000:1060].any()
+    assert usable[60:1000].mean() > 0.92

@@ -4,7 +4,9 @@ Nothing can be recognised: there is no magic number, no table, no order. A reade
 Gaussian and keeps those whose tag fits.
 
 - The *salt* of Argon2id is a hash of one Gaussian that carries nothing else (see `salts`). Because it may be
-  removed, there are key cells for each of SALTS.
+  removed, there are SALTS of them. A salt whose Gaussian is not usable is *stale*: the author of the cover
+  knows it in advance. There are key cells for the others. A reader tries SALTS_TRIED salts, and covers with
+  as many stale ones are refused.
 - *Key cells*, encrypted under the key and a salt, hold the secret's data key.
 - *Parameter cells*, encrypted under the data key, tell how the rest is read (see `parameters`).
 - *Records* are encrypted under the data key too; the numbered chunks of an encrypted payload are records (see
@@ -20,6 +22,7 @@ stream of a cell on the data in it (see `cells`).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -30,10 +33,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from keyss.channels.base import Bytes, Content, RecordPlan, RecordRequest
+from keyss.channels.base import SALTS_TRIED, Bytes, Content, RecordPlan, RecordRequest
 from keyss.channels.low_bits.bits import (
     Flags,
     Layout,
+    Rows,
     bytes_per_gaussian,
     identities,
     read_low_bits,
@@ -45,9 +49,15 @@ from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
 from keyss.channels.low_bits.writing import Writer, digest
 from keyss.channels.payloads import check_keys, randomness
+from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, KeyDerivation, stream
 from keyss.rendering.cpu.parallel import in_blocks
+
+_FIRST_IS_STALE = (
+    "the first salt of this model cannot be renewed: keys open it as usual, but not with `decoy=True`, which "
+    "tries no other"
+)
 
 
 class LowBits:
@@ -60,16 +70,24 @@ class LowBits:
     records = True
 
     def __init__(self) -> None:
-        # By cover, while it lives and does not change: (versions, usable, names).
-        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes]] = WeakKeyDictionary()
+        # By cover, while it lives and does not change: (versions, usable, names, rows of salts).
+        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes, Rows]] = WeakKeyDictionary()
 
     def prepare(self, cover: Gaussians) -> LowBitsCover:
+        """See `Channel`. Raises InputError for low bits that are not random, and for stale salts."""
         layout, versions = Layout.of(cover), _versions(cover)
         if (found := self._found.get(cover)) is None or found[0] != versions:
             names = identities(cover, layout)
             usable = usable_carriers(cover, names, layout)
             check_usable(cover, usable, layout)
-            found = self._found[cover] = versions, usable, names
+            rows = salt_rows(cover, names, layout=layout)
+            stale = int((~usable[rows]).sum())
+            if stale >= SALTS_TRIED:
+                raise InputError(
+                    f"{stale} of the {len(rows)} salts of this model cannot be renewed, and whoever made it "
+                    'could try keys in advance; choose another cover, or `publish="any"`'
+                )
+            found = self._found[cover] = versions, usable, names, rows
         return LowBitsCover(cover, layout, *found[1:])
 
     def room(self, gaussians: int, sh_degree: int) -> LowBitsRoom:
@@ -90,6 +108,7 @@ class LowBitsCover:
     layout: Layout
     usable: Flags  # [N]
     names: Bytes  # [N, 16] identities
+    salt_rows: Rows  # [S] in the order of salts
     overhead, grows = LowBitsRoom.overhead, LowBitsRoom.grows
 
     @property
@@ -107,41 +126,45 @@ class LowBitsCover:
         return self._room.plan_records(requests)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
+
+        Warns (KeyssWarning) if `decoy=True`, which tries the first salt alone, will not open the model.
+        """
         mixed = randomness(entropy, *(digest(content) for _, content in contents))
-        derivations = [KeyDerivation(salt=each) for each in self._salts(mixed)[1]]
+        salts = self._salts(mixed)[1]
+        if 0 not in self.fresh_salts:
+            warnings.warn(_FIRST_IS_STALE, KeyssWarning, stacklevel=2)
+        derivations = [KeyDerivation(salt=salts[index]) for index in self.fresh_salts]
         derived = [(_derived(key, derivations), content) for key, content in contents]
         return self._embed(derived, mixed)
 
     def embed_derived(
         self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], *, entropy: bytes | None = None
     ) -> Gaussians:
-        """`embed` after key derivation: for each secret its key under each of the salts."""
-        return self._embed(contents, randomness(entropy, *(digest(content) for _, content in contents)))
+        """`embed` after key derivation: for each secret its key under each of the salts, stale ones too."""
+        mixed = randomness(entropy, *(digest(content) for _, content in contents))
+        return self._embed(
+            [([keys[i] for i in self.fresh_salts], content) for keys, content in contents], mixed
+        )
 
     def _embed(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes) -> Gaussians:
         check_keys([keys[0].verifier() for keys, _ in contents])
         fresh, salts = self._salts(entropy)
         writer = Writer(self.names[self._rows], self.layout.width, entropy, bytes(each[0] for each in salts))
         writer.write(contents)
-        parts = [(self._fresh_rows, fresh), (self._rows[writer.order], writer.table)]
+        parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
         return write_low_bits(self.cover, self.layout, parts)
 
     @cached_property
-    def _salt_rows(self) -> npt.NDArray[np.int64]:
-        """[S] in the order of salts."""
-        return salt_rows(self.cover, self.names, layout=self.layout)
-
-    @property
-    def _fresh_rows(self) -> npt.NDArray[np.int64]:
-        """[F] of these, those that get new bits."""
-        return self._salt_rows[self.usable[self._salt_rows]]
+    def fresh_salts(self) -> Rows:
+        """[F] the numbers of the salts whose Gaussians get new bits."""
+        return np.flatnonzero(self.usable[self.salt_rows])
 
     @cached_property
     def _rows(self) -> npt.NDArray[np.int64]:
         """[C] the carriers."""
         carriers = self.usable.copy()
-        carriers[self._salt_rows] = False
+        carriers[self.salt_rows] = False
         return np.flatnonzero(carriers)
 
     @property
@@ -149,12 +172,12 @@ class LowBitsCover:
         return LowBitsRoom(self.carriers, self.layout.width)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
-        """New low bits [F, B] of `_fresh_rows`, and all salts with them."""
-        noise = stream(entropy, "low-bits/salts", len(self._fresh_rows) * self.layout.width)
-        fresh = np.frombuffer(noise, np.uint8).reshape(len(self._fresh_rows), -1)
-        low = read_low_bits(self.cover[torch.from_numpy(self._salt_rows)], self.layout)
-        low[self.usable[self._salt_rows]] = fresh
-        return fresh, [salt(*each) for each in zip(self.names[self._salt_rows], low, strict=True)]
+        """New low bits [F, B] of the Gaussians of fresh salts, and all salts with them."""
+        noise = stream(entropy, "low-bits/salts", len(self.fresh_salts) * self.layout.width)
+        fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), self.layout.width)
+        low = read_low_bits(self.cover[torch.from_numpy(self.salt_rows)], self.layout)
+        low[self.fresh_salts] = fresh
+        return fresh, [salt(*each) for each in zip(self.names[self.salt_rows], low, strict=True)]
 
 
 def _versions(model: Gaussians) -> list[int]:

@@ -5,10 +5,13 @@ A Gaussian is left alone as a whole, so that its numbers do not contradict each 
 
 - *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
   occur too often (after a few steps of training many are the same small multiple of the learning rate).
+- *Saturated opacities*: where float32's sigmoid is 1 its gradient is 0, so that logits of clones stay equal
+  while everything else about them changes.
 - *Coincidences*: numbers that agree in all bits above the written ones would differ in these afterwards. They
   are near-equal components (grey colours, round Gaussians), harmonics of one colour that are equal several
-  times (a Gaussian that few views show gets equal steps), Gaussians that share whole triples of numbers
-  (clones that training hardly moved apart), unit quaternions, and Gaussians that occur twice.
+  times (a Gaussian that few views show gets equal steps), Gaussians that share their scales, their quaternion
+  or harmonics of one channel (clones, and channels that training freezes), unit quaternions, and Gaussians
+  that occur twice.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
 
 Coincidences are found in bits that embedding never changes. A Gaussian whose bits are random must hardly ever
@@ -64,6 +67,12 @@ _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # A Gaussian is no measurement when so many of its values have 12 zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 _EQUAL_HARMONICS = 2
+
+_OPACITY = 7
+# Bit patterns of logits from 16 on. The sigmoid is 1 from 16.64 on, but only the exponent surely stays.
+_SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
+# Harmonics of a channel in a row: 0.3 % of 20,000 Gaussians share two by chance. Then of larger models.
+_FEW_GAUSSIANS, _SHARED_BY_FEW, _SHARED_BY_MANY = 50_000, 2, 3
 
 _EXACT = 1e-6  # of the length of a unit quaternion in single precision
 # Sets of equal values that there may be by chance: they are left alone, and embedding makes as many again.
@@ -172,15 +181,22 @@ def near_equal(used: Words, layout: Layout) -> Flags:
 
 def repeated(values: npt.NDArray[np.uint64]) -> Flags:
     """[N] which of the values [N] occur at least twice."""
-    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    result: Flags = (counts > 1)[inverse]
+    ordered = np.sort(values)
+    again = ordered[1:][ordered[1:] == ordered[:-1]]
+    if not len(again):
+        return np.zeros(len(values), bool)
+    result: Flags = again[np.searchsorted(again, values).clip(max=len(again) - 1)] == values
     return result
 
 
 def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: bool) -> Flags:
-    """[N] whether no number in use is subnormal or frequent, and few have many zeros; if `short`, none is."""
+    """[N] whether no number in use is subnormal, frequent or a saturated opacity, and few have many zeros.
+
+    If `short`, none has.
+    """
     large = exponents(used)
     fine = (large > 0) & (large < 254)
+    fine[:, _OPACITY] &= ~((used[:, _OPACITY] >= _SATURATED[0]) & (used[:, _OPACITY] < _SATURATED[1]))
     if short:
         fine &= (used & _SHORT) != 0
     for group, values in zip(_GROUPS.values(), frequent, strict=True):
@@ -201,13 +217,15 @@ def _have_unit_length(used: Words) -> Flags:
 
 
 def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, bool]:
-    """[N] whether neither the Gaussian, its scales, its quaternion nor two harmonics in a row occur twice.
+    """[N] whether neither the Gaussian, its scales, its quaternion nor harmonics of a channel occur twice.
 
-    Harmonics: numbers 1 and 2, 3 and 4 and so on, of all colours. Then whether there are more short values
-    than by chance.
+    Harmonics: two in a row, numbers 1 and 2, 3 and 4 and so on, or three in large models. Then whether there
+    are more short values than by chance.
     """
     together = [slice(0, 3), *([QUATS] if layout.quats else [])]
-    together += [slice(first, first + 6) for first in range(GEOMETRY, len(layout.mask) - 5, 6)]
+    width = 3 * (_SHARED_BY_FEW if len(gaussians) <= _FEW_GAUSSIANS else _SHARED_BY_MANY)
+    for first in range(GEOMETRY, len(layout.mask) - width + 1, width):
+        together += [slice(first + channel, first + width, 3) for channel in range(3)]
     keys = np.empty((len(together) + 1, len(gaussians)), np.uint64)
     keys[-1] = names.view("<u8")[:, 0]
 

@@ -53,7 +53,7 @@ class Writer:
     def write(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]]) -> None:
         """Headers in the first carriers, records in the others. Raises UsageError for too large payloads.
 
-        Keys: of each secret one under each salt.
+        Keys: of each secret one under each salt that is not stale.
         """
         payloads = [each for _, each in contents if isinstance(each, Payload)]
         records = [each for _, each in contents if isinstance(each, Records)]
