@@ -24,7 +24,7 @@ from keyss.core.extras import import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model
-from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
+from keyss.measure.images import renders_of, steganalysed
 from keyss.measure.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.measure.robustness.conversions import converters
 from keyss.measure.robustness.survival import measure_robustness
@@ -102,15 +102,10 @@ def files(subject: Subject) -> Numbers:
 
 
 def pictures(subject: Subject) -> Numbers:
-    """LPIPS of the cover and the first secret against their photos, where it is installed; times."""
+    """Render times of the cover and the first secret, also relative to plain 3DGS."""
     found: Numbers = {}
     for role, each in subject.times(subject.models).items():
         found |= {f"{role}.seconds": each.seconds, f"{role}.ratio": each.ratio}
-    for role, scene, model in zip(_ROLES, subject.scenes, subject.models, strict=False):
-        views = scene.test
-        compared = compare_images(photos_of(views), renders_of(model, scene, views)).mean
-        if compared.lpips_alex is not None:
-            found[f"{role}.lpips"] = compared.lpips_alex
     return found
 
 
