@@ -13,7 +13,7 @@ import keyss as library
 from cli.conftest import keyss  # noqa: F401  fixture
 from cli.said import Said
 from keyss import CarryOptions
-from keyss.core import InputError, OutputError, WrongKeyError
+from keyss.core import InputError, KeyssWarning, OutputError, WrongKeyError
 from keyss.keys import MasterKey
 from keyss.many import ManyResult, assets, cell, hide_batch, processes
 from many.fakes import REAL
@@ -21,6 +21,7 @@ from tiny_scenes import random_gaussians
 
 KEY = "q7Rv2LxT9bWm4KzDq7Rv2L"
 HEAD = "cover,secret,out\n"
+pytestmark = pytest.mark.filterwarnings("ignore:.*published more than once")
 
 
 @pytest.fixture
@@ -95,6 +96,12 @@ def check_batch(folder: Path, count: int, broken: set[int]) -> None:
         assert [row["state"] for row in csv.DictReader(file)] == ["done"] * count
     for index in range(count):
         assert (folder / "out" / f"asset-{index}" / "publish" / "stego.ply").exists()
+
+
+def test_a_cover_that_is_published_twice_is_warned_of(folder: Path) -> None:
+    manifest(folder, HEAD + "a.ply,secret.ply,x\nb.ply,secret.ply,y\na.ply,secret.ply,z\n")
+    with pytest.warns(KeyssWarning, match=r"1 of the covers \(a.ply\) are published more than once"):
+        hide(folder)
 
 
 def test_a_broken_asset_does_not_stop_the_others(folder: Path) -> None:

@@ -6,6 +6,8 @@ import csv
 import hashlib
 import io
 import os
+import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from keyss.core.errors import KeyssError, OutputError, UsageError
+from keyss.core.errors import KeyssError, KeyssWarning, OutputError, UsageError
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation
@@ -70,6 +72,14 @@ def hide_batch(
     assets, out = read_assets(Path(manifest), master=master is not None), Path(out)
     if master is not None:
         read_key_file(master)
+    covers = Counter(os.path.realpath(asset.cover) for asset in assets if is_model(asset.cover))
+    if again := [cover for cover, times in covers.items() if times > 1]:
+        warnings.warn(
+            f"{len(again)} of the covers ({Path(again[0]).name}) are published more than once: comparing two "
+            "published files of one cover shows that both hide something; give each asset a cover of its own",
+            KeyssWarning,
+            stacklevel=2,
+        )
     common: dict[str, Any] = {
         "views": ViewOptions.of(width, background, skip_missing),
         "min_psnr": min_psnr,
