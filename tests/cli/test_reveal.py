@@ -168,14 +168,6 @@ class TestOutputs:
         assert_refused(said, 2, "is the input")
         assert listing(tmp_path) == before
 
-    def test_unknown_formats_are_refused_before_any_work(
-        self, keyss: Run, files: Path, tmp_path: Path
-    ) -> None:
-        out = tmp_path / "secret.ksplat"
-        arguments = ("reveal", tmp_path / "nothing.ply", "--key-file", files / "key", "-o", out)
-        assert_refused(keyss(*arguments), 2, "expected a name that ends in .compressed.ply, .ply, .spz, ")
-        assert listing(tmp_path) == {}
-
     @pytest.mark.parametrize("name", ["secret.spz", "secret.compressed.ply"])
     def test_a_secret_comes_in_the_format_that_is_asked_for(
         self, keyss: Run, files: Path, tmp_path: Path, name: str
