@@ -102,6 +102,21 @@ def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[s
     assert (run / "private" / "audit" / "pictures" / "a.png").exists()
 
 
+def test_an_interrupt_between_parts_says_how_to_resume(
+    run: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("keyss.audits.page.report_bytes", interrupted)
+        with pytest.raises(Interrupted) as caught:
+            audit(run, [KEY], controls=2)
+    assert caught.value.checkpoint is not None
+    audit(run, [KEY], controls=2, resume=True)
+    assert calls == ["speed", "leaks"]
+
+
 def test_results_are_not_replaced_by_accident(run: Path, calls: list[str]) -> None:
     audit(run, [KEY], controls=2, only=["leaks"])
     with pytest.raises(OutputError, match="`overwrite=True`"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -94,7 +95,7 @@ def audit(
     )
     from keyss.audits.page import report_bytes
 
-    with folder.work():
+    with folder.work(), _resumable(folder.checkpoints):
         subject = subject_of(opened, original, controls, seed, target, reporter, folder)
         finished = FinishedParts(folder.checkpoints, _inputs(subject, seed))
         sections = {}
@@ -106,8 +107,6 @@ def audit(
                 progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
                 try:
                     finished.keep(name, PARTS[name](subject, seed, progress))
-                except KeyboardInterrupt as error:
-                    raise Interrupted(finished.folder, None, signal_of(error)) from error
                 finally:
                     progress.finish(finished.has(name))
             sections[name], own = finished.take(name)
@@ -125,6 +124,18 @@ def audit(
         there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **files}))
         folder.write(writers({REPORT: report_bytes(result, there)}))
     return result
+
+
+@contextmanager
+def _resumable(checkpoints: Path) -> Iterator[None]:
+    """Tell how to continue after an interrupt, wherever it comes."""
+    try:
+        yield
+    except Interrupted:
+        raise
+    except KeyboardInterrupt as error:
+        saved = any(not path.name.startswith(".") for path in checkpoints.iterdir())
+        raise Interrupted(checkpoints if saved else None, None, signal_of(error)) from error
 
 
 def _report(run: Path) -> Audit:
