@@ -154,3 +154,14 @@ def test_noise_in_green_and_blue_is_seen_beside_red() -> None:
     )
     assert abs(before) < 0.4 < after - before
     assert swapped < after
+
+
+def test_frozen_values_of_clones_are_found_by_channel() -> None:
+    """Harmonics of one channel, and saturated opacities, that differ after careless embedding alone."""
+    model = plain(1)
+    model.opacity_logits[:200] = 17.3
+    model.means[:200] = model.means[:1] + 0.001 * model.means[:200]
+    frozen, overwritten_too = (stealth_statistics(each) for each in (model, overwritten(model, bits=8)))
+    name = "coincidences: saturated, opacity"
+    assert frozen[name].value == 2**8
+    assert overwritten_too[name].value < 10

@@ -36,7 +36,10 @@ def agreement(model: Gaussians, words: Words) -> dict[str, Statistic]:
             one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
             statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
     harmless = words.attribute > 0
-    for name, rows in (("neighbours", _neighbours(doubles(model.means))), ("sharers", _sharers(words))):
+    for name, rows in (
+        ("neighbours", nearest_pairs(doubles(model.means), _NEIGHBOURS)),
+        ("sharers", _sharers(words)),
+    ):
         one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
         statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
     return statistics
@@ -78,9 +81,9 @@ def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, B
                 yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
 
 
-def _neighbours(positions: Floats) -> Ints:
-    """[P, 2] each Gaussian and its nearest neighbours."""
-    count = min(_NEIGHBOURS + 1, len(positions))
+def nearest_pairs(positions: Floats, neighbours: int) -> Ints:
+    """[P, 2] each Gaussian and its nearest `neighbours`, every pair once."""
+    count = min(neighbours + 1, len(positions))
     _, near = cKDTree(positions).query(positions, k=count)
     near = near.reshape(len(positions), -1)
     pairs = np.stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()], axis=1)

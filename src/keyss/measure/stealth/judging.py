@@ -11,6 +11,7 @@ import numpy as np
 from keyss.core import Gaussians, UsageError
 from keyss.measure.stealth.agreement import agreement
 from keyss.measure.stealth.bits import bits
+from keyss.measure.stealth.coincidences import coincidences
 from keyss.measure.stealth.colours import colours
 from keyss.measure.stealth.confirmation import candidate_scores, changed_low_bits
 from keyss.measure.stealth.invariants import invariants
@@ -23,6 +24,7 @@ from keyss.measure.stealth.words import Words
 KINDS: dict[str, Callable[[Gaussians, Words], dict[str, Statistic]]] = {
     "bits": bits,
     "agreement": agreement,
+    "coincidences": coincidences,
     "invariants": invariants,
     "opacities": opacities,
     "order": order,
