@@ -8,6 +8,8 @@
 Names are loaded at their first use, which keeps `import keyss` fast.
 """
 
+from keyss import _interrupts  # noqa: F401, I001  before anything else
+
 import lazy_loader
 
 from keyss import _threads  # noqa: F401  before anything imports torch

@@ -115,6 +115,27 @@ def test_ctrl_c_in_the_middle_of_an_import(world: Path, module: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "keyss: interrupted\n")
 
 
+FIRST = """
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, path, target=None):
+        if name == "lazy_loader":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+sys.argv = ["{name}"]
+import keyss
+"""
+
+
+def test_ctrl_c_before_anything_is_loaded() -> None:
+    command = [sys.executable, "-c", FIRST.format(name="/usr/bin/keyss")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "keyss: interrupted\n")
+    command[2] = FIRST.format(name="other")  # a program that imports keyss keeps its own handling
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert "KeyboardInterrupt" in done.stderr
+
+
 IN_A_COMMAND = """
 import os, signal, sys, time
 from keyss.cli import entry
