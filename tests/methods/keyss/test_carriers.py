@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from channels.low_bits.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import Gaussians, KeyssOptions, WrongKeyError, read_model
 from keyss.channels import LOW_BITS, Payload
@@ -17,7 +18,7 @@ from keyss.core import InputError, Interrupted, Similarity, UsageError
 from keyss.keys import random_embeddings
 from keyss.measure import search_embeddings
 from keyss.methods import PlacedScene, RowSecret, registry
-from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, row_kinds, secret_tables
+from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, encrypt_rows, row_kinds, secret_tables
 from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
 from methods.keyss.hiding import EMBEDDINGS, FIT, KEYS, cover_with_zeros, written
 from tiny_scenes import random_gaussians
@@ -187,6 +188,14 @@ def test_a_cover_without_harmonics_is_refused() -> None:
     options = replace(OPTIONS, fit=replace(FIT, iterations=1))
     with pytest.raises(InputError, match="train longer"):
         hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2])
+
+
+def test_a_cover_may_have_rows_of_one_kind_only() -> None:
+    cover, (_, (secret,), (model,)) = trained_like(400), written()
+    stego = encrypt_rows(cover, [secret], [model[:300]], bytes(32))
+    assert [len(kind.rows) for kind in row_kinds(stego)] == [400, 0]
+    assert row_kinds(stego)[1].read(stego).shape == (0, 21)
+    assert len(secret.decode(stego, secret.embedding)) == 300
 
 
 def test_a_share_of_pruned_steps_is_one() -> None:

@@ -187,12 +187,12 @@ class RowKind:
         carriers = (self._words(model) >> SHIFT & np.uint32(255)).astype(np.uint8)
         folded = np.where(carriers < 128, carriers, 255 - carriers)
         bits = np.unpackbits(folded[:, :, None], axis=2)[:, :, 1:]
-        return np.packbits(bits.reshape(len(bits), -1), axis=1)
+        return np.packbits(bits.reshape(len(bits), self.carriers * BITS), axis=1)
 
     def write(self, model: Gaussians, data: Bytes, noise: npt.NDArray[np.float64]) -> Gaussians:
         """The same with other carriers; `noise` [R, carriers] in [0, 1) decides between two for each."""
         bits = np.unpackbits(data, axis=1)[:, : self.carriers * BITS]
-        bits = bits.reshape(len(bits), -1, BITS)
+        bits = bits.reshape(len(bits), self.carriers, BITS)
         folded = np.packbits(np.pad(bits, ((0, 0), (0, 0), (1, 0))), axis=2)[:, :, 0]
         middle = (folded + 0.5) / 128 - 1
         upper = noise < (1 - _tilts(model, self) * middle) / 2
@@ -200,7 +200,7 @@ class RowKind:
         words = words_of(model)
         own = self._words(model) & ~np.uint32(255 << 13) | carriers << SHIFT
         words[self.rows[:, None], self.columns] = own
-        harmonics = torch.from_numpy(words.view(np.float32)).view(len(model), -1, 3)
+        harmonics = torch.from_numpy(words.view(np.float32)).view_as(model.sh[:, 1:])
         return replace(model, sh=torch.cat([model.sh[:, :1], harmonics], dim=1))
 
     def _words(self, model: Gaussians) -> Words:
@@ -270,9 +270,11 @@ def encrypt_rows(
     first, every = 0, names(cover)
     for index, kind in enumerate(carrying(cover)):
         count, size = len(kind.rows), kind.carriers * BITS // 8
+        if not count:
+            continue
         random = stream(entropy, f"carriers/{index}", count * (size + 4 * kind.carriers))
-        data = np.frombuffer(random[: count * size], np.uint8).reshape(count, -1).copy()
-        coins = np.frombuffer(random[count * size :], "<u4").reshape(count, -1) / 2**32
+        data = np.frombuffer(random[: count * size], np.uint8).reshape(count, size).copy()
+        coins = np.frombuffer(random[count * size :], "<u4").reshape(count, kind.carriers) / 2**32
         for secret, model in zip(secrets, models, strict=True):
             if index < len(secret.codecs):
                 codec, start = secret.codecs[index], secret.secret * share(kind.carriers, secret.secrets)
