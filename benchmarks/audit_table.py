@@ -45,6 +45,7 @@ def _rows(audits: list[Audit]) -> list[str]:
         "secret, dB (loss, beside the plain model it started from)": lambda a: _quality(a, 1),
         "wrong keys against the cover, mean": lambda a: f"{a.wrong_key.vs_cover.mean:.2f}",
         "3D-Sinkhorn as published, sum (controls)": _sinkhorn,
+        "distance over seed-to-seed variation: joint (the plain model's)": _ratio,
         "classifier, AUC (controls)": _classifier,
         "StegExpose, AUC (controls)": lambda a: _auc(a),
         "largest leak after the best fit of colours, SSIM": lambda a: _leak(a, "ssim_fitted", 3),
@@ -64,6 +65,11 @@ def _quality(audit: Any, index: int) -> str:
 def _sinkhorn(audit: Any) -> str:
     found = audit.parameters
     return f"{found.sinkhorn.sum:.3f} ({fmean(each.sum for each in found.sinkhorn_controls):.3f})"
+
+
+def _ratio(audit: Any) -> str:
+    found = audit.parameters.distances["joint"]
+    return f"{found.ratio:.2f}" + (f" ({found.original:.2f})" if found.original is not None else "")
 
 
 def _classifier(audit: Any) -> str:

@@ -199,6 +199,7 @@ def test_texts_of_others_stay_text(run_folder: Path, data: dict[str, Any], tmp_p
     data = with_all_texts(data, text, lambda name: name in ("picture", "pictures"))
     files = [file for files in data["images"]["pictures"].values() for file in files.values()]
     data["images"]["pictures"] = {text: {text: files[0], "other": files[1]}}
+    data["parameters"]["distances"] = {text: data["parameters"]["distances"]["opacity"]}
     data["run"]["config"] = {text: {text: text}}
     page = parsed(run_with(run_folder, tmp_path, data))
     harmless(page)

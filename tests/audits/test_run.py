@@ -157,6 +157,8 @@ def test_the_command_runs_the_real_parts_and_writes_the_report(
     found = read_audit(run)
     assert found.robustness is None
     assert found.parameters is not None
+    assert set(found.parameters.distances) >= {"position", "scale", "rotation", "opacity", "joint"}
+    assert all(each.original is not None for each in found.parameters.distances.values())
     metrics = json.loads((run / "private" / "metrics.json").read_text())
     psnrs = metrics["cover"]["psnr"] + metrics["secrets"][0]["psnr"]
     assert found.parameters.score == pytest.approx(psnrs * (1 - found.parameters.sinkhorn.sum))

@@ -61,6 +61,8 @@ def fine(data: Data) -> Data:
             row["leak"], row["best_leak"] = dict(no_leak), dict(no_leak)
     data["leaks"][1][2]["best_leak"] |= {"psnr_fitted": 0.4, "ssim_fitted": 0.01}
     data["leaks"][1][2] |= {"attack": "matched opacities", "best": "below 0.05"}
+    for each in data["parameters"]["distances"].values():
+        each |= {"ratio": 1.1, "original": None}
     for row in data["robustness"]:
         pruned = (row["attack"], row["strength"]) == ("random pruning", 0.25)
         for each in [row["cover"], *row["secrets"]] if row["cover"] else ():
@@ -84,6 +86,7 @@ def test_the_whole_audit(fine: Data) -> None:
         "leaks without the key": "fine",
         "the file by itself": "fine",
         "guessing the secret": "fine",
+        "attributes of the Gaussians": "fine",
         "classifier between models": "fine",
         "StegExpose on renders": "fine",
         "loss of a random 25% of the Gaussians": "fine",
@@ -108,6 +111,7 @@ def test_the_whole_audit(fine: Data) -> None:
         ("the file by itself", "stealth.least", 0.01, 0.009, "visible"),
         ("the file by itself", "stealth.least", 0.2, 0.0, "visible"),
         ("guessing the secret", "stealth.confirmations.0.1.p", 0.005, 0.0049, "visible"),
+        ("attributes of the Gaussians", "parameters.distances.opacity.ratio", 1.5, 1.51, "visible"),
         ("classifier between models", "parameters.two_sample.stego.0.auc", 0.6, 0.61, "visible"),
         ("StegExpose on renders", f"{STEGEXPOSE}.low", 0.5, 0.51, "visible"),
         ("StegExpose on renders", f"{STEGEXPOSE}.high", 0.75, 0.45, "visible"),
@@ -166,6 +170,8 @@ def test_a_file_is_as_unusual_as_plain_models_are(fine: Data) -> None:
 def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
     parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
     assert judged(changed(fine, *((part, None) for part in parts))) == {}
+    for each in fine["parameters"]["distances"].values():
+        each["ratio"] = None
     left_out = [
         ("robustness", [row for row in fine["robustness"] if row["strength"] != 0.25]),
         ("images.models.0.baseline", None),
@@ -184,10 +190,10 @@ def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
 def test_the_headline(fine: Data) -> None:
     assert headline([]) == "Nothing was measured that could be judged."
     lines = verdicts(changed(fine))
-    assert headline(lines) == "All 10 measures are within their limits."
+    assert headline(lines) == "All 11 measures are within their limits."
     changes = ((f"{STEGEXPOSE}.high", 0.45), (IMAGES.format(2), 25.5))
     assert headline(verdicts(changed(fine, *changes))) == (
-        "8 of 10 measures are within their limits. Visible: StegExpose on renders. "
+        "9 of 11 measures are within their limits. Visible: StegExpose on renders. "
         "Missed: secret 2 on test photos."
     )
 
@@ -213,6 +219,15 @@ def test_renders_of_given_models_are_not_called_photos(fine: Data) -> None:
     models = [("images.models.0.photos", False), (BASELINES.format(0), 120.0)]
     line = judged(changed(fine, *models, (IMAGES.format(0), 46.0)))["cover on renders of its model"]
     assert (line.word, line.beside, line.limit) == ("fine", "the given model itself", "at least 45 dB")
+
+
+def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model(fine: Data) -> None:
+    ratio, original = (f"parameters.distances.scale.{name}" for name in ("ratio", "original"))
+    measure, opacity = "attributes of the Gaussians", "parameters.distances.opacity.ratio"
+    assert judged(changed(fine, (ratio, 1.9)))[measure].word == "visible"
+    assert judged(changed(fine, (ratio, 1.9), (original, 1.9)))[measure].word == "fine"
+    line = judged(changed(fine, (ratio, 1.9), (original, 1.9), (opacity, 1.6)))[measure]
+    assert (line.word, line.value) == ("visible", "opacity 1.60×")
 
 
 def test_a_classifier_may_tell_as_much_as_of_the_covers_plain_model(fine: Data) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -68,3 +69,15 @@ def rescaled_quaternions(model: Gaussians) -> Gaussians:
     """Lengths times 0.5 to 2, which changes nothing that is drawn."""
     factors = 0.5 + 1.5 * torch.rand(len(model), 1, generator=torch.Generator().manual_seed(9))
     return replace(model, quats=model.quats * factors)
+
+
+# Each change, and the attributes that it is a change of.
+CHANGES: dict[Callable[[Gaussians], Gaussians], set[str]] = {
+    doubled_scales: {"scale"},
+    random_rotations: {"rotation"},
+    tripled_positions: {"position"},
+    red_for_blue: {"colour"},
+    stronger_harmonics: {"harmonics"},
+    some_transparent: {"opacity"},
+    rescaled_quaternions: set(),
+}

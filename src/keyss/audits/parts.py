@@ -21,6 +21,7 @@ from keyss.audits.record import (
 )
 from keyss.audits.subject import AuditSubject
 from keyss.files.images import picture_names
+from keyss.measure.distances import against_controls
 from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
 from keyss.measure.leaks.attacks import decoder_attack, file_attacks, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
@@ -75,17 +76,19 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
 
 
 def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ParametersResult]:
-    """Distances of the parameters from plain models: 3D-Sinkhorn as published, and a classifier."""
+    """Distances of the parameters from plain models: 3D-Sinkhorn as published, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
-    progress(0, 2)
+    progress(0, 3)
     sinkhorn = sinkhorn_3d(original, stego)
     between = tuple(sinkhorn_3d(original, control) for control in controls)
     quality = subject.run.metrics
     secret_psnr = fmean(secret.psnr for secret in quality.secrets)
     score = composite_score(quality.cover.psnr, secret_psnr, sinkhorn.sum)
-    progress(1, 2)
+    progress(1, 3)
+    distances = against_controls(stego, controls, original=original, seed=seed)
+    progress(2, 3)
     two_sample = auc_beside_controls(stego, controls, original, seed=seed)
-    return PartResult(ParametersResult(sinkhorn, between, score, two_sample))
+    return PartResult(ParametersResult(sinkhorn, between, score, distances, two_sample))
 
 
 def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[StealthResult]:

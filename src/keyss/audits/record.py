@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.errors import InputError
+from keyss.measure.distances import AttributeDistance
 from keyss.measure.hiding import WrongKeys
 from keyss.measure.images import ImageComparison
 from keyss.measure.leaks.looking import AttackResult
@@ -66,6 +67,7 @@ class ParametersResult:
     sinkhorn: Sinkhorn3D  # as published, from the cover's plain model
     sinkhorn_controls: tuple[Sinkhorn3D, ...]
     score: float  # composite score (KeySS, eq. 10)
+    distances: dict[str, AttributeDistance]
     two_sample: TwoSampleAucs
 
 

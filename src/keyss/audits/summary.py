@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from keyss.audits.numbers import decibel, difference, number, numbered, significant
+from keyss.audits.numbers import decibel, difference, number, numbered, significant, times
 from keyss.audits.record import Audit
 from keyss.measure.auc import Auc
 from keyss.measure.leaks.looking import AttackResult
@@ -20,6 +20,7 @@ from keyss.measure.leaks.scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference
 IDENTICAL = 119.9  # dB; a given model has 120 against its own renders
+DISTANCE_RATIO = 1.5  # distance from controls / distance between controls
 TWO_SAMPLE_AUC = 0.6  # of the classifier between the Gaussians of two models
 AUC_TOLERANCE = 0.01  # above the AUC of the cover's own plain model
 UNUSUAL = 0.01  # p, corrected for the number of statistics
@@ -50,6 +51,7 @@ def verdicts(audit: Audit) -> list[Verdict]:
         *_wrong_keys(audit),
         *_leaks(audit),
         *_stealth(audit),
+        *_distances(audit),
         *_two_sample(audit),
         *_renders(audit),
         *_pruning(audit),
@@ -150,6 +152,20 @@ def _stealth(audit: Audit) -> Iterator[Verdict]:
         value, beside = f"p = {significant(p)} ({likeliest.name})", "plain models of the cover"
         limit, word = f"at least {UNUSUAL}", _word(p >= UNUSUAL)
         yield Verdict("guessing the secret", value, beside, limit, word, "stealth")
+
+
+def _distances(audit: Audit) -> Iterator[Verdict]:
+    distances = audit.parameters.distances if audit.parameters else {}
+    judged = {name: each for name, each in distances.items() if each.ratio is not None}
+    if not judged:
+        return
+    limits = {name: max(DISTANCE_RATIO, 1.01 * (each.original or 0)) for name, each in judged.items()}
+    name, worst = max(judged.items(), key=lambda item: (item[1].ratio or 0) / limits[item[0]])
+    own = "" if worst.original is None else f"; the cover's plain model {times(worst.original)}"
+    value, beside = f"{name} {times(worst.ratio)}", f"1×, between plain models{own}"
+    limit = f"at most {DISTANCE_RATIO}×, or as the plain model's"
+    word = _word((worst.ratio or 0) <= limits[name])
+    yield Verdict("attributes of the Gaussians", value, beside, limit, word, "statistics")
 
 
 def _two_sample(audit: Audit) -> Iterator[Verdict]:

@@ -1,4 +1,9 @@
 from .auc import Auc as Auc, auc_between as auc_between, delong as delong
+from .distances import (
+    AttributeDistance as AttributeDistance,
+    against_controls as against_controls,
+    attribute_distances as attribute_distances,
+)
 from .hiding import (
     BaselineQuality as BaselineQuality,
     HidingQuality as HidingQuality,

@@ -3,7 +3,7 @@
 It misses most changes: norms ignore directions, and dividing each model by its own maximum cancels common
 factors. Doubled scales, rotated Gaussians and swapped red and blue give the same value as an identical model,
 which is not 0 either. It does change with the lengths of quaternions, which no render shows.
-`keyss.measure.two_sample` has none of these faults.
+`keyss.measure.distances` has none of these faults.
 """
 
 from __future__ import annotations
