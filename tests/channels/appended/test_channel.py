@@ -93,7 +93,6 @@ def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
         assert opened(_turned(scale)(stego)) == b"a note"
 
 
-@pytest.mark.argon2
 @pytest.mark.parametrize("moved", [False, True], ids=["random", "pilots"])
 def test_many_faint_gaussians_that_do_not_agree_cost_little(moved: bool) -> None:
     random = np.random.default_rng(0)
@@ -107,6 +106,7 @@ def test_many_faint_gaussians_that_do_not_agree_cost_little(moved: bool) -> None
     assert time.process_time() - began < 8
 
 
+@pytest.mark.argon2
 def test_a_wrong_key_opens_nothing_in_about_the_same_time(cover: Gaussians) -> None:
     reader = AppendedReader.of(embedded(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
     assert reader is not None

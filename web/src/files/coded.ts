@@ -2,7 +2,7 @@
 
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
-const LEAST_SCALE = 2 ** -126;
+const MIN_SCALE = 2 ** -126;
 const SMALL_COUNT = 1 << 18; // more Gaussians than this have to take a byte each
 
 /** Whether `size` packed bytes can hold `count` Gaussians, at least one. */
@@ -23,7 +23,7 @@ export function constantHarmonic(byte: number): number {
 
 /** Of a scale; that of 0 is that of the smallest normal number, of negative ones NaN. */
 export function logScale(scale: number): number {
-  return Math.log(scale === 0 ? LEAST_SCALE : scale);
+  return Math.log(scale === 0 ? MIN_SCALE : scale);
 }
 
 /** A quaternion of length 1; one of length 0 becomes (1, 0, 0, 0), as renderers take it. */

@@ -10,7 +10,7 @@ export const FINEST = 65535; // a position's largest code
 export const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored
 const ROW = 64; // vectors of the palette in a row of pixels
 const BOOK = 256;
-const MOST_LABELS = 65536;
+const MAX_LABELS = 65536;
 
 interface Meta {
   version: number;
@@ -111,7 +111,7 @@ function checkedMeta(bytes: Uint8Array, size: number): Meta {
     if (!named || means.mins.length !== 3 || means.maxs.length !== 3) throw damaged();
     for (const book of [scales, sh0, ...(shN ? [shN] : [])]) book.codebook = checkedBook(book.codebook);
     const bands = shN?.bands ?? 0;
-    if (shN && !(bands in [0, 1, 2, 3] && shN.count > 0 && shN.count <= MOST_LABELS)) throw damaged();
+    if (shN && !(bands in [0, 1, 2, 3] && shN.count > 0 && shN.count <= MAX_LABELS)) throw damaged();
   } catch (error) {
     throw error instanceof InputError ? error : damaged();
   }

@@ -8,8 +8,8 @@ import { fromSmallestThree, holds, logit } from './coded.ts';
 
 const LEGACY_BYTES = 16;
 const HEADER_BYTES = 32;
-const MOST_EXTENSION_BYTES = 1 << 20;
-const MOST_UNPACKED = 2 ** 31;
+const MAX_EXTENSION_BYTES = 1 << 20;
+const MAX_UNPACKED = 2 ** 31;
 const MAGNITUDE = 511;
 // Signs of the harmonics of degrees 1 to 3 where y and z change theirs: SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
@@ -64,7 +64,7 @@ function header(bytes: Uint8Array, versions: number[], size: number): Header & {
   if (!holds(size, count) || shDegree > 3 || fractionalBits > 24) throw damaged();
   const rotation = version === 2 ? 3 : 4;
   const sizes = [9, 1, 3, 3, rotation, 3 * (coefficients(shDegree) - 1)].map((each) => each * count);
-  if (sizes.reduce((sum, each) => sum + each, 0) > MOST_UNPACKED) throw damaged();
+  if (sizes.reduce((sum, each) => sum + each, 0) > MAX_UNPACKED) throw damaged();
   return { version, count, shDegree, fractionalBits, sizes };
 }
 
@@ -76,7 +76,7 @@ function codesOf({ version, count, shDegree, fractionalBits }: Header, sections:
 }
 
 async function legacy(bytes: Uint8Array): Promise<SpzCodes> {
-  const most = Math.min(MOST_UNPACKED, 64 * Math.max(bytes.length, 1 << 18)) + MOST_EXTENSION_BYTES;
+  const most = Math.min(MAX_UNPACKED, 64 * Math.max(bytes.length, 1 << 18)) + MAX_EXTENSION_BYTES;
   const data = await unpacked(bytes, 'gzip', most);
   const found = header(data, [2, 3], bytes.length);
   const parts: Uint8Array[] = [];

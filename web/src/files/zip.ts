@@ -4,19 +4,19 @@ import { damaged } from '../core/errors.ts';
 import { unpacked } from '../core/unpacking.ts';
 
 const [END, CENTRAL, LOCAL] = [0x06054b50, 0x02014b50, 0x04034b50];
-const MOST_MEMBERS = 64;
-const MOST_COMMENT = 65557; // bytes of the end of the directory, its comment included
+const MAX_MEMBERS = 64;
+const MAX_COMMENT = 65557; // bytes of the end of the directory, its comment included
 const SMALL = 1 << 20;
 
 /** What gives a member by its name. Raises InputError for what is no whole archive. */
 export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array> {
   const view = viewOf(bytes);
   let end = bytes.length - 22;
-  const last = Math.max(0, bytes.length - MOST_COMMENT);
+  const last = Math.max(0, bytes.length - MAX_COMMENT);
   while (end >= last && view.getUint32(end, true) !== END) end--;
   if (end < last) throw damaged();
   const count = view.getUint16(end + 10, true);
-  if (count > MOST_MEMBERS) throw damaged();
+  if (count > MAX_MEMBERS) throw damaged();
   const members = new Map<string, { method: number; packed: number; size: number; at: number }>();
   let at = view.getUint32(end + 16, true);
   for (let index = 0; index < count; index++) {

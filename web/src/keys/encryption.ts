@@ -5,8 +5,8 @@ import { damaged } from '../core/errors.ts';
 import { unpacked } from '../core/unpacking.ts';
 import { expand } from './derivation.ts';
 
-const MOST_PAYLOAD_BYTES = 64 << 20;
-const [MOST_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes become MOST_RATIO n + SMALL_PAYLOAD at most
+const MAX_PAYLOAD_BYTES = 64 << 20;
+const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes become MAX_RATIO n + SMALL_PAYLOAD at most
 
 /** The inverse of `keyss.keys.encryption.encrypt`. Raises InputError when anything is not as it left it. */
 export async function decrypted(
@@ -20,6 +20,6 @@ export async function decrypted(
   }
   const length = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
   if (4 + length > plain.length) throw damaged();
-  const most = Math.min(MOST_PAYLOAD_BYTES, MOST_RATIO * length + SMALL_PAYLOAD);
+  const most = Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD);
   return unpacked(plain.subarray(4, 4 + length), 'deflate', most);
 }

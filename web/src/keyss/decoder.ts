@@ -7,9 +7,9 @@ const UNITS: Record<string, number> = { op: 5, ro: 1, sc: 1, xyz: 0.1, sh: 0.5 }
 const COLUMNS = { op: 'opacityLogits', ro: 'quats', sc: 'logScales', xyz: 'means', sh: 'sh' } as const;
 const KEY_GAIN = 3;
 const KEY_NUMBERS = 64;
-const MOST_WIDTH = 4096;
-const MOST_OCTAVES = 16;
-const MOST_PRODUCTS = 1e11; // of all Gaussians: minutes
+const MAX_WIDTH = 4096;
+const MAX_OCTAVES = 16;
+const MAX_PRODUCTS = 1e11; // of all Gaussians: minutes
 
 type Attribute = keyof typeof COLUMNS;
 
@@ -74,7 +74,7 @@ export class Decoder {
   decode(model: Gaussians): Gaussians {
     const { shape, first, second, branches } = this;
     const products = [first, second, ...[...branches.values()].flat()].reduce((sum, each) => sum + each.weight.values.length, 0);
-    if (products * model.count > MOST_PRODUCTS) throw damaged();
+    if (products * model.count > MAX_PRODUCTS) throw damaged();
     const found = withDegree(model, shape.shDegree);
     const length = Math.sqrt(found.opacityLogits.reduce((sum, each) => sum + each * each, 0));
     const [before, extent] = [withDegree(found, shape.shDegree), this.constants.extent[0]];
@@ -130,9 +130,9 @@ function shapeOf(described: Record<string, unknown>): Shape {
   return {
     mask: mask.map((name) => oneOf(name, ...(Object.keys(COLUMNS) as Attribute[]))),
     byBias: oneOf(described.conditioning, 'gate', 'bias') === 'bias',
-    hidden: [integer(hidden[0], 1, MOST_WIDTH), integer(hidden[1], 1, MOST_WIDTH)],
-    branch: integer(described.branch, 1, MOST_WIDTH),
-    octaves: integer(described.frequencies, 0, MOST_OCTAVES),
+    hidden: [integer(hidden[0], 1, MAX_WIDTH), integer(hidden[1], 1, MAX_WIDTH)],
+    branch: integer(described.branch, 1, MAX_WIDTH),
+    octaves: integer(described.frequencies, 0, MAX_OCTAVES),
     shDegree: integer(described.sh_degree, 0, 3),
     normalised: oneOf(described.inputs, 'standardised', 'normalised') === 'normalised',
     oneSided: oneOf(described.residuals, 'signed', 'one-sided') === 'one-sided',

@@ -8,8 +8,8 @@ import { Decoder } from './decoder.ts';
 import { numbersOf, objectOf, parsed, readTensors } from './safetensors.ts';
 
 const [FORMAT, VERSION] = ['keyss-secret', 8];
-const [MOST_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
-const MOST_COUNT = 2 ** 31;
+const [MAX_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
+const MAX_COUNT = 2 ** 31;
 const DRAWN_OPACITY = Math.fround(1 / 255);
 const APPENDED_OPACITY = 1.1 / 255;
 const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
@@ -21,7 +21,7 @@ export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians:
   if (header.format !== FORMAT) throw damaged();
   if (header.version !== VERSION) throw otherVersion();
   const count = header.count as number;
-  if (!Number.isInteger(count) || count < 0 || count > MOST_COUNT) throw damaged();
+  if (!Number.isInteger(count) || count < 0 || count > MAX_COUNT) throw damaged();
   const frame = frameOf(objectOf(header.frame));
   checkAnchors(read.tensors.get('anchors'), stego);
   const own = rowsWhere(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
@@ -44,7 +44,7 @@ function frameOf(described: Record<string, unknown>): Similarity {
 /** Raises InputError unless enough of some positions are there: what was moved or rounded no decoder fits. */
 function checkAnchors(anchors: { shape: readonly number[]; values: Float32Array } | undefined, stego: Gaussians): void {
   const [count, axes] = anchors?.shape ?? [];
-  if (!anchors || anchors.shape.length !== 2 || axes !== 3 || count < 1 || count > MOST_ANCHORS) throw damaged();
+  if (!anchors || anchors.shape.length !== 2 || axes !== 3 || count < 1 || count > MAX_ANCHORS) throw damaged();
   const { means } = stego;
   const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
   means.forEach((each, at) => {

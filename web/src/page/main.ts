@@ -12,7 +12,7 @@ import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
-const MOST_BYTES = 2 ** 31;
+const MAX_BYTES = 2 ** 31;
 const EMBEDDED = location.protocol === 'about:'; // in another page, which has the address to itself
 
 class Page {
@@ -81,7 +81,7 @@ class Page {
 
   private async openFile(file: File): Promise<void> {
     if (page.main.dataset.live !== undefined) return;
-    if (file.size > MOST_BYTES) return this.fail('This file is larger than 2 GiB.');
+    if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
   }
 

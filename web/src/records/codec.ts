@@ -6,7 +6,7 @@ import { fromSmallestThree } from '../files/coded.ts';
 
 const BANDS = [1, 3, 5, 7]; // coefficients of each degree
 const CHROMA_FEWER = 2; // bits of the differences of colours
-const MOST_BITS = 24;
+const MAX_BITS = 24;
 const TABLE_BYTES = 8;
 const LINE_BYTES = 12;
 const FURTHEST = 1e30; // no number that a line may give is larger
@@ -46,7 +46,7 @@ export class Codec {
     let count = TABLE_BYTES;
     while (count > 0 && data[count - 1] === 0) count--;
     const bits = [...data.subarray(0, count)];
-    const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MOST_BITS);
+    const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MAX_BITS);
     if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damaged();
     const size = Codec.packedSize(bits.length - 5);
     if (data.length < size) throw damaged();

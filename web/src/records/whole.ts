@@ -6,7 +6,7 @@ import { unpackedZstd } from '../core/unpacking.ts';
 import { Codec, type Layout, putColours } from './codec.ts';
 
 const ALWAYS = 1 << 16; // Gaussians, whatever announces them
-const LEAST_BYTES = 2; // of each Gaussian in larger models
+const MIN_BYTES = 2; // of each Gaussian in larger models
 const HEAD_BYTES = 9; // Gaussians (4), SH degree (1), step of harmonics (4)
 const PER_OCTAVE = 0.5 / Math.LN2; // half octaves of the step
 const FINER = 6; // half octaves by which a step is finer or coarser, at most
@@ -21,7 +21,7 @@ export function decodeWhole(data: Uint8Array, carriers: number): Gaussians {
   const view = viewOf(data);
   const [count, shDegree, step] = [view.getUint32(0, true), data[4], view.getFloat32(5, true)];
   const codec = Codec.unpack(data.subarray(HEAD_BYTES));
-  const largest = Math.max(ALWAYS, Math.min(Math.floor(data.length / LEAST_BYTES), carriers));
+  const largest = Math.max(ALWAYS, Math.min(Math.floor(data.length / MIN_BYTES), carriers));
   const possible = count > 0 && count <= largest && shDegree <= 3 && step > 0 && step < 1;
   if (!possible || codec.shDegree !== 0) throw damaged();
   const { layout } = codec;

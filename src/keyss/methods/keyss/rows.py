@@ -47,7 +47,7 @@ PAYLOAD_BYTES = 2048  # at most, of a packed secret
 KINDS = (40, 24)  # of rows: carriers that are used where at least so many harmonics are not zero
 BITS = 7  # of a carrier
 SHIFT = np.uint32(13)  # bits of a harmonic below its carrier
-_LEAST = Table.short()  # the coarsest Gaussian
+_COARSEST = Table.short()  # the coarsest Gaussian
 _FEWEST = 500  # carriers that a tilt is measured on
 
 Bytes = npt.NDArray[np.uint8]
@@ -157,7 +157,7 @@ def secret_tables(sh_degree: int, secrets: int) -> list[Table]:
     for carriers in _carriers(sh_degree):
         bits = 8 * (share(carriers, secrets) - TAG_BYTES)
         tables = [Table.of_size(bits, degree) for degree in range(sh_degree, -1, -1)]
-        found += [each for each in (*tables, Table.of_size(bits, 0, _LEAST)) if each is not None][:1]
+        found += [each for each in (*tables, Table.of_size(bits, 0, _COARSEST)) if each is not None][:1]
     if not found:
         raise UsageError(
             f"SH degree {sh_degree} with {secrets} secrets: a row has no room for a Gaussian of each; use a "

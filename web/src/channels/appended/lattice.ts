@@ -10,7 +10,7 @@ export const [COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS] = [7, 6, 10, 5]
 const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
 const [COLOUR_STEP, SCALE_STEP] = [0.0275, 0.08];
 const TURNS_REACH = 0.5; // x, y and z of quaternions are below it, so that w is never smaller
-const [FARTHEST, MOST_SHIFTS] = [1 << 12, 500]; // steps of log scales: that are looked at, and that are tried
+const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: that are looked at, and that are tried
 
 /** The Gaussians that are as faint as appended ones, without harmonics. */
 export function candidates(model: Gaussians): Gaussians {
@@ -64,7 +64,7 @@ export function likelyShifts(steps: Float64Array): number[] {
 export function allShifts(steps: Float64Array): number[] {
   const sorted = steps.map((each) => Math.max(-FARTHEST, Math.min(FARTHEST, each))).sort();
   const [low, high] = [0.01, 0.99].map((share) => sorted[Math.round(share * (sorted.length - 1))]);
-  const end = Math.max(Math.min(high - 2 ** (SCALE_BITS - 2), low + MOST_SHIFTS), low);
+  const end = Math.max(Math.min(high - 2 ** (SCALE_BITS - 2), low + MAX_SHIFTS), low);
   const found: number[] = [];
   for (let shift = low - 2 ** (SCALE_BITS - 1); shift < end; shift += 0.25) found.push(shift);
   return found;

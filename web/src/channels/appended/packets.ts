@@ -7,9 +7,9 @@ import type { Codewords } from '../reed_solomon.ts';
 const PACKET_BYTES = 6;
 const NUMBER_BITS = 20;
 const DATA_BITS = 8; // of a header: packets of a codeword that hold data
-const MOST_DATA = 150;
-const MOST_CHUNKS = 255;
-const MOST_CODEWORDS = Math.min(1 << (NUMBER_BITS - DATA_BITS), Math.floor((1 << NUMBER_BITS) / MOST_CHUNKS)) - 1;
+const MAX_DATA = 150;
+const MAX_CHUNKS = 255;
+const MAX_CODEWORDS = Math.min(1 << (NUMBER_BITS - DATA_BITS), Math.floor((1 << NUMBER_BITS) / MAX_CHUNKS)) - 1;
 const [LEFT, DEVIATIONS] = [0.72, 4.5]; // of packets that may be relied upon
 const AGREEING_HEADERS = 3; // one or two may be there by chance
 
@@ -65,8 +65,8 @@ export function readHeader(key: Uint8Array, words: TaggedWords): number | null {
 /** The codewords of a payload; null where no writer would have written this header. */
 export function codewordsOf(header: number): Codewords | null {
   const [count, k] = [header >> DATA_BITS, header & ((1 << DATA_BITS) - 1)];
-  if (!(count > 0 && count <= MOST_CODEWORDS && k > 0 && k <= MOST_DATA)) return null;
+  if (!(count > 0 && count <= MAX_CODEWORDS && k > 0 && k <= MAX_DATA)) return null;
   let n = k;
   while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
-  return { count, n: Math.min(n, MOST_CHUNKS), k, width: PACKET_BYTES };
+  return { count, n: Math.min(n, MAX_CHUNKS), k, width: PACKET_BYTES };
 }

@@ -12,11 +12,11 @@ import type { Codes } from '../../files/models.ts';
 import { FINEST, LARGEST, type SogCodes } from '../../files/sog.ts';
 import { positionCode, rotationPart, rotationWord, type SpzCodes } from '../../files/spz.ts';
 
-const MOST_BITS = 10;
+const MAX_BITS = 10;
 const SHARE = -3; // 2 to this: the range of what is written, in sizes of the Gaussian
 const LOG_SCALE = -4; // 2 to this: the range of what is written in log scales
 const LOG2_E = 1.4426950408889634;
-const MOST_DISTANCE = 64; // powers of 2
+const MAX_DISTANCE = 64; // powers of 2
 const AXES = [0, 1, 2];
 const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
 
@@ -35,7 +35,7 @@ function fieldsOf(codes: Codes): Field[] {
 /** By how many powers of 2 a .sog's steps are larger at a position than at 0. */
 function sogDistance(codes: SogCodes, row: number, axis: number): number {
   const log = Math.abs(codes.mins[axis] + sogExtent(codes, axis) * (codes.positions[3 * row + axis] / FINEST));
-  return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MOST_DISTANCE);
+  return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MAX_DISTANCE);
 }
 
 function sogExtent({ mins, maxs }: SogCodes, axis: number): number {
@@ -96,7 +96,7 @@ function middle(a: number, b: number, c: number): number {
 
 /** How many bits of levels span 2 to `log` at most; NaN, of which bytes make 0, for NaN. */
 function fitting(log: number): number {
-  return Math.min(Math.max(Math.floor(log), 0), MOST_BITS);
+  return Math.min(Math.max(Math.floor(log), 0), MAX_BITS);
 }
 
 const NUMBER = new Float64Array(1);

@@ -7,8 +7,8 @@ import { sortingOrder } from '../../core/words.ts';
 import { BLOCK } from './syndromes.ts';
 
 const VERSION = 1;
-const [LEAST_SLOTS, MOST_SLOTS] = [4, 256];
-const [LEAST_SHARE, SHARE] = [1 / 4, 1 / 32]; // of all bits that the least slots, and more of them, may take
+const [MIN_SLOTS, MAX_SLOTS] = [4, 256];
+const [MIN_SHARE, SHARE] = [1 / 4, 1 / 32]; // of all bits that the least slots, and more of them, may take
 const HEADER_BYTES = 12; // version (1), bits that a block holds (2), first bit (4), bytes of data (4), unused (1)
 const SLOT_BYTES = HEADER_BYTES + 16;
 const ASSOCIATED = ascii('keyss/v1/codes');
@@ -40,9 +40,9 @@ export class Room {
 }
 
 function slotsIn(bits: number): number {
-  if (zoneBlocks(LEAST_SLOTS) * BLOCK > bits * LEAST_SHARE) return 0;
-  let found = LEAST_SLOTS;
-  while (found < MOST_SLOTS && zoneBlocks(2 * found) * BLOCK <= bits * SHARE) found *= 2;
+  if (zoneBlocks(MIN_SLOTS) * BLOCK > bits * MIN_SHARE) return 0;
+  let found = MIN_SLOTS;
+  while (found < MAX_SLOTS && zoneBlocks(2 * found) * BLOCK <= bits * SHARE) found *= 2;
   return found;
 }
 

@@ -17,7 +17,7 @@ import { BLOCK, bytesOf, matrix, products } from './syndromes.ts';
 
 const ASSOCIATED = ascii('keyss/v1/codes/data');
 const USUAL_RATE = 800; // of a key that opens nothing
-const MOST_BITS = 2 ** 30; // of which more would take more memory than tabs have
+const MAX_BITS = 2 ** 30; // of which more would take more memory than tabs have
 
 export class CodesReader implements Reader {
   readonly derivations = 1;
@@ -32,7 +32,7 @@ export class CodesReader implements Reader {
   static of(codes: Codes): CodesReader | null {
     const bits = lastBits(codes);
     const room = new Room(bits.length);
-    if (!room.slots || room.bits > MOST_BITS) return null;
+    if (!room.slots || room.bits > MAX_BITS) return null;
     const noSalt = new Uint8Array(SALT_BYTES);
     const every = order(noSalt, room.bits);
     const zoned = products(bits, every.subarray(0, room.zoneBits), matrix(noSalt, ZONE_RATE));

@@ -10,7 +10,7 @@ export const CELL = 0.25; // of a log scale
 export const [COLOUR_NOISE, OPACITY_NOISE] = [0.009, 0.004]; // what formats move these numbers by, at most
 export const NAME = 8; // numbers of a name: five, and zeros up to a block of AES
 const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [4, 5, 16]; // that make a cell
-const LEAST_OPACITY = 2.5 / 255;
+const MIN_OPACITY = 2.5 / 255;
 const SCALE_NOISE = 0.018;
 const SCALE_ROUNDED = SCALE_STEP / 2;
 const CELLS = 30_000; // on either side of zero
@@ -31,7 +31,7 @@ export function numbersOf(model: Gaussians): Numbers {
   for (let row = 0; row < model.count; row++) {
     let sum = 0; // finite where all are
     for (let axis = 0; axis < 3; axis++) sum += model.logScales[3 * row + axis] + model.sh[width * row + axis];
-    if (Number.isFinite(sum) && opacities[row] > LEAST_OPACITY) rows.push(row);
+    if (Number.isFinite(sum) && opacities[row] > MIN_OPACITY) rows.push(row);
   }
   const [logScales, colours] = [new Float64Array(3 * rows.length), new Float64Array(3 * rows.length)];
   rows.forEach((row, to) => {

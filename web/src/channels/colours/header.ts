@@ -10,7 +10,7 @@ import { mixAt, runs, sortingOrder, type Words, wordsOf } from '../../core/words
 import { expand } from '../../keys/derivation.ts';
 import { type Carriers, chosen } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
-import { COLUMNS, dithers, MOST_BITS, rank, readBits, seedsOf } from './lattice.ts';
+import { COLUMNS, dithers, MAX_BITS, rank, readBits, seedsOf } from './lattice.ts';
 
 export const FILE_KEY_BYTES = 5;
 export const SHARES = 256; // parts of the carriers, of which a payload has some
@@ -20,7 +20,7 @@ const CHECK_BYTES = 2;
 export const HEADER_BYTES = 14;
 const ROUNDS = 20;
 const TRIES = 3; // to tell salts that were lost
-const [LEAST_TRUST, MOST_TRUST] = [0.02, 0.95];
+const [MIN_TRUST, MAX_TRUST] = [0.02, 0.95];
 const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
 const PILOTS = 16; // numbers of each salt's part that are known beforehand
 const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
@@ -132,7 +132,7 @@ function unpackHeader(bits: Uint8Array, check: Uint8Array): Header | null {
     idle: e & 31,
     bits: bits.slice(),
   };
-  return found.depth < 1 || found.depth > MOST_BITS || found.last < found.first ? null : found;
+  return found.depth < 1 || found.depth > MAX_BITS || found.last < found.first ? null : found;
 }
 
 /** Bytes of bits, the highest first. */
@@ -143,7 +143,7 @@ export function packBits(bits: Uint8Array): Uint8Array {
 }
 
 function trust(odds: number): number {
-  return Math.max(LEAST_TRUST, Math.min(MOST_TRUST, 1 / (1 + Math.exp(-odds))));
+  return Math.max(MIN_TRUST, Math.min(MAX_TRUST, 1 / (1 + Math.exp(-odds))));
 }
 
 /** Code bits of a header under one salt, as one Gaussian of each place says; hints are P(0) - P(1). */

@@ -8,7 +8,7 @@ import { expand } from '../../keys/derivation.ts';
 import { type Carriers, impact } from './carriers.ts';
 
 export const COLUMNS = 2; // numbers of a Gaussian that are written
-export const MOST_BITS = 5; // of a number
+export const MAX_BITS = 5; // of a number
 const SPACING = 0.0275; // between neighbouring points
 export const LEVELS = 64;
 const BIT = Math.log(4); // of impact; a level is a quarter of a bit

@@ -26,7 +26,7 @@ const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SALT_BYTES
 // Shares of carriers that may hold something else: in ordinary files, in merged ones.
 const CHANGED = [0.03, 0.5];
 const ROUNDS = 60;
-const MOST_RATE = 4; // data bits for each code bit
+const MAX_RATE = 4; // data bits for each code bit
 const CELLS_AROUND = [0, 1, -1, 2, -2, 3, -3, 4, -4]; // where a writer may have had its zero, in cells
 const CELLS_SCALED = [0, 1, -1]; // in a model that was scaled
 const ALIGNMENTS = 7; // of borders of cells
@@ -149,7 +149,7 @@ async function payload(
   const own = chosen(carriers, ownRows(header, carriers));
   const [size, key] = [bucketBytes(header.bucket), expand(joined(fixed, header.fileKey), 'colours/data-key', 32)];
   const counts = bitCounts(own, header.level, header.depth);
-  if (!own.count || 8 * size > MOST_RATE * COLUMNS * sum(counts)) return null;
+  if (!own.count || 8 * size > MAX_RATE * COLUMNS * sum(counts)) return null;
   const garbage = Math.min(0.9, header.idle * IDLE + changed);
   const alike = namesakes(rank(header.partition, 'partition', own.names));
   const doubt = own.doubt.map((each, row) => 1 - ((1 - garbage) * (1 - each)) / alike[row]);

@@ -14,7 +14,7 @@ const NOISE = [
   ...[COLOUR_NOISE / COLOUR_STEP, COLOUR_NOISE / COLOUR_STEP, COLOUR_NOISE / COLOUR_STEP],
 ];
 const UNCHANGED = 4; // of these numbers: opacity, ratios and red
-const MOST_CELLS = 30_000;
+const MAX_CELLS = 30_000;
 const LABEL = ascii('keyss/v1/colours-salt');
 const PUBLIC = sha256(LABEL);
 
@@ -55,7 +55,7 @@ function putCells({ logScales, opacities, colours }: Numbers, row: number, cells
   ];
   let inner = true;
   steps.forEach((step, column) => {
-    const place = Math.max(-MOST_CELLS, Math.min(MOST_CELLS, step / STEPS[column]));
+    const place = Math.max(-MAX_CELLS, Math.min(MAX_CELLS, step / STEPS[column]));
     const cell = Math.floor(place);
     cells[STEPS.length * row + column] = cell;
     const outward = Math.abs(place - cell - 0.5) / (0.5 - NOISE[column] / STEPS[column]);

@@ -6,7 +6,7 @@ import type { Codewords } from '../reed_solomon.ts';
 const VERSION = 3;
 const PREFIX_BYTES = 34;
 const NUMBERS = 29; // where cells, bytes of a record and bytes of the header begin
-const MOST_CELLS = 4;
+const MAX_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
 const MAX_CHUNKS = 255;
 const MAX_CODEWORDS = Math.floor((1 << 24) / MAX_CHUNKS);
@@ -32,7 +32,7 @@ export function unpackParameters(parts: Uint8Array[]): Parameters {
   if (version !== VERSION) throw otherVersion();
   const [cells, view] = [prefix[NUMBERS], viewOf(prefix)];
   const [recordBytes, length] = [view.getUint16(NUMBERS + 1, true), view.getUint16(NUMBERS + 3, true)];
-  if (service < 1 || service > 2 || cells < 1 || cells > MOST_CELLS || length > MAX_HEADER_BYTES) throw damaged();
+  if (service < 1 || service > 2 || cells < 1 || cells > MAX_CELLS || length > MAX_HEADER_BYTES) throw damaged();
   const method = bytesKey(prefix.subarray(2, 17)).replace(/\0+$/, '');
   const header = firstBytes(best, PREFIX_BYTES + length).subarray(PREFIX_BYTES);
   return { isPayload: service === 1, method, cells, recordBytes, header };
