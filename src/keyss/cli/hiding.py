@@ -49,8 +49,8 @@ class Details:
         float,
         arg(
             metavar="DB",
-            help="Fail if cover or secret is further from its plain model than this. Pruned secrets need 25 dB, "
-            "unless this is below 20.",
+            help="Fail if cover or secret is further from its plain model than this. Pruned secrets need "
+            "25 dB, unless this is below 20.",
         ),
     ] = 20.0
     bound: Annotated[
