@@ -154,7 +154,7 @@ def test_dithering_says_what_it_costs(
     hide = (*HIDE, "--cover", tmp_path / "coarse.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
     status, _, err = run(*hide)
     assert status == 4
-    assert "--dither may give it others" in err
+    assert "--dither makes room" in err
     status, out, _ = run(*hide, "--dither")
     assert status == 0
     assert "PSNR to the plain models: cover " in out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from keyss.channels import (
@@ -19,7 +19,7 @@ from keyss.channels import (
     usable_carriers,
 )
 from keyss.channels.low_bits.bits import Layout
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.options import CarryOptions
@@ -75,24 +75,23 @@ class RecordRoom:
         Raises UsageError for Gaussians without room for a record, InputError for low bits that are not
         random.
         """
+        try:
+            return RecordRoom._of(cover, options, os.urandom(32) if entropy is None else entropy)
+        except KeyssError as error:
+            raise type(error)(f"{error}; {_ways(cover, options)}") from error
+
+    @staticmethod
+    def _of(cover: Gaussians | None, options: CarryOptions, entropy: bytes) -> RecordRoom:
         degree, count = options.fit.sh_degree, options.fit.max_gaussians
-        entropy = os.urandom(32) if entropy is None else entropy
         if cover is not None:
             cover = of_degree(cover, degree, entropy)
         layout = Layout(degree) if cover is None else Layout.of(cover)
         if largest_degree(LowBitsRoom(0, layout.width).record_bytes(1)) is None:
             unit = "" if layout.quats else " with unit quaternions"
-            raise UsageError(
-                f"a model of SH degree {degree}{unit} has no room for anything in its low bits; "
-                f"`sh_degree={1 if layout.quats else 2}` makes room, {_ANY}"
-            )
+            raise UsageError(f"a model of SH degree {degree}{unit} has no room for anything in its low bits")
         if cover is None:
             return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
-        try:
-            prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
-        except InputError as error:
-            others = "" if options.dither else "`dither=True` may give it others, "
-            raise InputError(f"{error}; {others}{_ANY}") from error
+        prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
         room = LowBitsRoom(prepared.carriers, prepared.layout.width)
         return RecordRoom(len(cover), degree, room, prepared)
 
@@ -193,6 +192,22 @@ def room_for(
     Raises UsageError and InputError for a cover without room.
     """
     return RecordRoom.of(cover, options, entropy) if options.place.records else WholeRoom.of(cover, options)
+
+
+def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
+    """The fewest changes of the options that give `cover` room in its low bits, and what always works."""
+    entropy = os.urandom(32)
+    degrees = [degree for degree in (1, 2) if degree > options.fit.sh_degree]
+    for degree in (None, *degrees):
+        for dither in (False, True):
+            changed = options if degree is None else options.with_fit(sh_degree=degree)
+            try:
+                RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
+            except KeyssError:
+                continue
+            asked = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
+            return f"`{', '.join(asked)}` makes room, {_ANY}"
+    return _ANY
 
 
 def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
