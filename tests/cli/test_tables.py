@@ -6,10 +6,11 @@ import io
 import re
 from dataclasses import replace
 
+import pytest
 from rich.console import Console
 
 from cli.said import METRICS
-from keyss.cli.tables import print_hiding
+from keyss.cli.tables import print_hiding, print_table
 from keyss.fitting import ImageQuality
 from keyss.measure import BaselineQuality, PsnrRange, WrongKeys
 from keyss.runs import HideMetrics
@@ -19,7 +20,7 @@ class TestNumbers:
     """What is printed of a hiding, whatever its method."""
 
     def table(self, metrics: HideMetrics) -> list[list[str]]:
-        console = Console(file=io.StringIO(), width=120)
+        console = Console(file=io.StringIO(), width=80)
         print_hiding(metrics, console)
         text: str = console.file.getvalue()  # type: ignore[attr-defined]
         return [re.split("  +", line.strip()) for line in text.splitlines()]
@@ -27,42 +28,51 @@ class TestNumbers:
     def test_a_row_for_each_and_what_the_method_adds(self) -> None:
         rows = self.table(METRICS)
         assert rows[:4] == [
-            ["on test views", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
+            ["on test photos", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
             ["cover", "30.00", "0.500", "30.50", "0.50", "1,234", "10"],
             ["secret", "20.00", "0.250", "567", "20"],
-            ["chance level of the secret", "9.00"],
+            ["PSNR in dB."],
         ]
         assert rows[-2:] == [["carriers: 1,000"], ["bits per gaussian: 568, 600"]]
 
     def test_columns_that_nothing_fills_are_left_out(self) -> None:
         rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)), details={}))
-        assert rows[0] == ["on test views", "PSNR", "SSIM", "Gaussians", "steps"]
+        assert rows[0] == ["on test photos", "PSNR", "SSIM", "Gaussians", "steps"]
         assert rows[1] == ["cover", "30.00", "0.500", "1,234", "10"]
 
-    def test_wrong_keys_where_there_is_a_decoder(self) -> None:
+    def test_two_secrets_and_wrong_keys_in_80_columns(self) -> None:
         two = replace(
             METRICS,
             secrets=METRICS.secrets * 2,
-            baseline=BaselineQuality(None, (None, None), (None, None, None)),
-            photos=(True, True, True),
+            baseline=BaselineQuality(
+                ImageQuality(30.0, 0.5),
+                (ImageQuality(19.0, 0.2), None),
+                (10**5,) * 3,
+                (9,) * 3,
+                (True, False, True),
+            ),
+            photos=(True, True, False),
             against_plain=METRICS.against_plain + METRICS.against_plain[1:],
             secret_gaussians=(5, 6),
-            steps=(10, 20, 20),
+            steps=(10**4, 10**4, 10**4),
             chance_level=(9.0, 8.0),
             wrong_key=WrongKeys(
                 7, PsnrRange(28.0, 27.0, 29.0), (PsnrRange(8.0, 7.0, 9.5), PsnrRange(6.0, 5.0, 7.5))
             ),
         )
-        rows = [row[:2] for row in self.table(two)]
-        assert rows[3:10] == [
-            ["secret 2", "20.00"],
-            ["7 wrong keys, mean to the cover", "28.00"],
-            ["lowest to the cover", "27.00"],
-            ["highest to the secret 1", "9.50"],
-            ["highest to the secret 2", "7.50"],
-            ["chance level of the secret 1", "9.00"],
-            ["chance level of the secret 2", "8.00"],
-        ]
+        rows = self.table(two)
+        assert rows[2] == ["secret 1", "20.00", "0.250", "19.00", "5", "100,000", "10,000"]
+        assert rows[3][0] == "secret 2 (renders)"
+        said = " ".join(cell for row in rows for cell in row)
+        assert (
+            "7 wrong keys: on average 28.00 to the cover, at least 27.00; at most 9.50 to the secret 1"
+            in said
+        )
+        assert "Chance level: 9.00, 8.00" in said
+
+    def test_rows_that_no_terminal_holds_become_lists(self, capsys: pytest.CaptureFixture[str]) -> None:
+        print_table(["method", *"abc"], [["keyss", "x" * 40, "y" * 40, "z 1"]])
+        assert capsys.readouterr().out.splitlines()[:2] == ["method: keyss", f"a: {'x' * 40}"]
 
     def test_what_was_written_was_opened_again(self) -> None:
         said = " ".join(cell for row in self.table(METRICS) for cell in row)
@@ -70,22 +80,14 @@ class TestNumbers:
 
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)
-        assert ["Test views: photos held out of training. PSNR, bound and loss in dB."] in rows
-        assert ["Bound: plain 3DGS of as many Gaussians and as many training steps."] in rows
-        assert any(row[0].startswith("Chance level: PSNR of the stego model itself") for row in rows)
+        assert ["Bound: PSNR of plain 3DGS of as many Gaussians and as many training steps."] in rows
+        assert any(row[0].startswith("Chance level: 9.00, PSNR of the stego") for row in rows)
         alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
         assert not any(row[0].startswith(("Bound:", "Start:")) for row in self.table(alone))
 
-    def test_renders_of_models_are_not_called_photos(self) -> None:
-        rows = self.table(replace(METRICS, photos=(False, False)))
-        assert not any("photo" in cell for row in rows for cell in row if "there are no photos" not in cell)
-        assert any("8-bit renders of the given models" in row[0] for row in rows)
-        (line,) = (row[0] for row in self.table(replace(METRICS, photos=(True, False))) if "Test" in row[0])
-        assert "photos held out of training; for secret 8-bit renders of the given model" in line
-
     def test_models_that_nothing_trained_have_neither_steps_nor_bounds(self) -> None:
         rows = self.table(replace(METRICS, photos=(False, False)))
-        assert rows[0] == ["on test views", "PSNR", "SSIM", "Gaussians"]
+        assert rows[0] == ["on renders of the given models", "PSNR", "SSIM", "Gaussians"]
         assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
         assert not any("training steps" in cell for row in rows for cell in row)
 
@@ -105,11 +107,11 @@ class TestNumbers:
         shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
         rows = self.table(replace(METRICS, baseline=shorter))
         assert rows[0] == [
-            *("on test views", "PSNR", "SSIM", "bound", "loss", "start"),
+            *("on test photos", "PSNR", "SSIM", "bound", "loss", "start"),
             *("Gaussians", "steps"),
         ]
-        assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20 (start 10)"]
-        assert any(row[0].startswith("Start:") and "is no bound" in row[0] for row in rows)
+        assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20"]
+        assert any(row[0].startswith("Start:") and "10 training steps" in row[0] for row in rows)
         old = replace(shorter, steps=(), equal=())  # a record that knows nothing of steps
         rows = self.table(replace(METRICS, baseline=old, steps=()))
-        assert rows[0] == ["on test views", "PSNR", "SSIM", "start", "Gaussians"]
+        assert rows[0] == ["on test photos", "PSNR", "SSIM", "start", "Gaussians"]

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from rich.cells import cell_len
 from rich.console import Console as RichConsole
 from rich.table import Table
 from rich.text import Text
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from keyss.runs.metrics import FitMetrics, HideMetrics
 
 
-_HEADS = ("on test views", "PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")
+_HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")
 
 
 class Console(RichConsole):
@@ -36,41 +37,31 @@ class Console(RichConsole):
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     """The numbers of a hiding: a row for each scene beside its baseline, wrong keys, the method's own."""
-    secrets = ["secret"]
+    names = ["cover", "secret"]
     if len(metrics.secrets) > 1:
-        secrets = [f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1)]
-    rows = _scene_rows(metrics, ["cover", *secrets])
-    psnrs = []
-    if (wrong := metrics.wrong_key) is not None:
-        psnrs = [
-            (f"{wrong.keys} wrong keys, mean to the cover", wrong.vs_cover.mean),
-            ("  lowest to the cover", wrong.vs_cover.min),
-            *(
-                (f"  highest to the {name}", psnr.max)
-                for name, psnr in zip(secrets, wrong.vs_secrets, strict=True)
-            ),
-        ]
-    psnrs += [
-        (f"chance level of the {name}", level)
-        for name, level in zip(secrets, metrics.chance_level, strict=True)
-    ]
-    rows += [{"on test views": name, "PSNR": f"{psnr:.2f}"} for name, psnr in psnrs]
+        names = ["cover", *(f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1))]
+    rows = _scene_rows(metrics)
     heads = [head for head in _HEADS if any(head in row for row in rows)]
+    views, first = "on test photos", names
+    if not any(metrics.photos):
+        views = "on renders of the given models"
+    elif not all(metrics.photos):
+        first = [name + " (renders)" * (not shown) for name, shown in zip(names, metrics.photos, strict=True)]
+    table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     console = console or Console()
-    print_table(heads, [[row.get(head, "") for head in heads] for row in rows], console=console)
-    for line in _explanations(metrics, ["cover", *secrets], heads):
+    print_table([views, *heads], table, console=console)
+    for line in _explanations(metrics, names, heads):
         console.print(line, highlight=False, markup=False)
     for name, value in metrics.details.items():
         console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False, markup=False)
 
 
-def _scene_rows(metrics: HideMetrics, names: Sequence[str]) -> list[dict[str, str]]:
+def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
     """A row for the cover and each secret, by the heads of its columns."""
-    baseline, unknown = metrics.baseline, (None,) * len(names)
+    baseline, unknown = metrics.baseline, (None,) * len(metrics.photos)
     sizes = [metrics.gaussians, *metrics.secret_gaussians]
     rows = []
-    for name, photos, own, plain, equal, size, plain_size, steps, plain_steps in zip(
-        names,
+    for photos, own, plain, equal, size, plain_size, steps in zip(
         metrics.photos,
         [metrics.cover, *metrics.secrets],
         [baseline.cover, *baseline.secrets],
@@ -78,10 +69,9 @@ def _scene_rows(metrics: HideMetrics, names: Sequence[str]) -> list[dict[str, st
         sizes,
         baseline.gaussians,
         metrics.steps or unknown,
-        baseline.steps or unknown,
         strict=True,
     ):
-        row = {"on test views": name, "PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
+        row = {"PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
         row["Gaussians"] = f"{size:,}"
         if not photos:  # the test views are renders of the given model, which is no bound of training
             plain = steps = None
@@ -91,8 +81,6 @@ def _scene_rows(metrics: HideMetrics, names: Sequence[str]) -> list[dict[str, st
             row |= {"bound": f"{plain.psnr:.2f}", "loss": f"{plain.psnr - own.psnr:z.2f}"}
         elif plain is not None:
             row["start"] = f"{plain.psnr:.2f}"
-            if steps is not None and plain_steps is not None:
-                row["steps"] += f" (start {plain_steps:,})"
         if plain_size and _sizes_differ(metrics):
             row["plain's"] = f"{plain_size:,}"
         rows.append(row)
@@ -138,28 +126,32 @@ def print_plan(plan: Plan) -> None:
 
 def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[str]) -> list[str]:
     """A line for each term of the table of a hiding."""
-    rendered = [name for name, photos in zip(names, metrics.photos, strict=True) if not photos]
-    views = "photos held out of training"
-    if len(rendered) == len(names):
-        views = "8-bit renders of the given models"
-    elif rendered:
-        views += f"; for {', '.join(rendered)} 8-bit renders of the given model"
-    units = [head for head in ("PSNR", "bound", "loss", "start") if head in heads]
-    listed = units[0] if len(units) == 1 else f"{', '.join(units[:-1])} and {units[-1]}"
-    lines = [f"Test views: {views}. {listed} in dB."]
+    lines = ["PSNR in dB."]
     size = "as many Gaussians"
     if _sizes_differ(metrics):
         size = "its own number of Gaussians" if _sizes_differ(metrics, 0.02) else "about as many Gaussians"
     if "bound" in heads:
-        lines.append(f"Bound: plain 3DGS of {size} and as many training steps.")
+        lines.append(f"Bound: PSNR of plain 3DGS of {size} and as many training steps.")
     if "start" in heads:
+        baseline = metrics.baseline
+        pairs = zip(baseline.steps, baseline.equal, strict=False)
+        shorter = {steps for steps, equal in pairs if steps is not None and not equal}
+        fewer = " or ".join(f"{steps:,}" for steps in sorted(shorter)) or "fewer"
         lines.append(
-            f"Start: a plain model of {size} and fewer training steps, which is no bound; `keyss hide "
-            "--bound` fits one."
+            f"Start: PSNR of a plain model of {size} and {fewer} training steps, which is no bound; `keyss "
+            "hide --bound` fits one."
         )
+    if (wrong := metrics.wrong_key) is not None:
+        highest = (
+            f"{each.max:.2f} to the {name}" for name, each in zip(names[1:], wrong.vs_secrets, strict=True)
+        )
+        cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
+        lines.append(f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {', '.join(highest)}.")
     if metrics.chance_level:
+        chance = ", ".join(f"{each:.2f}" for each in metrics.chance_level)
         lines.append(
-            "Chance level: PSNR of the stego model itself to the secret; no wrong key should exceed it."
+            f"Chance level: {chance}, PSNR of the stego model itself to the secret; no wrong key should "
+            "exceed it."
         )
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
     lines.append(f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB.")
@@ -283,13 +275,29 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
 def print_table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, console: Console | None = None
 ) -> None:
-    """A table whose first `texts` columns are aligned left; the others hold numbers."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for index, head in enumerate(heads):
-        table.add_column(head, justify="left" if index < texts else "right")
+    """A table whose first `texts` columns are aligned left; the others hold numbers.
+
+    Cells wrap between words. Where that is not enough for the terminal, each row becomes a list.
+    """
+    console, rows = console or Console(), list(rows)
+    columns = list(zip(heads, *rows, strict=True))
+    least = [max(cell_len(word) for cell in cells for word in cell.split() or [""]) for cells in columns]
+    widths = [max(map(cell_len, cells)) for cells in columns]
+    gaps = 2 * (len(heads) - 1)
+    if sum(least) + gaps > console.width:
+        for row in rows:
+            for head, cell in zip(heads, row, strict=True):
+                console.print(f"{head}: {cell}", highlight=False, markup=False)
+            console.print()
+        return
+    while sum(widths) + gaps > console.width:
+        widths[max(range(len(widths)), key=lambda index: (widths[index] > least[index]) * widths[index])] -= 1
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for index, (head, width) in enumerate(zip(heads, widths, strict=True)):
+        table.add_column(head, justify="left" if index < texts else "right", width=width)
     for row in rows:
         table.add_row(*map(Text, row))
-    (console or Console()).print(table)
+    console.print(table)
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
