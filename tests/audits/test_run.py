@@ -87,11 +87,16 @@ def test_plain_models_are_made_once_and_differ(run: Path, calls: list[str]) -> N
     assert [path.stat().st_mtime_ns for path in models] == times
 
 
-def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[str]) -> None:
+def test_an_interrupted_audit_goes_on_after_what_it_has(
+    run: Path, calls: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     calls.append("fail")
     with pytest.raises(Interrupted):
         audit(run, [KEY], controls=2)
     assert not (run / "private" / "audit" / "audit.json").exists()
+    assert main(["audit", str(run), "--report-only"]) == 0
+    assert "interrupted before leaks: --resume with the same arguments" in capsys.readouterr().err
+    assert 'id="speed"' in (run / "private" / "report.html").read_text()
     with pytest.raises(OutputError, match="`resume=True` with the same arguments"):
         audit(run, [KEY], controls=2)
     with pytest.raises(OutputError, match="controls: 2 then, 3 now"):

@@ -1,24 +1,22 @@
-"""Finished parts of an audit, from which an interrupted one resumes, and its progress."""
+"""The audit so far, from which an interrupted one resumes, and its progress."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar
 
 import msgspec
 from torch import Tensor
 
-from keyss.audits.record import Audit
+from keyss.audits.record import AUDIT_FILE, AUDIT_FOLDER, PICTURES, Audit, read_audit
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
 from keyss.files.reading import read_file
 from keyss.fitting.reporting import Reporter
-from keyss.runs.records import read_record, write_record
-
-_MAX_PICTURE_BYTES = 1 << 26
+from keyss.runs.records import write_record
 
 T = TypeVar("T")
 
@@ -31,18 +29,13 @@ class PartResult(Generic[T]):
     pictures: dict[str, Tensor] = field(default_factory=dict)  # [H, W, 3] uint8 by file name
 
 
-@dataclass(frozen=True, kw_only=True)
-class _FinishedPart(Generic[T]):
-    version: int = 1
-    section: T
-    pictures: tuple[str, ...]
+class PartialAudit:
+    """The audit so far, with its pictures, in a folder laid out as a run's; for the same `inputs` only."""
 
-
-class FinishedParts:
-    """Finished parts in a folder; they are valid for the same `inputs` only."""
-
-    def __init__(self, folder: Path, inputs: dict[str, object]) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, begun: Audit, inputs: dict[str, object]) -> None:
+        self.folder, self.audit = folder, begun
+        self.file = folder / AUDIT_FOLDER / AUDIT_FILE
+        self.pictures = self.file.parent / PICTURES
         digest = hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).digest()
         path = folder / "inputs.sha256"
         if not path.exists():
@@ -52,24 +45,15 @@ class FinishedParts:
                 f"{folder}: belongs to an audit with other settings or inputs: "
                 "give the same ones, or start again with `overwrite=True`"
             )
+        if self.file.exists():
+            self.audit = replace(read_audit(folder), run=begun.run)
 
-    def has(self, part: str) -> bool:
-        return (self.folder / f"{part}.json").exists()
-
-    def keep(self, part: str, result: PartResult[Any]) -> None:
+    def add(self, part: str, result: PartResult[Any]) -> None:
+        self.pictures.mkdir(parents=True, exist_ok=True)
         for name, picture in result.pictures.items():
-            (self.folder / part).mkdir(exist_ok=True, mode=0o700)
-            write_bytes(self.folder / part / name, png_bytes(picture))
-        kept = _FinishedPart(section=result.section, pictures=tuple(result.pictures))
-        write_record(self.folder / f"{part}.json", kept)
-
-    def take(self, part: str) -> tuple[Any, dict[str, bytes]]:
-        """Section and pictures (PNG files by name) of a finished part."""
-        section = get_type_hints(Audit)[part]
-        path = self.folder / f"{part}.json"
-        kept: _FinishedPart[Any] = read_record(path, _FinishedPart[section])  # type: ignore[valid-type]
-        folder = self.folder / part
-        return kept.section, {name: read_file(folder / name, _MAX_PICTURE_BYTES) for name in kept.pictures}
+            write_bytes(self.pictures / name, png_bytes(picture))
+        write_record(self.file, replace(self.audit, **{part: result.section}))
+        self.audit = read_audit(self.folder)
 
 
 class PartProgress:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import platform
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -15,7 +17,7 @@ import msgspec
 
 from keyss._version import __version__
 from keyss.audits.parts import OF_3DGS_MODELS, PARTS
-from keyss.audits.progress import FinishedParts, PartProgress
+from keyss.audits.progress import PartialAudit, PartProgress
 from keyss.audits.record import (
     AUDIT_FILE,
     AUDIT_FOLDER,
@@ -25,13 +27,13 @@ from keyss.audits.record import (
     read_audit,
 )
 from keyss.audits.subject import AuditSubject, subject_of
-from keyss.core import Interrupted, UsageError, import_extra, signal_of
+from keyss.core import Interrupted, KeyssWarning, UsageError, import_extra, signal_of
 from keyss.files.atomic import write_bytes
 from keyss.fitting import Reporter, SilentReporter
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import REPORT, writers
-from keyss.runs.folder import RunFolder, write_again
+from keyss.runs.folder import CHECKPOINTS, RunFolder, read_manifest, write_again
 from keyss.runs.opening import HidingRun, open_run
 from keyss.runs.sources import PathLike
 
@@ -57,9 +59,10 @@ def audit(
     """Measure quality, stealth, leaks, robustness and speed of a folder that `hide` made.
 
     `keys`: those of all its secrets, in any order. `report_only`: only writes `private/report.html` again,
-    from the audit that the run already has; it needs no keys. `original`: a plain model of the cover, by
-    default the run's own. `controls`: the number of plain models of the cover, from other seeds, to compare
-    with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
+    from the audit that the run already has, or from the finished parts of an interrupted one; it needs no
+    keys. `original`: a plain model of the cover, by default the run's own. `controls`: the number of plain
+    models of the cover, from other seeds, to compare with; at least 2, kept in `private/controls/`. `only`:
+    names of parts, by default all.
 
     The folder gets `private/audit/` with `audit.json`, which is also returned, and pictures, and
     `private/report.html`. An interrupted audit keeps its finished parts, and `resume` continues after them.
@@ -97,31 +100,29 @@ def audit(
 
     with folder.work(), _resumable(folder.checkpoints):
         subject = subject_of(opened, original, controls, seed, target, reporter, folder)
-        finished = FinishedParts(folder.checkpoints, _inputs(subject, seed))
-        sections = {}
-        pictures: dict[str, bytes] = {}
-        possible = [name for name in PARTS if standard or name not in OF_3DGS_MODELS]
-        chosen = [name for name in possible if not only or name in only]
-        for index, name in enumerate(chosen):
-            if not finished.has(name):
-                progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
-                try:
-                    finished.keep(name, PARTS[name](subject, seed, progress))
-                finally:
-                    progress.finish(finished.has(name))
-            sections[name], own = finished.take(name)
-            pictures |= own
-        result = Audit(
+        begun = Audit(
             keyss=__version__,
-            seconds=round(time.monotonic() - started, 1),
+            seconds=0.0,
             run=_audited_run(opened),
             controls=subject.seeds,
             wrong_key=opened.metrics.wrong_key,
             chance_level=opened.metrics.chance_level,
-            **sections,
         )
-        files = {f"{AUDIT_FOLDER}/{PICTURES}/{name}": data for name, data in pictures.items()}
-        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **files}))
+        partial_audit = PartialAudit(folder.checkpoints, begun, _inputs(subject, seed))
+        chosen = _chosen(only, standard)
+        for index, name in enumerate(chosen):
+            if getattr(partial_audit.audit, name) is None:
+                progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
+                try:
+                    partial_audit.add(name, PARTS[name](subject, seed, progress))
+                finally:
+                    progress.finish(getattr(partial_audit.audit, name) is not None)
+        result = replace(partial_audit.audit, seconds=round(time.monotonic() - started, 1))
+        pictures = {
+            f"{AUDIT_FOLDER}/{PICTURES}/{path.name}": path.read_bytes()
+            for path in partial_audit.pictures.glob("*.png")
+        }
+        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **pictures}))
         folder.write(writers({REPORT: report_bytes(result, there)}))
     return result
 
@@ -139,13 +140,31 @@ def _resumable(checkpoints: Path) -> Iterator[None]:
 
 
 def _report(run: Path) -> Audit:
-    """Write the report of the audit that a run has; nothing else of the run changes."""
+    """Write the report of the audit that a run has, finished or not; nothing else of the run changes."""
     import_extra("jinja2", "audit", "write a report")
     from keyss.audits.page import report_bytes
 
-    result = read_audit(run)
-    write_again(run, "audit", REPORT, partial(write_bytes, data=report_bytes(result, run)))
+    record = f"{AUDIT_FOLDER}/{AUDIT_FILE}"
+    interrupted = not (run / record).exists() and (run / CHECKPOINTS / record).exists()
+    place = run / CHECKPOINTS if interrupted else run
+    result = read_audit(place)
+    if interrupted and (running := read_manifest(run).running):
+        parts = _chosen(running.arguments["only"], result.run.standard)
+        missing = [name for name in parts if getattr(result, name) is None]
+        warnings.warn(
+            f"the audit was interrupted before {', '.join(missing)}: `resume=True` with the same arguments "
+            "continues it",
+            KeyssWarning,
+            stacklevel=2,
+        )
+    write_again(run, "audit", REPORT, partial(write_bytes, data=report_bytes(result, place)))
     return result
+
+
+def _chosen(only: Sequence[str], standard: bool) -> list[str]:
+    """The parts of an audit of a run, `standard` if it published a 3DGS model."""
+    possible = [name for name in PARTS if standard or name not in OF_3DGS_MODELS]
+    return [name for name in possible if not only or name in only]
 
 
 def _inputs(subject: AuditSubject, seed: int) -> dict[str, object]:

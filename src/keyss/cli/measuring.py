@@ -54,7 +54,7 @@ def audit(
         UseAppendAction[tuple[PartName, ...]],
         optional("PART", f"Part to audit: {', '.join(get_args(PartName))}; repeat for more.", "all"),
     ] = (),
-    report_only: Annotated[bool, switch("Write the report of a finished audit again.")] = False,
+    report_only: Annotated[bool, switch("Write the report again, of an interrupted audit too.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -72,9 +72,9 @@ def audit(
     from keyss.progress import reporter
 
     if report_only:
-        keyss.audit(run, report_only=True)
+        found = keyss.audit(run, report_only=True)
     else:
-        keyss.audit(
+        found = keyss.audit(
             run,
             keys_of_run(run, key_file),
             original=original,
@@ -86,7 +86,7 @@ def audit(
             resume=resume,
             reporter=reporter(),
         )
-    print_verdicts(run)
+    print_verdicts(found)
     print_files(
         run,
         {

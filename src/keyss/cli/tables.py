@@ -19,6 +19,7 @@ from keyss.runs.records import record_bytes
 
 if TYPE_CHECKING:
     from keyss.api.converting import Conversion
+    from keyss.audits import Audit
     from keyss.many import Forecast, ManyResult
     from keyss.measure.stegexpose import Steganalysis
     from keyss.methods.plan import Plan
@@ -183,11 +184,11 @@ def print_steganalysis(found: Steganalysis) -> None:
     print_table(("images", "flagged", "mean fusion"), [row], texts=0)
 
 
-def print_verdicts(run: Path) -> None:
+def print_verdicts(audit: Audit) -> None:
     """The verdicts of an audit: a line for each measure, with its baseline or control."""
-    from keyss.audits import headline, read_audit, verdicts
+    from keyss.audits import headline, verdicts
 
-    lines = verdicts(read_audit(run))
+    lines = verdicts(audit)
     rows = [(line.measure, line.value, line.beside, line.limit, line.word) for line in lines]
     print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
     Console().print(headline(lines), highlight=False)

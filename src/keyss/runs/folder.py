@@ -25,7 +25,7 @@ from keyss.runs.records import read_record, write_record
 
 PUBLISH, PRIVATE = "publish", "private"
 MANIFEST = f"{PRIVATE}/manifest.json"
-_LOCK, _CHECKPOINTS, _STAGING = (f"{PRIVATE}/{name}" for name in ("lock", "checkpoint", "unfinished"))
+_LOCK, CHECKPOINTS, _STAGING = (f"{PRIVATE}/{name}" for name in ("lock", "checkpoint", "unfinished"))
 
 _MAX_SHOWN = 60  # characters of an argument in a message
 
@@ -167,7 +167,7 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         """The folder for checkpoints, created."""
-        folder = self.path / _CHECKPOINTS
+        folder = self.path / CHECKPOINTS
         with _os_errors(folder):
             folder.mkdir(exist_ok=True, mode=0o700)
         return folder
@@ -234,7 +234,7 @@ class RunFolder:
         return Running(stage=self.stage, arguments=self.arguments, seconds=seconds)
 
     def _has_checkpoints(self) -> bool:
-        folder = self.path / _CHECKPOINTS
+        folder = self.path / CHECKPOINTS
         # A name with a leading dot is a file that a killed process did not finish.
         return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
 
@@ -307,7 +307,7 @@ def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
 
     Raises OutputError if they exist although no stage is running: then keyss did not write them.
     """
-    for name in (_CHECKPOINTS, _STAGING):
+    for name in (CHECKPOINTS, _STAGING):
         if manifest.running is None and os.path.lexists(folder / name):
             raise OutputError(f"{folder / name} is in the way, and keyss did not write it: move it")
         shutil.rmtree(folder / name, ignore_errors=True)
