@@ -18,7 +18,7 @@ from keyss.channels import LOW_BITS
 from keyss.cli import commands, flags, main
 from keyss.core import KeyssError
 from keyss.fitting import SilentReporter
-from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys import DerivedKey
 from keyss.methods import registry
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -118,7 +118,7 @@ def test_a_key_among_the_arguments_is_refused_and_not_repeated(
 
 
 def test_errors_and_representations_do_not_show_the_key() -> None:
-    derived = DerivedKey(KEY, KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8192, parallelism=1))
+    derived = DerivedKey.of(KEY, bytes(16))
     assert KEY not in repr(derived)
     assert derived.expand("writer", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:

@@ -17,7 +17,8 @@ from channels.codes.published import codes_of, model_of
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Said, assert_refused, listing
 from keyss import Secret, hide
-from keyss.channels import LOW_BITS, CodesCover, Payload, base, opening
+from keyss.channels import LOW_BITS, CodesCover, Payload, base
+from keyss.channels.colours import salts
 from keyss.channels.low_bits import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
@@ -102,19 +103,18 @@ class TestOpensNothing:
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         """Counts derived keys, and blocks of AES."""
         done = {"keys": 0, "blocks": 0}
-        encrypt, derive = cells.encrypted_blocks, base.DerivedKey
+        encrypt, derive = cells.encrypted_blocks, DerivedKey.of
 
         def counted(key: bytes, data: np.ndarray) -> np.ndarray:
             done["blocks"] += data.size // 16
             return encrypt(key, data)
 
-        def derived(*arguments: object) -> DerivedKey:
+        def derived(key: str, salt: bytes) -> DerivedKey:
             done["keys"] += 1
-            return derive(*arguments)  # type: ignore[arg-type]
+            return derive(key, salt)
 
         monkeypatch.setattr(cells, "encrypted_blocks", counted)
-        for module in (opening, base):
-            monkeypatch.setattr(module, "DerivedKey", derived)
+        monkeypatch.setattr(DerivedKey, "of", derived)
         return done
 
     def test_in_the_same_words_after_the_same_work(
@@ -131,7 +131,7 @@ class TestOpensNothing:
             made.append(dict(work))
         assert said[0] == said[1] == said[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == base.SALTS_TRIED
+        assert made[0]["keys"] == base.SALTS_TRIED + salts.SALTS + 1  # in low bits, then in colours
         assert_refused(said[0], 3, "opens nothing here")
         for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in said[0].err

@@ -10,7 +10,7 @@ from itertools import combinations
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene
-from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys import normalized_key
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, Source
 from keyss.methods.plan import Plan
@@ -106,10 +106,8 @@ def _drawable(model: PathLike | Gaussians | None, what: str) -> Gaussians | None
 
 def check_keys(keys: Sequence[str]) -> None:
     """Raise UsageError for invalid keys, and for two that key derivation treats as equal."""
-    cheap = KeyDerivation(salt=bytes(16), time_cost=1, memory_kib=8 * 1024, parallelism=1)
-    derived = [DerivedKey(key, cheap) for key in keys]
-    for (i, a), (j, b) in combinations(enumerate(derived, 1), 2):
-        if a.equals(b):
+    for (i, a), (j, b) in combinations(enumerate(map(normalized_key, keys), 1), 2):
+        if a == b:
             raise UsageError(
                 f"secrets {i} and {j} have the same key, which could open only one of them: give each its "
                 "own (see `keyss keygen`)"

@@ -24,7 +24,7 @@ from keyss.files.models import is_model_path, read_model
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.ranks import here
 from keyss.fitting.reporting import Reporter
-from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
 from keyss.methods.base import Context, MethodOptions, Source, Stego
@@ -221,15 +221,14 @@ def hide(
 def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
     """Verifiers of the keys for resumed runs; guessing a key from one is as slow as from the stego model."""
     salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
-    derivation = KeyDerivation(salt=salt)
-    return [DerivedKey(key, derivation).verifier().hex() for key in keys if key]
+    return [DerivedKey.of(key, salt).verifier().hex() for key in keys if key]
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
     """32 bytes that follow from keys, options and models, and that cannot be guessed without the keys."""
     seed = options.fit.known_seed
     salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
-    parts = [DerivedKey(key, KeyDerivation(salt=salt)).expand("writer", 32) for key in keys if key]
+    parts = [DerivedKey.of(key, salt).expand("writer", 32) for key in keys if key]
     parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey, KeyDerivation
+from keyss.keys.derivation import DerivedKey
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -154,7 +154,7 @@ class SaltedReader(ABC):
 
     def keys(self, key: str) -> Iterator[DerivedKey]:
         """`key` under each salt to be tried; each takes 0.1 s."""
-        return (DerivedKey(key, KeyDerivation(salt=salt)) for salt in self.salts[:SALTS_TRIED])
+        return (DerivedKey.of(key, salt) for salt in self.salts[:SALTS_TRIED])
 
     def open(self, key: str) -> Content:
         """See `Reader`. Changed or added Gaussians may have taken the place of the first salt."""

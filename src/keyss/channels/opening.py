@@ -10,7 +10,7 @@ from keyss.channels.base import Content, Payload, Reader, SaltedReader
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
-from keyss.keys.derivation import DerivedKey, KeyDerivation
+from keyss.keys.derivation import DerivedKey
 
 
 def open_content(stego: Gaussians, key: str) -> Content:
@@ -39,7 +39,7 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     reader = appended or _exact(stego)
     if reader is None or not reader.salts:
         return None
-    derived = DerivedKey(key, KeyDerivation(salt=reader.salts[0]))
+    derived = DerivedKey.of(key, reader.salts[0])
     content = None
     with suppress(WrongKeyError):
         content = _read_from(stego, reader.extract(derived))

@@ -1,8 +1,4 @@
-from .derivation import (
-    DerivedKey as DerivedKey,
-    KeyDerivation as KeyDerivation,
-    random_embeddings as random_embeddings,
-)
+from .derivation import DerivedKey as DerivedKey, random_embeddings as random_embeddings
 from .generation import ALPHABET as ALPHABET, generate_key as generate_key, length_for as length_for
 from .key_file import normalized_key as normalized_key, read_key_file as read_key_file
 from .master import MasterKey as MasterKey

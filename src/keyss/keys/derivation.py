@@ -6,7 +6,6 @@ result, with labels: no derived value reveals anything about another. Keys are n
 
 from __future__ import annotations
 
-import hmac
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,35 +26,7 @@ SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
 _STREAM_BLOCK = 1 << 16  # bytes
-TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4
-MAX_FACTOR = 4  # a file may demand so many times our memory and work
-MAX_PASSES = 4
-
-
-@dataclass(frozen=True)
-class KeyDerivation:
-    """Argon2id's public parameters. Raises InputError for values out of range, since files contain them."""
-
-    salt: bytes
-    time_cost: int = TIME_COST  # passes
-    memory_kib: int = MEMORY_KIB
-    parallelism: int = PARALLELISM
-
-    def __post_init__(self) -> None:
-        if len(self.salt) != SALT_BYTES:
-            raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(self.salt)}")
-        ranges = (
-            ("time_cost", 1, MAX_PASSES),
-            ("memory_kib", 8 * 1024, MAX_FACTOR * MEMORY_KIB),
-            ("parallelism", 1, 16),
-        )
-        for name, low, high in ranges:
-            value = getattr(self, name)
-            if not (type(value) is int and low <= value <= high):
-                raise InputError(f"key derivation: expected {name} in {low} to {high}, got {value!r}")
-        work, max_work = self.time_cost * self.memory_kib, MAX_FACTOR * TIME_COST * MEMORY_KIB
-        if work > max_work:
-            raise InputError(f"key derivation: expected at most {max_work:,} passes x KiB, got {work:,}")
+TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4  # of Argon2id: passes, KiB and lanes
 
 
 def expand(secret: bytes, label: str, length: int) -> bytes:
@@ -79,52 +50,41 @@ def fill(secret: bytes, label: str, data: npt.NDArray[np.uint8]) -> None:
         encryptor.update_into(zeros[: len(part)], part)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class DerivedKey:
-    """The values that one `KeyDerivation` derives from a key.
+    """What a key becomes under a salt, and the values that follow from it.
 
     Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "low-bits/key" (encrypts
     the data key in low bits), "writer" (randomness of hiding), "decoy", and those of the other channels.
     """
 
-    def __init__(self, key: str, derivation: KeyDerivation) -> None:
-        """Takes about 0.1 s. Raises UsageError as `normalized_key` does, InputError without memory."""
-        text = normalized_key(key)
-        try:
-            self._master = hash_secret_raw(
-                text.encode(),
-                derivation.salt,
-                time_cost=derivation.time_cost,
-                memory_cost=derivation.memory_kib,
-                parallelism=derivation.parallelism,
-                hash_len=MASTER_BYTES,
-                type=Type.ID,
-            )
-        except HashingError as error:
-            raise InputError(
-                f"deriving a key needs {derivation.memory_kib // 1024} MiB of memory, which the system "
-                f"refuses: {error}"
-            ) from error
+    master: bytes  # MASTER_BYTES, the output of Argon2id
 
     @staticmethod
-    def of_master(master: bytes) -> DerivedKey:
-        """The key whose Argon2id output is `master` (32 bytes): for tests that try thousands of keys."""
-        if len(master) != MASTER_BYTES:
-            raise ValueError(f"expected {MASTER_BYTES} bytes, got {len(master)}")
-        derived = object.__new__(DerivedKey)
-        derived._master = master
-        return derived
+    def of(key: str, salt: bytes) -> DerivedKey:
+        """Derive a key under a salt of SALT_BYTES, in about 0.1 s.
+
+        Raises UsageError as `normalized_key` does, InputError for another salt, and without enough memory.
+        """
+        text = normalized_key(key)
+        if len(salt) != SALT_BYTES:
+            raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(salt)}")
+        costs = {"time_cost": TIME_COST, "memory_cost": MEMORY_KIB, "parallelism": PARALLELISM}
+        try:
+            master = hash_secret_raw(text.encode(), salt, **costs, hash_len=MASTER_BYTES, type=Type.ID)
+        except HashingError as error:
+            raise InputError(
+                f"deriving a key needs {MEMORY_KIB // 1024} MiB of memory, which the system refuses: {error}"
+            ) from error
+        return DerivedKey(master)
 
     def expand(self, label: str, length: int) -> bytes:
         """`length` bytes for the use that `label` names."""
-        return expand(self._master, label, length)
+        return expand(self.master, label, length)
 
     def verifier(self) -> bytes:
         """32 bytes that identify the key and reveal nothing about its embedding."""
         return self.expand("verifier", 32)
-
-    def equals(self, other: DerivedKey) -> bool:
-        """True for the same key and derivation; takes constant time."""
-        return hmac.compare_digest(self.verifier(), other.verifier())
 
     def embedding(self) -> Tensor:
         """[64] float32 unit vector, uniform on the sphere, which conditions the decoder."""

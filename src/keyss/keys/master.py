@@ -12,7 +12,7 @@ import hashlib
 import unicodedata
 
 from keyss.core.errors import UsageError
-from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES, DerivedKey
 from keyss.keys.generation import ALPHABET
 
 KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
@@ -24,7 +24,7 @@ class MasterKey:
     """A master key; deriving it takes about 0.1 s, and no time for each name."""
 
     def __init__(self, key: str) -> None:
-        self._derived = DerivedKey(key, KeyDerivation(salt=_SALT))
+        self._derived = DerivedKey.of(key, _SALT)
 
     def key_of(self, name: str) -> str:
         """The key of a name: 22 letters and digits.

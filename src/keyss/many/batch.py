@@ -18,7 +18,7 @@ import msgspec
 from keyss.core.errors import KeyssError, KeyssWarning, OutputError, UsageError
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
-from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation
+from keyss.keys.derivation import SALT_BYTES, DerivedKey
 from keyss.keys.key_file import read_key_file
 from keyss.many.assets import Asset, read_assets
 from keyss.many.cell import CELL, RESULT, Cell, Failure
@@ -144,7 +144,7 @@ def _cell(
 def _key_check(key: str, identity: str) -> str:
     """Recognises the key of a cell; a guess costs as much as one at the published file."""
     salt = hashlib.sha256(b"keyss/v1/batch" + identity.encode()).digest()[:SALT_BYTES]
-    return DerivedKey(key, KeyDerivation(salt=salt)).verifier().hex()
+    return DerivedKey.of(key, salt).verifier().hex()
 
 
 def _summary(out: Path, outcomes: Sequence[Outcome]) -> bytes:

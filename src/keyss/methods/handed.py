@@ -12,7 +12,7 @@ import os
 
 from keyss.channels import METHOD_BYTES, Payload, pack_method, unpack_method
 from keyss.core.errors import InputError, UsageError, WrongKeyError
-from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.keys.encryption import DATA_KEY_BYTES, decrypt, encrypt
 
@@ -62,4 +62,4 @@ def unpack(data: bytes, key: str | None) -> Payload:
 
 
 def _data_key(header: bytes, key: str) -> bytes:
-    return DerivedKey(key, KeyDerivation(salt=header[-SALT_BYTES:])).expand("handed", DATA_KEY_BYTES)
+    return DerivedKey.of(key, header[-SALT_BYTES:]).expand("handed", DATA_KEY_BYTES)

@@ -16,7 +16,7 @@ from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.keys import DerivedKey
 from keyss.methods.records.opening import unpack
 
-KEY = DerivedKey.of_master(bytes(32))
+KEY = DerivedKey(bytes(32))
 EVERY = pytest.mark.parametrize("suffix", FORMATS)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from keyss.channels import LOW_BITS, LowBitsReader, Payload
+from keyss.channels import LOW_BITS, Content, LowBitsCover, LowBitsReader, Payload
+from keyss.channels.low_bits.writing import digest
+from keyss.channels.payloads import randomness
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 
@@ -20,7 +22,18 @@ def embed_derived(
     entropy: bytes | None = None,
 ) -> Gaussians:
     contents = [(keys, Payload("test", data)) for keys, data in secrets]
-    return LOW_BITS.prepare(model).embed_derived(contents, entropy=entropy)
+    return embed_contents(LOW_BITS.prepare(model), contents, entropy)
+
+
+def embed_contents(
+    prepared: LowBitsCover,
+    secrets: Sequence[tuple[Sequence[DerivedKey], Content]],
+    entropy: bytes | None = None,
+) -> Gaussians:
+    """With a key under each salt, stale ones too."""
+    mixed = randomness(entropy, *(digest(content) for _, content in secrets))
+    fresh = [([keys[i] for i in prepared.fresh_salts], content) for keys, content in secrets]
+    return prepared.embed_derived(fresh, mixed)
 
 
 def extract(stego: Gaussians, key: str) -> bytes:

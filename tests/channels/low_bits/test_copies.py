@@ -7,7 +7,7 @@ import warnings
 import pytest
 import torch
 
-from channels.low_bits.payloads import embed, extract
+from channels.low_bits.payloads import embed, embed_contents, extract
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, LowBitsReader, RecordRequest, Records
 from keyss.core import Gaussians, KeyssWarning
@@ -20,7 +20,7 @@ def _carried(cover: Gaussians, count: int) -> Gaussians:
     (plan,) = prepared.plan_records([RecordRequest(count, 33, 10)])
     data = torch.randint(256, (count, plan.record_bytes), dtype=torch.uint8).numpy()
     records = Records("test", bytes(10), data, plan, torch.arange(plan.copies).numpy())
-    return prepared.embed_derived([(keys(1), records)])
+    return embed_contents(prepared, [(keys(1), records)])
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from channels.low_bits.holder import seen_by_holder
+from channels.low_bits.payloads import embed_contents
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, RecordRequest, Records
 from keyss.core import KeyssWarning
@@ -28,7 +29,7 @@ def _seen(own: int, others: Sequence[int], draw: int) -> dict[str, float]:
         data = np.frombuffer(os.urandom(count * plan.record_bytes), np.uint8).reshape(count, -1)
         records = Records("test", os.urandom(HEADER), data, plan, np.arange(plan.copies))
         contents.append((keys(10 * draw + index), records))
-    stego = prepared.embed_derived(contents, entropy=os.urandom(32))
+    stego = embed_contents(prepared, contents, os.urandom(32))
     return seen_by_holder(stego, keys(10 * draw)[prepared.fresh_salts[0]])
 
 

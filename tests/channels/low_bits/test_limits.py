@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from channels.low_bits.payloads import embed_contents
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, Codewords, LowBitsReader, Payload
 from keyss.channels.low_bits import spread, writing
@@ -75,7 +76,7 @@ def test_hostile_parameters_end_in_a_sentence(
     cover: Gaussians, hostile: Parameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writing, "Parameters", lambda *_: hostile)
-    stego = LOW_BITS.prepare(cover).embed_derived([(keys(), Payload("carry", b"x"))])
+    stego = embed_contents(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     reader = LowBitsReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):
         reader.extract(keys()[0])

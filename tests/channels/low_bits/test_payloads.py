@@ -215,11 +215,11 @@ def test_a_thousand_random_keys_open_nothing() -> None:
     assert extract_derived(reader, own[0]) == b"x"
     for number in range(1000):
         with pytest.raises(WrongKeyError):
-            extract_derived(reader, DerivedKey.of_master(number.to_bytes(32, "big")))
+            extract_derived(reader, DerivedKey(number.to_bytes(32, "big")))
 
 
 def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All the way from the text, with an Argon2id that takes 64 KiB and one pass, which no file may ask for.
+    """All the way from the text, with an Argon2id that takes 64 KiB and one pass.
 
     At full cost the same is done by `test_wrong_keys_at_full_cost`.
     """
@@ -271,7 +271,7 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
 
 def test_a_wrong_key_is_tried_under_a_few_salts(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     derived = []
-    monkeypatch.setattr(base, "DerivedKey", lambda key, derivation: derived.append(key) or keys(5)[0])
+    monkeypatch.setattr(DerivedKey, "of", lambda key, salt: derived.append(key) or keys(5)[0])
     with pytest.raises(WrongKeyError):
         extract(stego, "The right key")
     assert len(derived) == base.SALTS_TRIED

@@ -11,19 +11,17 @@ import pytest
 
 from keyss.channels import CellCipher
 from keyss.core import errors
-from keyss.keys import DerivedKey, KeyDerivation, encryption
+from keyss.keys import DerivedKey, encryption
 
 pytestmark = pytest.mark.argon2
 
 FOLDER = Path(__file__).parents[3] / "tests" / "vectors"
 DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
 SEALING = json.loads((FOLDER / "sealing.json").read_text())
-COSTS = ("time_cost", "memory_kib", "parallelism")
 
 
 def _derived(vector: dict[str, Any]) -> DerivedKey:
-    costs = {name: vector[name] for name in COSTS if name in vector}
-    return DerivedKey(vector["key"], KeyDerivation(salt=bytes.fromhex(vector["salt"]), **costs))
+    return DerivedKey.of(vector["key"], bytes.fromhex(vector["salt"]))
 
 
 @pytest.mark.parametrize("vector", DERIVATION["valid"], ids=lambda vector: ascii(vector["key"]))

@@ -42,7 +42,7 @@ def keys(seed: int = 0) -> list[DerivedKey]:
     """A key under every salt, without Argon2id: its output is replaced by random bytes."""
     generator = torch.Generator().manual_seed(10_000 + seed)
     numbers = torch.randint(256, (SALTS, 32), generator=generator, dtype=torch.uint8)
-    return [DerivedKey.of_master(row.numpy().tobytes()) for row in numbers]
+    return [DerivedKey(row.numpy().tobytes()) for row in numbers]
 
 
 def _half_precision(model: Gaussians) -> Gaussians:

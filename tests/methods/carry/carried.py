@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from channels.low_bits.payloads import embed_contents
 from keyss.channels import LOW_BITS, LowBitsReader
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
@@ -26,7 +27,7 @@ def embed_derived(
     prepared = LOW_BITS.prepare(cover)
     records = encode_all(prepared, [model for _, model in secrets])
     keyed = list(zip((keys for keys, _ in secrets), records, strict=True))
-    return prepared.embed_derived(keyed, entropy=entropy)
+    return embed_contents(prepared, keyed, entropy)
 
 
 def extract(stego: Gaussians, key: str) -> CarriedSecret:

@@ -233,7 +233,7 @@ def test_1000_wrong_keys_and_ordinary_models_open_nothing(secret: Gaussians) -> 
     assert len(extract_derived(stego, own[0]).gaussians) == 200
     for number in range(1000):
         with pytest.raises(WrongKeyError):
-            extract_derived(stego, DerivedKey.of_master(number.to_bytes(32, "big")))
+            extract_derived(stego, DerivedKey(number.to_bytes(32, "big")))
     with pytest.raises(WrongKeyError):
         extract(model, KEY)
 

@@ -40,7 +40,7 @@ from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack
 from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
+from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 _DATA_BITS = 8  # of a header: packets of a codeword that hold data
@@ -107,7 +107,7 @@ class AppendedCover:
         secret = randomness(entropy, *packed)
         salt = expand(secret, "appended/salt", SALT_BYTES)
         random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
-        keys = [DerivedKey(key, KeyDerivation(salt=salt)) for key, _ in contents]
+        keys = [DerivedKey.of(key, salt) for key, _ in contents]
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)

@@ -37,7 +37,7 @@ from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians, Codes, in_morton_order, writable
-from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
+from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 _ASSOCIATED = b"keyss/v1/codes/data"
@@ -140,10 +140,10 @@ class CodesCover:
         mixed = randomness(entropy, _digest(self.codes), *packed)
         for attempt in range(_ATTEMPTS):
             own = expand(mixed, f"codes/attempt/{attempt}", 32)
-            derivation = KeyDerivation(salt=expand(own, "codes/salt", SALT_BYTES))
-            keys = [DerivedKey(key, derivation) for key, _ in contents]
+            salt = expand(own, "codes/salt", SALT_BYTES)
+            keys = [DerivedKey.of(key, salt) for key, _ in contents]
             check_keys([key.verifier() for key in keys])
-            embedded = self._embedded(list(zip(keys, packed, strict=True)), derivation.salt, own)
+            embedded = self._embedded(list(zip(keys, packed, strict=True)), salt, own)
             if embedded is not None:
                 return _model_of(embedded)
         raise RuntimeError("no block order was found in which all blocks have room")

@@ -36,7 +36,7 @@ from keyss.channels.colours.lattice import (
 )
 from keyss.channels.colours.salts import SALTS
 from keyss.channels.mixing import Words, mixed
-from keyss.keys.derivation import SALT_BYTES, DerivedKey, KeyDerivation, expand, stream
+from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 
 FILE_KEY_BYTES = 5
 _PILOTS = 16  # bits of a header under each salt that are known beforehand
@@ -268,8 +268,8 @@ def derived(key: str, salts: Sequence[bytes]) -> tuple[bytes, tuple[bytes, ...]]
     The salts make every guess cost Argon2id anew for each file. The other secret makes up for the few bytes
     of a header: whoever does not know the key has to guess both.
     """
-    secrets = [_derived(key, salt).expand("colours/header", 32) for salt in salts]
-    return _derived(key, _STATIC_SALT).expand("colours/static", 32), tuple(secrets)
+    secrets = [DerivedKey.of(key, salt).expand("colours/header", 32) for salt in salts]
+    return DerivedKey.of(key, _STATIC_SALT).expand("colours/static", 32), tuple(secrets)
 
 
 def data_key(static: bytes, header: Header) -> bytes:
@@ -280,10 +280,6 @@ def data_key(static: bytes, header: Header) -> bytes:
 def check_secret(static: bytes) -> bytes:
     """The secret that recognises headers, from the key without a salt."""
     return expand(static, "colours/check", 32)
-
-
-def _derived(key: str, salt: bytes) -> DerivedKey:
-    return DerivedKey(key, KeyDerivation(salt=salt))
 
 
 def _seeds(kind: Kind, secret: bytes, names: Names) -> Words:

@@ -51,7 +51,7 @@ from keyss.channels.low_bits.writing import Writer, digest
 from keyss.channels.payloads import check_keys, randomness
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey, KeyDerivation, stream
+from keyss.keys.derivation import DerivedKey, stream
 from keyss.rendering.cpu.parallel import in_blocks
 
 _FIRST_IS_STALE = (
@@ -134,20 +134,17 @@ class LowBitsCover:
         salts = self._salts(mixed)[1]
         if 0 not in self.fresh_salts:
             warnings.warn(_FIRST_IS_STALE, KeyssWarning, stacklevel=2)
-        derivations = [KeyDerivation(salt=salts[index]) for index in self.fresh_salts]
-        derived = [(_derived(key, derivations), content) for key, content in contents]
-        return self._embed(derived, mixed)
+        fresh = [salts[index] for index in self.fresh_salts]
+        derived = [(_derived(key, fresh), content) for key, content in contents]
+        return self.embed_derived(derived, mixed)
 
     def embed_derived(
-        self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], *, entropy: bytes | None = None
+        self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes
     ) -> Gaussians:
-        """`embed` after key derivation: for each secret its key under each of the salts, stale ones too."""
-        mixed = randomness(entropy, *(digest(content) for _, content in contents))
-        return self._embed(
-            [([keys[i] for i in self.fresh_salts], content) for keys, content in contents], mixed
-        )
+        """`embed` after key derivation: for each secret its key under each of the `fresh_salts`.
 
-    def _embed(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes) -> Gaussians:
+        `entropy`: of `randomness`, for no other file.
+        """
         check_keys([keys[0].verifier() for keys, _ in contents])
         fresh, salts = self._salts(entropy)
         writer = Writer(self.names[self._rows], self.layout.width, entropy, bytes(each[0] for each in salts))
@@ -186,6 +183,6 @@ def _versions(model: Gaussians) -> list[int]:
     return [0 if each.is_inference() else each._version for each in tensors]
 
 
-def _derived(key: str, derivations: Sequence[KeyDerivation]) -> list[DerivedKey]:
-    """`key` under each derivation, several at a time."""
-    return in_blocks(lambda index, _: DerivedKey(key, derivations[index]), len(derivations), 1)
+def _derived(key: str, salts: Sequence[bytes]) -> list[DerivedKey]:
+    """`key` under each salt, several at a time."""
+    return in_blocks(lambda index, _: DerivedKey.of(key, salts[index]), len(salts), 1)

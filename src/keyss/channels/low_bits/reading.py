@@ -32,7 +32,7 @@ from keyss.channels.low_bits.usable import repeated
 from keyss.channels.low_bits.writing import ASSOCIATED, payload_key
 from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import DerivedKey, KeyDerivation
+from keyss.keys.derivation import DerivedKey
 from keyss.keys.encryption import decrypt
 
 _TWO_SECRETS = (
@@ -113,7 +113,7 @@ class LowBitsReader(SaltedReader):
         foreign = [each for each in self.salts if each[0] not in own]
         for each in foreign[:SALTS_TRIED]:
             with suppress(WrongKeyError, InputError):
-                if self._parameters(DerivedKey(key, KeyDerivation(salt=each)))[0] != data_key:
+                if self._parameters(DerivedKey.of(key, each))[0] != data_key:
                     warnings.warn(_TWO_SECRETS, KeyssWarning, stacklevel=3)
                     return
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from keyss.channels import APPENDED, LOW_BITS, check_payload_fits
 from keyss.core.errors import KeyssError, KeyssWarning, UsageError
 from keyss.core.scene import Scene
-from keyss.keys import DerivedKey, KeyDerivation
+from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.methods.base import Capabilities, Context, Source, Stego
 from keyss.methods.joint import train_jointly
@@ -75,8 +75,8 @@ class KeyssMethod:
         keys = [each.key for each in secrets]
         encoder = encoder_of(options)
         if encoder is None:
-            derivation = KeyDerivation(salt=training_salt(cover.scene, options.fit.known_seed))
-            embeddings = [DerivedKey(key, derivation).embedding() for key in keys]
+            salt = training_salt(cover.scene, options.fit.known_seed)
+            embeddings = [DerivedKey.of(key, salt).embedding() for key in keys]
         else:
             embeddings = [encoder(key) for key in keys]
         design = options.settings
