@@ -28,21 +28,10 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
     `counter` is an int64 array of one zero, from which the kernel takes the number of its next piece with
     `simd8.fetch_add`.
     """
-    counter = np.zeros(1, np.int64)
-    helpers = min(torch.get_num_threads(), _CORES) - 1
     # The first call loads the kernel under a lock of LLVM's bindings, which Ctrl-C may leave locked: a helper
     # that waits for it would block this thread.
-    if helpers < 1 or not getattr(kernel, "overloads", True):
-        kernel(counter, *arguments)
-        return
-    tasks = [_pool(helpers).submit(kernel, counter, *arguments) for _ in range(helpers)]
-    try:
-        kernel(counter, *arguments)
-    finally:
-        # Every piece is taken by now, so a helper that has not started can be cancelled.
-        for task in tasks:
-            if not task.cancel():
-                task.result()
+    most = _CORES if getattr(kernel, "overloads", True) else 1
+    _on_threads(most, kernel, np.zeros(1, np.int64), *arguments)
 
 
 def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[T]:
@@ -57,16 +46,21 @@ def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[
         for start in waiting:  # shared by all threads
             results[start] = function(start, min(start + size, count))
 
-    waiting = iter(starts)
-    helpers = min(torch.get_num_threads(), _CORES, len(starts)) - 1
-    tasks = [_pool(helpers).submit(work, waiting) for _ in range(helpers)]
+    _on_threads(min(_CORES, len(starts)), work, iter(starts))
+    return [results[start] for start in starts]
+
+
+def _on_threads(most: int, work: Callable[..., None], *arguments: Any) -> None:
+    """Call `work` on this thread and on helpers, `most` together, and return when all are done."""
+    helpers = min(torch.get_num_threads(), most) - 1
+    tasks = [_pool(helpers).submit(work, *arguments) for _ in range(helpers)]
     try:
-        work(waiting)
+        work(*arguments)
     finally:
+        # Every piece is taken by now, so a helper that has not started can be cancelled.
         for task in tasks:
             if not task.cancel():
                 task.result()
-    return [results[start] for start in starts]
 
 
 def _pool(helpers: int) -> ThreadPoolExecutor:

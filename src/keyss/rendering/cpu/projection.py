@@ -232,7 +232,7 @@ def project(counter, gaussians, camera, settings, projected):
 def _project(gaussians, camera, settings, footprints, ids, start, results):
     """Footprints without colour; results = [mean x | mean y | depth | radius x | radius y | tiles]."""
     width, height, near, far, eps2d, _ = settings
-    opacity = gather1(gaussians.opacities, ids, start)
+    (opacity,) = gather1(gaussians.opacities, ids, start, 1, 0)
     linear = linearised(camera, settings, gaussians.means, gaussians.quats, ids, start)
     z = linear.point[2]
     # `seen` is 1 or 0. A NaN fails every test.

@@ -14,7 +14,6 @@ import numpy as np
 from keyss.rendering.cpu.jit import inlined, kernel
 from keyss.rendering.cpu.layout import (
     CHUNK,
-    GREEN,
     HALF,
     HUGE,
     MOMENTS,
@@ -26,7 +25,7 @@ from keyss.rendering.cpu.layout import (
     ZERO,
 )
 from keyss.rendering.cpu.projection import PREFETCH, dot, linearised, times
-from keyss.rendering.cpu.rows import gather1, gather3, gather4, gather8, load_transposed, scatter
+from keyss.rendering.cpu.rows import gather1, gather3, gather8, load_transposed, scatter
 from keyss.rendering.cpu.shading import prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
     absolute,
@@ -41,77 +40,63 @@ from keyss.rendering.cpu.simd8 import (
     store8,
 )
 
-# The buffer of `_sum_pairs`.
-COLOR = 64  # gradients of red, green and blue; before them the sums of `layout.MOMENTS` over all tiles
-ALL_SUMS = 88
-
 
 @kernel
 def project_backward(
     counter, gaussians, camera, settings, channels, footprints, first_slots, slot_counts, moments, extras,
-    first_camera, need_colors, gradients, means2d_gradient,
+    need_colors, gradients, means2d_gradient,
 ):  # fmt: skip
-    """Add the gradients through one camera to `gradients`; for the first camera, overwrite them.
+    """Fill `gradients` and means2d_gradient.
 
-    means2d_gradient is that of this camera only. Without need_colors, gradients.colors is not touched.
-    `channels` is the number of feature channels, 0 if the colours are in the footprints.
+    Without need_colors, gradients.colors is not touched. `channels` is the number of feature channels, 0 if
+    the colours are in the footprints.
     """
     means, colors, colors_gradient = gaussians.means, gaussians.colors, gradients.colors
     sh_count = settings.sh_count
     count = means.shape[0]
     ids = np.empty(CHUNK + 8, np.int64)
-    sums = np.empty(ALL_SUMS, np.float32)
+    sums = np.empty(9 * 8, np.float32)
     basis = np.empty(16 * 8, np.float32)
     coefficients = np.empty(48 * 8, np.float32)
-    results = np.empty(3 * 8, np.float32)
     while True:
         piece = fetch_add(counter, 0, 1)
         if piece * CHUNK >= count:
             break
         listed = _find_listed(
-            piece * CHUNK, min((piece + 1) * CHUNK, count), sh_count, slot_counts, first_camera, need_colors,
-            ids, gradients, means2d_gradient,
+            piece * CHUNK, min((piece + 1) * CHUNK, count), sh_count, slot_counts, need_colors, ids,
+            gradients, means2d_gradient,
         )  # fmt: skip
         for k in range(listed, listed + 8):
             ids[k] = ids[max(listed - 1, 0)]
         for start in range(0, listed, 8):
-            size = min(8, listed - start)
             if sh_count > 1:
                 for ahead in range(start + PREFETCH, min(start + PREFETCH + 8, listed)):
                     prefetch_coefficients(colors, sh_count, at(ids, ahead))
-            _sum_pairs(
-                ids, start, size, first_slots, slot_counts, moments, extras, channels, first_camera,
-                need_colors, colors_gradient, sums,
+            own_moments, red, green, blue = _sum_pairs(
+                ids, start, first_slots, slot_counts, moments, extras, channels, need_colors, colors_gradient,
+                sums,
             )  # fmt: skip
             through_color = (splat(ZERO), splat(ZERO), splat(ZERO))
             if sh_count > 0:
-                _, _, _, _, _, _, _, red = gather8(footprints, ids, start, PACKED, RED - RED % 8)
-                green, blue, _, _, _, _, _, _ = gather8(footprints, ids, start, PACKED, GREEN - GREEN % 8)
                 # No gradient passes where 0.5 + basis . colors was clamped to 0.
-                red = select_gt(red, ZERO, load8(sums, COLOR), ZERO)
-                green = select_gt(green, ZERO, load8(sums, COLOR + 8), ZERO)
-                blue = select_gt(blue, ZERO, load8(sums, COLOR + 16), ZERO)
+                drawn_red, drawn_green, drawn_blue = gather3(footprints, ids, start, PACKED, RED)
+                red = select_gt(drawn_red, ZERO, red, ZERO)
+                green = select_gt(drawn_green, ZERO, green, ZERO)
+                blue = select_gt(drawn_blue, ZERO, blue, ZERO)
                 through_color = shade_backward(
-                    means, colors, sh_count, camera, ids, start, red, green, blue, first_camera,
-                    need_colors, basis, coefficients, colors_gradient,
+                    means, colors, sh_count, camera, ids, start, red, green, blue, need_colors, basis,
+                    coefficients, colors_gradient,
                 )  # fmt: skip
             elif need_colors and channels == 0:
-                for lane in range(size):
-                    for channel in range(3):
-                        value = sums[COLOR + 8 * channel + lane]
-                        if not first_camera:
-                            value += colors_gradient[ids[start + lane], 0, channel]
-                        colors_gradient[ids[start + lane], 0, channel] = value
+                scatter(colors_gradient, ids, start, 3, 0, (red, green, blue))
             _gaussian_gradients(
-                gaussians, camera, settings, footprints, ids, start, first_camera, sums, through_color,
-                gradients, means2d_gradient, results,
+                gaussians, camera, settings, footprints, ids, start, own_moments, through_color, gradients,
+                means2d_gradient,
             )  # fmt: skip
 
 
 @inlined
-def _find_listed(
-    start, end, sh_count, slot_counts, first_camera, need_colors, ids, gradients, means2d_gradient,
-):  # fmt: skip
+def _find_listed(start, end, sh_count, slot_counts, need_colors, ids, gradients, means2d_gradient):
     """Fill `ids` with the Gaussians that have pairs; returns their number. Zeros the other gradients."""
     means_gradient, quats_gradient, scales_gradient, opacities_gradient, colors_gradient = gradients
     channels = colors_gradient.shape[2]
@@ -126,14 +111,13 @@ def _find_listed(
         else:
             for k in range(2 * i, 2 * i + 2):
                 put(means2d_gradient, k, ZERO)
-            if first_camera:
-                for k in range(3 * i, 3 * i + 3):
-                    put(means_gradient, k, ZERO)
-                    put(scales_gradient, k, ZERO)
-                for k in range(4 * i, 4 * i + 4):
-                    put(quats_gradient, k, ZERO)
-                put(opacities_gradient, i, ZERO)
-        if first_camera and need_colors:
+            for k in range(3 * i, 3 * i + 3):
+                put(means_gradient, k, ZERO)
+                put(scales_gradient, k, ZERO)
+            for k in range(4 * i, 4 * i + 4):
+                put(quats_gradient, k, ZERO)
+            put(opacities_gradient, i, ZERO)
+        if need_colors:
             for k in range(i * stride + used, (i + 1) * stride):
                 put(colors_gradient, k, ZERO)
     return listed
@@ -141,12 +125,11 @@ def _find_listed(
 
 @inlined
 def _sum_pairs(
-    ids, start, size, first_slots, slot_counts, moments, extras, channels, first_camera, need_colors,
-    colors_gradient, sums,
+    ids, start, first_slots, slot_counts, moments, extras, channels, need_colors, colors_gradient, sums,
 ):  # fmt: skip
-    """Sum over the tiles of each of the 8 Gaussians ids[start:], into `sums`.
+    """Sums over the tiles of each of the 8 Gaussians ids[start:]: six moments, red, green and blue.
 
-    Gradients of feature channels are final, and go to colors_gradient.
+    Of feature channels they go to colors_gradient instead.
     """
     extra_width = max(channels, 1)
     for lane in range(8):
@@ -162,52 +145,28 @@ def _sum_pairs(
             for slot in range(first, after):
                 total += at(extras, slot * extra_width + extra)
             if channels == 0:
-                put(sums, COLOR + 16 + lane, total)
-            elif need_colors and lane < size:
-                if not first_camera:
-                    total += colors_gradient[i, 0, extra]
+                put(sums, 64 + lane, total)
+            elif need_colors:
                 colors_gradient[i, 0, extra] = total
-    m0, m1, m2, m3, m4, m5, red, green = load_transposed(sums, 0)
-    store8(sums, 0, m0)
-    store8(sums, 8, m1)
-    store8(sums, 16, m2)
-    store8(sums, 24, m3)
-    store8(sums, 32, m4)
-    store8(sums, 40, m5)
-    if channels == 0:
-        store8(sums, COLOR, red)
-        store8(sums, COLOR + 8, green)
+    columns = load_transposed(sums, 0)
+    return columns[:6], columns[6], columns[7], load8(sums, 64)
 
 
 @inlined
 def _gaussian_gradients(
-    gaussians, camera, settings, footprints, ids, start, first_camera, sums, through_color, gradients,
-    means2d_gradient, results,
+    gaussians, camera, settings, footprints, ids, start, moments, through_color, gradients, means2d_gradient,
 ):  # fmt: skip
     """Go back through footprint and perspective. `through_color`: dL/d(mean) through the view directions."""
-    s_1 = load8(sums, 0)
-    s_x = load8(sums, 8)
-    s_y = load8(sums, 16)
-    s_xx = load8(sums, 24)
-    s_xy = load8(sums, 32)
-    s_yy = load8(sums, 40)
+    s_1, s_x, s_y, s_xx, s_xy, s_yy = moments
     _, _, conic_xx, conic_xy, conic_yy, _, _, _ = gather8(footprints, ids, start, PACKED, 0)
     conic_xx = conic_xx * -TWO
     conic_xy = conic_xy * -ONE
     conic_yy = conic_yy * -TWO
     mean_x = conic_xx * s_x + conic_xy * s_y
     mean_y = conic_xy * s_x + conic_yy * s_y
-    opacity_gradient = divide(s_1, gather1(gaussians.opacities, ids, start))
-    if not first_camera:
-        opacity_gradient = opacity_gradient + gather1(gradients.opacities, ids, start)
-    store8(results, 0, opacity_gradient)
-    store8(results, 8, mean_x)
-    store8(results, 16, mean_y)
-    for lane in range(8):
-        i = at(ids, start + lane)
-        put(gradients.opacities, i, at(results, lane))
-        put(means2d_gradient, 2 * i, at(results, 8 + lane))
-        put(means2d_gradient, 2 * i + 1, at(results, 16 + lane))
+    (opacity,) = gather1(gaussians.opacities, ids, start, 1, 0)
+    scatter(gradients.opacities, ids, start, 1, 0, (divide(s_1, opacity),))
+    scatter(means2d_gradient, ids, start, 2, 0, (mean_x, mean_y))
 
     # dL/d(covariance) = -conic dL/d(conic) conic, with dL/d(conic) = -1/2 [s_xx s_xy; s_xy s_yy].
     t_00 = conic_xx * s_xx + conic_xy * s_xy
@@ -228,7 +187,7 @@ def _gaussian_gradients(
     dv = times(_combined(cov_xy, p, cov_yy, q), doubled)
     u = times(du, p)
     v = times(dv, q)
-    _add3(gradients.scales, ids, start, first_camera, (u[0] + v[0], u[1] + v[1], u[2] + v[2]))
+    scatter(gradients.scales, ids, start, 3, 0, (u[0] + v[0], u[1] + v[1], u[2] + v[2]))
     du = times(du, scales)
     dv = times(dv, scales)
     a, b = linear.jw
@@ -249,10 +208,6 @@ def _gaussian_gradients(
         _finite((ey - along * qy) * norm),
         _finite((ez - along * qz) * norm),
     )
-    if not first_camera:
-        w, x, y, z = gather4(gradients.quats, ids, start, 4, 0)
-        w_new, x_new, y_new, z_new = quat_gradient
-        quat_gradient = (w_new + w, x_new + x, y_new + y, z_new + z)
     scatter(gradients.quats, ids, start, 4, 0, quat_gradient)
     r = linear.rotation
     da = (_finite(dot(du, r[0])), _finite(dot(du, r[1])), _finite(dot(du, r[2])))
@@ -282,7 +237,7 @@ def _gaussian_gradients(
         tx * camera[1] + ty * camera[4] + tz * camera[7] + dy,
         tx * camera[2] + ty * camera[5] + tz * camera[8] + dz,
     )
-    _add3(gradients.means, ids, start, first_camera, mean_gradient)
+    scatter(gradients.means, ids, start, 3, 0, mean_gradient)
 
 
 @inlined
@@ -300,12 +255,3 @@ def _finite(a):
 @inlined
 def _one_where_equal(a, b):
     return select_ge(a, b, select_ge(b, a, ONE, ZERO), ZERO)
-
-
-@inlined
-def _add3(array, ids, start, first_camera, values):
-    """Add 3 vectors to the columns of an array [N, 3]; for the first camera, overwrite them."""
-    if not first_camera:
-        x, y, z = gather3(array, ids, start, 3, 0)
-        values = (values[0] + x, values[1] + y, values[2] + z)
-    scatter(array, ids, start, 3, 0, values)

@@ -167,15 +167,12 @@ class _Rasterize(torch.autograd.Function):
         shapes = [tuple(tensor.shape) for tensor in (*gaussians, ctx.means2d)]
         if not need_colors:
             shapes[4] = (0, 1, images.shape[-1])
-        *gradients, means2d_gradient = (_empty(*shape) for shape in shapes)
-        if not ctx.renderings:  # the first camera would have overwritten the memory
-            for gradient in gradients:
-                gradient.zero_()
-        arrays, gradient_arrays = (
-            GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
-            for tensors in (gaussians, gradients)
-        )
+        *shapes, means2d_shape = shapes
+        means2d_gradient = _empty(*means2d_shape)
+        gradients = [] if ctx.renderings else [torch.zeros(shape) for shape in shapes]
+        arrays = GaussianArrays(*(tensor.detach().numpy() for tensor in gaussians))
         for c, rendering in enumerate(ctx.renderings):
+            own = [_empty(*shape) for shape in shapes]
             channels = 0 if rendering.features is None else images.shape[-1]
             slots = len(rendering.entries)
             moments = memory.empty((slots * MOMENTS,), np.float32)
@@ -188,9 +185,10 @@ class _Rasterize(torch.autograd.Function):
             )  # fmt: skip
             run(
                 projection_backward.project_backward, arrays, rendering.camera, settings, channels,
-                rendering.footprints, rendering.first_slots, rendering.slot_counts, moments, extras, c == 0,
-                need_colors, gradient_arrays, means2d_gradient[c].detach().numpy(),
+                rendering.footprints, rendering.first_slots, rendering.slot_counts, moments, extras,
+                need_colors, GaussianArrays(*(tensor.numpy() for tensor in own)), means2d_gradient[c].numpy(),
             )  # fmt: skip
+            gradients = [a.add_(b) for a, b in zip(gradients, own, strict=True)] if c else own
         backgrounds_gradient = None
         if need_background:
             # Unlike torch's sum, numpy's does not depend on the number of threads.

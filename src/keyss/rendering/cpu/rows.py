@@ -72,23 +72,10 @@ def _gathering(count):
 
 
 # (array, ids, start, stride, column): columns column:column + count of the 8 rows, as a tuple of vectors.
+gather1 = _gathering(1)
 gather3 = _gathering(3)
 gather4 = _gathering(4)
 gather8 = _gathering(8)
-
-
-@intrinsic
-def gather1(typingctx, array, ids, start):
-    """The floats array[ids[start]], ... array[ids[start + 7]] as one vector."""
-
-    def codegen(context, builder, signature, arguments):
-        one, zero = (ir.Constant(ir.IntType(64), value) for value in (1, 0))
-        result = ir.Constant(VECTOR, ir.Undefined)
-        for lane, address in enumerate(_addresses(context, builder, signature, (*arguments, one, zero))):
-            result = builder.insert_element(result, builder.load(address), INT(lane))
-        return result
-
-    return float32x8(array, ids, start), codegen
 
 
 @intrinsic

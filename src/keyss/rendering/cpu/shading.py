@@ -42,13 +42,10 @@ def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
 
 @inlined
 def shade_backward(
-    means, colors, sh_count, camera, ids, start, red, green, blue, first_camera, need_colors, basis,
-    coefficients, colors_gradient,
+    means, colors, sh_count, camera, ids, start, red, green, blue, need_colors, basis, coefficients,
+    colors_gradient,
 ):  # fmt: skip
-    """Gradients of the SH coefficients; returns dL/d(mean) through the view directions.
-
-    Adds to colors_gradient; for the first camera, overwrites it.
-    """
+    """Fills the gradients of the SH coefficients; returns dL/d(mean) through the view directions."""
     px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z, inverse = view_directions(camera, px, py, pz)
     dx = splat(ZERO)
@@ -67,20 +64,11 @@ def shade_backward(
         dz = (dz - along * z) * inverse
     if need_colors:
         sh_basis(basis, sh_count, x, y, z)
-        if not first_camera:
-            load_coefficients(colors_gradient, sh_count, ids, start, coefficients)
         for k in range(sh_count):
             value = load8(basis, 8 * k)
-            for_red = value * red
-            for_green = value * green
-            for_blue = value * blue
-            if not first_camera:
-                for_red = for_red + load8(coefficients, 24 * k)
-                for_green = for_green + load8(coefficients, 24 * k + 8)
-                for_blue = for_blue + load8(coefficients, 24 * k + 16)
-            store8(coefficients, 24 * k, for_red)
-            store8(coefficients, 24 * k + 8, for_green)
-            store8(coefficients, 24 * k + 16, for_blue)
+            store8(coefficients, 24 * k, value * red)
+            store8(coefficients, 24 * k + 8, value * green)
+            store8(coefficients, 24 * k + 16, value * blue)
         store_coefficients(colors_gradient, sh_count, ids, start, coefficients)
     return dx, dy, dz
 
