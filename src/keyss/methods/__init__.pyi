@@ -20,9 +20,8 @@ from .keyss.decoder import (
     DecoderShape as DecoderShape,
     parse_mask as parse_mask,
 )
-from .keyss.designs.base import DesignName as DesignName
 from .keyss.designs.carriers import CarriersTraining as CarriersTraining
-from .keyss.options import KeyssOptions as KeyssOptions
+from .keyss.options import DesignName as DesignName, KeyssOptions as KeyssOptions
 from .keyss.rows import RowSecret as RowSecret
 from .keyss.secret import HiddenSecret as HiddenSecret, choose_anchors as choose_anchors
 from .opened import (

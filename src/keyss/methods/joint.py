@@ -58,7 +58,7 @@ class JointTraining(ABC):
         device: torch.device,
         *,
         common_poses: float,  # share of steps that render all scenes from one pose
-        network_rate: float,  # of AdamW, decays to 5 % of it
+        network_rate: float = 0.0,  # of AdamW, decays to 5 % of it
         weight_decay: float = 0.0,
         freeze: bool = False,  # at the cap nothing is pruned
     ) -> None:

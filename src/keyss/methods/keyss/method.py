@@ -10,7 +10,6 @@ import hashlib
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -28,7 +27,6 @@ from keyss.methods.keyss.designs.base import DesignTraining
 from keyss.methods.keyss.options import KeyssOptions
 from keyss.methods.keyss.secret import unpack
 from keyss.methods.plan import Plan
-from keyss.methods.poses import PlacedScene
 
 _APPENDED = "the secrets lie in appended Gaussians instead, and everybody can see that they are there"
 
@@ -49,7 +47,8 @@ class KeyssMethod:
 
         Raises UsageError for more secrets than the design can hide.
         """
-        options = replace(options, fit=options.joint_fit)
+        if (weight := options.settings.ssim_weight) is not None:
+            options = options.with_fit(ssim_weight=weight)
         encoder_of(options)  # raises where CLIP is missing
         fit, secrets = options.fit, len(sources) - 1
         size = options.settings.payload_bytes(fit.sh_degree, secrets)
@@ -79,13 +78,10 @@ class KeyssMethod:
             embeddings = [DerivedKey.of(key, salt).embedding() for key in keys]
         else:
             embeddings = [encoder(key) for key in keys]
-        design = options.settings
-
-        def begin(placed: Sequence[PlacedScene]) -> DesignTraining:
-            training: DesignTraining = design.training(placed, embeddings, options, context.device)
-            return training
-
-        run = train_jointly(begin, cover, secrets, context)
+        training: type[DesignTraining] = options.settings.training
+        run = train_jointly(
+            lambda placed: training(placed, embeddings, options, context.device), cover, secrets, context
+        )
         return _embedded(run, keys, context.entropy or os.urandom(32))
 
 

@@ -7,12 +7,21 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from keyss.core.errors import UsageError
-from keyss.fitting.config import FitConfig
 from keyss.methods.base import CommandLineOption
 from keyss.methods.joint_options import JointOptions
 from keyss.methods.keyss.decoder import Mask, parse_mask
-from keyss.methods.keyss.designs.base import DesignName, design
+from keyss.methods.keyss.designs.base import Design
+from keyss.methods.keyss.designs.carriers import CARRIERS
+from keyss.methods.keyss.designs.network import MLP, PUBLISHED, RELEASED
 
+DesignName = Literal["carriers", "mlp", "published", "released"]
+
+_DESIGNS: dict[DesignName, Design] = {
+    "carriers": CARRIERS,
+    "mlp": MLP,
+    "published": PUBLISHED,
+    "released": RELEASED,
+}
 _OTHERS = ("clip_model",)  # options that are None by default and no setting of a design
 
 
@@ -89,7 +98,7 @@ class KeyssOptions(JointOptions):
     @property
     def settings(self) -> Any:
         """The `Design` with what these options override. Raises UsageError for what it does not have."""
-        chosen = design(self.design)
+        chosen = _DESIGNS[self.design]
         own = [each.name for each in fields(self) if each.default is None and each.name not in _OTHERS]
         given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}
         if foreign := [name for name in given if not hasattr(chosen, name)]:
@@ -103,9 +112,3 @@ class KeyssOptions(JointOptions):
     def variants(cls) -> Mapping[str, KeyssOptions]:
         """KeySS as published."""
         return {"published": KeyssOptions(design="published")}
-
-    @property
-    def joint_fit(self) -> FitConfig:
-        """`fit` with the weight that the design gives SSIM."""
-        weight = self.settings.ssim_weight
-        return self.fit if weight is None else replace(self.fit, ssim_weight=weight)

@@ -9,7 +9,7 @@ from typing import ClassVar
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Capabilities, Context, Source, Stego, Training
 from keyss.methods.peers.method import Peer, PeerOptions
-from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.peers.payload import HandedTensors, Show
 from keyss.methods.plan import Plan
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
@@ -26,13 +26,9 @@ class BoundOptions(PeerOptions):
         return (Training(),) * scenes
 
 
+@dataclass(frozen=True)
 class BoundMethod(Peer):
     """See `keyss.methods.base.Method`."""
-
-    name = BoundOptions.method
-    summary = "two plain models, the second handed over: nothing is hidden, a bound"
-    capabilities = Capabilities(keys=False, hands_over=True)
-    options = BoundOptions
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
         """Both models as they are."""
@@ -44,14 +40,18 @@ class BoundMethod(Peer):
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
         """Hand the secret's model over."""
         (secret,) = secrets
-        tensors = {name: getattr(secret.model, name) for name in _NAMES}
-        payload = HandedTensors(tensors).payload(self.name)
-        return Stego(cover.model, (self.unpack(payload),), handed=(payload,))
-
-    def open(self, handed: HandedTensors) -> HandedSecret:
-        model = Gaussians(*handed.taken(_NAMES))
-        return HandedSecret(handed, lambda stego: model)
+        return self.stego(cover.model, HandedTensors(vars(secret.model)))
 
 
-METHOD = BoundMethod()
+def _open(handed: HandedTensors) -> Show:
+    model = Gaussians(*handed.taken(_NAMES))
+    return lambda stego: model
+
+
+METHOD = BoundMethod(
+    options=BoundOptions,
+    summary="two plain models, the second handed over: nothing is hidden, a bound",
+    capabilities=Capabilities(keys=False, hands_over=True),
+    open=_open,
+)
 unpack = METHOD.unpack

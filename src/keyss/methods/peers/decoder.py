@@ -17,9 +17,9 @@ from keyss.fitting.parameters import to_gaussians
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
 from keyss.methods.joint_options import Scenes
-from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
+from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
-from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.peers.payload import HandedTensors, Show
 from keyss.rendering import decode_picture
 
 
@@ -38,6 +38,11 @@ class DecoderTraining(PeerTraining):
             Picture(decode_picture(cover.image, network), cover.meta) if scene else cover for scene in scenes
         ]
 
+    def publish(self) -> tuple[Gaussians, HandedTensors]:
+        network = self.decoder.network(self.backgrounds[0])
+        stego = to_gaussians(self.parameters).detach()[self.visible()].to("cpu")
+        return stego, HandedTensors(network_tensors(network), self.frame)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DecoderOptions(PeerOptions):
@@ -48,27 +53,19 @@ class DecoderOptions(PeerOptions):
     points: Scenes = "cover"
 
 
-class DecoderMethod(JointPeer):
-    """See `keyss.methods.base.Method`."""
-
-    name = DecoderOptions.method
-    summary = "a network from the cover's picture to the secret's, handed over (baseline)"
-    capabilities = Capabilities(keys=False, hands_over=True, models=False)
-    options = DecoderOptions
-    training = DecoderTraining
-    pixel_weights = weights_of(3)
-
-    def publish(self, run: DecoderTraining) -> tuple[Gaussians, HandedTensors]:
-        kept = run.kept()
-        stego = gaussians_of(kept, kept["opacities"], kept["sh"])
-        return stego, HandedTensors(network_tensors(run.decoder.network(run.backgrounds[0])), run.frame)
-
-    def open(self, handed: HandedTensors) -> HandedSecret:
-        network = network_of(handed)
-        if len(network.background) != 3:
-            raise ValueError("expected a network for pictures in colour")
-        return HandedSecret(handed, lambda stego: DecodedGaussians.of(stego, network))
+def _open(handed: HandedTensors) -> Show:
+    network = network_of(handed)
+    if len(network.background) != 3:
+        raise ValueError("expected a network for pictures in colour")
+    return lambda stego: DecodedGaussians.of(stego, network)
 
 
-METHOD = DecoderMethod()
+METHOD = Peer(
+    options=DecoderOptions,
+    summary="a network from the cover's picture to the secret's, handed over (baseline)",
+    capabilities=Capabilities(keys=False, hands_over=True, models=False),
+    open=_open,
+    training=DecoderTraining,
+    pixel_weights=weights_of(3),
+)
 unpack = METHOD.unpack

@@ -19,9 +19,9 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
+from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
-from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.peers.payload import HandedTensors, Show
 from keyss.rendering import decode_picture, render_features
 
 FEATURES = 16
@@ -42,11 +42,25 @@ class GsHiderTraining(PeerTraining):
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         """All images come from one render of the features."""
         background = torch.zeros(FEATURES, device=self.device)
-        sh = torch.zeros(len(self), 1, 3, device=self.device)
-        model = gaussians_of(self.parameters, self.parameters["opacities"], sh)
-        drawn, meta = render_features(model, self.parameters["features"], camera, background)
+        drawn, meta = render_features(self.gaussians(), self.parameters["features"], camera, background)
         networks = (self.decoders[scene].network(background) for scene in scenes)
         return [Picture(decode_picture(drawn, network), meta) for network in networks]
+
+    def gaussians(self) -> Gaussians:
+        """[N] without colours."""
+        own = self.parameters
+        sh = torch.zeros(len(self), 1, 3, device=self.device)
+        return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)
+
+    def publish(self) -> tuple[Gaussians, HandedTensors]:
+        visible = self.visible()
+        background = torch.zeros(FEATURES, device=self.device)
+        cover, secret = (
+            decoder.network(background).map(lambda values: values.detach().cpu()) for decoder in self.decoders
+        )
+        features = self.parameters["features"].detach()[visible].cpu()
+        stego = DecodedGaussians.of(self.gaussians().detach()[visible].to("cpu"), cover, features)
+        return stego, HandedTensors(network_tensors(secret), self.frame)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,36 +70,23 @@ class GsHiderOptions(PeerOptions):
     method: ClassVar[str] = "gs-hider"
 
 
-class GsHiderMethod(JointPeer):
-    """See `keyss.methods.base.Method`."""
+def _open(handed: HandedTensors) -> Show:
+    network = network_of(handed)
 
-    name = GsHiderOptions.method
-    summary = "features in place of harmonics, and a network for each scene"
-    capabilities = Capabilities(keys=False, hands_over=True, standard=False, models=False)
-    options = GsHiderOptions
-    training = GsHiderTraining
-    pixel_weights = 2 * weights_of(FEATURES)
+    def show(stego: Gaussians) -> Gaussians:
+        if not isinstance(stego, DecodedGaussians) or stego.features is None:
+            raise InputError("expected the model that gs-hider published, which has features")
+        return DecodedGaussians.of(stego, network, stego.features)
 
-    def publish(self, run: GsHiderTraining) -> tuple[Gaussians, HandedTensors]:
-        kept = run.kept()
-        background = torch.zeros(FEATURES, device=run.device)
-        cover, secret = (
-            decoder.network(background).map(lambda values: values.detach().cpu()) for decoder in run.decoders
-        )
-        plain = gaussians_of(kept, kept["opacities"], torch.zeros(len(kept["means"]), 1, 3))
-        stego = DecodedGaussians.of(plain, cover, kept["features"])
-        return stego, HandedTensors(network_tensors(secret), run.frame)
-
-    def open(self, handed: HandedTensors) -> HandedSecret:
-        network = network_of(handed)
-
-        def show(stego: Gaussians) -> Gaussians:
-            if not isinstance(stego, DecodedGaussians) or stego.features is None:
-                raise InputError("expected the model that gs-hider published, which has features")
-            return DecodedGaussians.of(stego, network, stego.features)
-
-        return HandedSecret(handed, show)
+    return show
 
 
-METHOD = GsHiderMethod()
+METHOD = Peer(
+    options=GsHiderOptions,
+    summary="features in place of harmonics, and a network for each scene",
+    capabilities=Capabilities(keys=False, hands_over=True, standard=False, models=False),
+    open=_open,
+    training=GsHiderTraining,
+    pixel_weights=2 * weights_of(FEATURES),
+)
 unpack = METHOD.unpack

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from keyss.core.similarity import Similarity
 from keyss.methods.base import Capabilities, CommandLineOption, Context, Source, Stego, check_above_zero
 from keyss.methods.joint import JointTraining, train_jointly
 from keyss.methods.joint_options import JointOptions
-from keyss.methods.peers.payload import DAMAGED, HandedSecret, HandedTensors
+from keyss.methods.peers.payload import DAMAGED, HandedSecret, HandedTensors, Show
 from keyss.methods.plan import Plan
 from keyss.methods.poses import PlacedScene
 from keyss.methods.tensors import damage_refused
@@ -53,56 +53,40 @@ class PeerTraining(JointTraining):
         poses, rate = options.common_poses, options.network_rate
         super().__init__(scenes, options, device, common_poses=poses, network_rate=rate)
 
+    @abstractmethod
+    def publish(self) -> tuple[Gaussians, HandedTensors]:
+        """The published model, on the CPU, and the tensors to hand over, after the training."""
+
     @property
     def frame(self) -> Similarity:
         """From the secret's own frame into the cover's."""
         return self.scenes[1].frame
 
-    def kept(self) -> dict[str, Tensor]:
-        """The parameters on the CPU, without Gaussians whose opacity is below the limit of pruning."""
+    def visible(self) -> Tensor:
+        """[N] which Gaussians have an opacity above the limit of pruning; all if none has."""
         visible = self.opacity_for_pruning() >= self.options.fit.prune_opacity
-        visible = visible if bool(visible.any()) else torch.ones_like(visible)
-        return {name: value.detach()[visible].cpu() for name, value in self.parameters.items()}
+        return visible if bool(visible.any()) else torch.ones_like(visible)
 
 
-def gaussians_of(tensors: Mapping[str, Tensor], opacities: Tensor, sh: Tensor) -> Gaussians:
-    """Gaussians with the means, quaternions and scales of the parameters, and these logits and harmonics."""
-    return Gaussians(tensors["means"], tensors["quats"], tensors["scales"], opacities, sh)
+@dataclass(frozen=True)
+class Peer:
+    """A `Method` with a joint training, one secret, and one file that is handed over for it."""
 
-
-class Peer(ABC):
-    """A `Method` with one secret, and one file that is handed over for it."""
-
-    name: str
+    options: type[PeerOptions]
     summary: str
     capabilities: Capabilities
-    most_secrets = 1
-    options: type[PeerOptions]
+    open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
+    training: type[PeerTraining] | None = None  # None: `hide` is another
+    pixel_weights: int = 0  # see `Plan`
+    most_secrets: int = 1
 
-    @abstractmethod
-    def open(self, handed: HandedTensors) -> HandedSecret:
-        """The secret of a handed-over file. Raises InputError and ValueError for damage."""
+    @property
+    def name(self) -> str:
+        return self.options.method
 
     def prepare(self, sources: Sequence[Source], options: PeerOptions) -> PeerOptions:
         """Accepts all scenes."""
         return options
-
-    def unpack(self, content: Content) -> HandedSecret:
-        """See `open`."""
-        handed = HandedTensors.of(content)
-        with damage_refused(DAMAGED):
-            return self.open(handed)
-
-
-class JointPeer(Peer):
-    """A peer with a joint training."""
-
-    training: ClassVar[type[PeerTraining]]
-    pixel_weights = 0  # see `Plan`
-
-    @abstractmethod
-    def publish(self, run: Any) -> tuple[Gaussians, HandedTensors]:
-        """The published model, on the CPU, and the tensors to hand over, of a finished training."""
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
         """As many Gaussians as a plain model show both scenes."""
@@ -110,9 +94,18 @@ class JointPeer(Peer):
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
         """Train both scenes together. Raises Interrupted, and InputError for another run's checkpoint."""
-        run = train_jointly(
-            lambda placed: self.training(placed, options, context.device), cover, secrets, context
-        )
-        stego, handed = self.publish(run)
+        training = self.training
+        assert training is not None
+        run = train_jointly(lambda placed: training(placed, options, context.device), cover, secrets, context)
+        return self.stego(*run.publish(), run.iterations)
+
+    def stego(self, published: Gaussians, handed: HandedTensors, iterations: int = 0) -> Stego:
+        """The result of hiding, opened from the payload that is handed over."""
         payload = handed.payload(self.name)
-        return Stego(stego, (self.unpack(payload),), run.iterations, handed=(payload,))
+        return Stego(published, (self.unpack(payload),), iterations, handed=(payload,))
+
+    def unpack(self, content: Content) -> HandedSecret:
+        """The secret of a handed-over file. Raises InputError for damage."""
+        handed = HandedTensors.of(content)
+        with damage_refused(DAMAGED):
+            return HandedSecret(handed, self.open(handed))

@@ -61,12 +61,15 @@ class HandedTensors:
         return [self.tensors[name] for name in expected]
 
 
+Show = Callable[[Gaussians], Gaussians]  # from a model on the CPU, in the cover's frame; raises ValueError
+
+
 @dataclass(frozen=True)
 class HandedSecret:
     """An `Opened`: a handed-over file applied to the published model."""
 
     handed: HandedTensors
-    show: Callable[[Gaussians], Gaussians]  # from a model on the CPU, in the cover's frame; raises ValueError
+    show: Show
     decode: None = None
 
     @property

@@ -12,11 +12,11 @@ from typing import ClassVar
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
-from keyss.fitting.parameters import make_optimizers
+from keyss.fitting.parameters import make_optimizers, to_gaussians
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
-from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
+from keyss.methods.peers.payload import HandedTensors, Show
 
 _NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
 
@@ -30,9 +30,14 @@ class ShTraining(PeerTraining):
         self.add(_NAMES[1], start.sh.clone(), optimizer)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
-        opacities = self.parameters["opacities"]
-        models = [gaussians_of(self.parameters, opacities, self.parameters[name]) for name in _NAMES]
-        return [self.render(models[scene], scene, camera, sh_degree) for scene in scenes]
+        model = to_gaussians(self.parameters)
+        models = [replace(model, sh=self.parameters[_NAMES[scene]]) for scene in scenes]
+        return [self.render(*each, camera, sh_degree) for each in zip(models, scenes, strict=True)]
+
+    def publish(self) -> tuple[Gaussians, HandedTensors]:
+        visible, secret_sh = self.visible(), self.parameters[_NAMES[1]].detach()
+        stego = to_gaussians(self.parameters).detach()[visible].to("cpu")
+        return stego, HandedTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,24 +47,16 @@ class ShOptions(PeerOptions):
     method: ClassVar[str] = "3dgs-sh"
 
 
-class ShMethod(JointPeer):
-    """See `keyss.methods.base.Method`."""
-
-    name = ShOptions.method
-    summary = "second harmonics for the secret, handed over (baseline)"
-    capabilities = Capabilities(keys=False, hands_over=True)
-    options = ShOptions
-    training = ShTraining
-
-    def publish(self, run: ShTraining) -> tuple[Gaussians, HandedTensors]:
-        kept = run.kept()
-        stego = gaussians_of(kept, kept["opacities"], kept["sh"])
-        return stego, HandedTensors({_NAMES[1]: kept[_NAMES[1]]}, run.frame, rows=len(stego))
-
-    def open(self, handed: HandedTensors) -> HandedSecret:
-        (sh,) = handed.taken([_NAMES[1]])
-        return HandedSecret(handed, lambda stego: replace(stego, sh=sh))
+def _open(handed: HandedTensors) -> Show:
+    (sh,) = handed.taken([_NAMES[1]])
+    return lambda stego: replace(stego, sh=sh)
 
 
-METHOD = ShMethod()
+METHOD = Peer(
+    options=ShOptions,
+    summary="second harmonics for the secret, handed over (baseline)",
+    capabilities=Capabilities(keys=False, hands_over=True),
+    open=_open,
+    training=ShTraining,
+)
 unpack = METHOD.unpack

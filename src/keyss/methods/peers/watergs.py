@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import ClassVar
@@ -34,13 +34,13 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.files.formats.common import morton_order
-from keyss.fitting.parameters import make_optimizers
+from keyss.fitting.parameters import make_optimizers, to_gaussians
 from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import JointPeer, PeerOptions, PeerTraining, gaussians_of
-from keyss.methods.peers.payload import HandedSecret, HandedTensors
+from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
+from keyss.methods.peers.payload import HandedTensors, Show
 
 COVER_BITS = (8, 10, 12, 14)  # low bits in use, of the 23 of a mantissa, by degree
 SECRET_BITS = (16, 13, 11, 10)  # of a coefficient if there is room for all, by degree
@@ -188,11 +188,11 @@ class WaterGsTraining(PeerTraining):
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         pictures = []
         for scene in scenes:
-            logits, sh = self.parameters["opacities"], self.parameters["sh"]
+            model = to_gaussians(self.parameters)
             if scene:
-                logits = self.mapping(logits) if self.mapped else self.parameters["secret_opacities"]
-                sh = self.parameters["secret_sh"]
-            model = gaussians_of(self.parameters, logits, sh)
+                free = self.parameters["secret_opacities"]
+                logits = self.mapping(model.opacity_logits) if self.mapped else free
+                model = replace(model, opacity_logits=logits, sh=self.parameters["secret_sh"])
             pictures.append(self.render(model, scene, camera, sh_degree))
         return pictures
 
@@ -218,6 +218,16 @@ class WaterGsTraining(PeerTraining):
         adam.zero_grad()
         here().share(self.mapping.parameters())
 
+    def publish(self) -> tuple[Gaussians, HandedTensors]:
+        """Publishes all Gaussians, because the autoencoder depends on their order."""
+        cover = to_gaussians(self.parameters).detach().to("cpu")
+        secret_sh = self.parameters["secret_sh"].detach().cpu()
+        ranges, cipher = ranges_of(secret_sh), os.urandom(_CIPHER_BYTES)
+        stego = replace(cover, sh=write_bits(cover.sh, secret_sh, ranges, cipher))
+        tensors = {f"mapping.{name}": value for name, value in self.mapping.state_dict().items()}
+        tensors |= {"ranges": ranges, "cipher": torch.tensor(list(cipher), dtype=torch.uint8)}
+        return stego, HandedTensors(tensors, self.frame, rows=len(stego))
+
 
 @dataclass(frozen=True, kw_only=True)
 class WaterGsOptions(PeerOptions):
@@ -234,43 +244,29 @@ class WaterGsOptions(PeerOptions):
             )
 
 
-class WaterGsMethod(JointPeer):
-    """See `keyss.methods.base.Method`."""
+def _open(handed: HandedTensors) -> Show:
+    mapping = OpacityMapping().requires_grad_(False)
+    names = [f"mapping.{name}" for name in mapping.state_dict()]
+    *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
+    mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
+    if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
+        raise ValueError("no such cipher")
+    cipher = bytes(numbers.tolist())
 
-    name = WaterGsOptions.method
-    summary = "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)"
-    capabilities = Capabilities(hands_over=True)
-    options = WaterGsOptions
-    training = WaterGsTraining
+    def show(stego: Gaussians) -> Gaussians:
+        if stego.sh_degree != len(ranges) - 1:
+            raise InputError(f"expected SH degree {len(ranges) - 1}, got {stego.sh_degree}")
+        sh = read_bits(stego.sh, ranges, cipher)
+        return replace(stego, opacity_logits=mapping(stego.opacity_logits), sh=sh)
 
-    def publish(self, run: WaterGsTraining) -> tuple[Gaussians, HandedTensors]:
-        """Publishes all Gaussians, because the autoencoder depends on their order."""
-        kept = {name: value.detach().cpu() for name, value in run.parameters.items()}
-        ranges, cipher = ranges_of(kept["secret_sh"]), os.urandom(_CIPHER_BYTES)
-        sh = write_bits(kept["sh"], kept["secret_sh"], ranges, cipher)
-        stego = gaussians_of(kept, kept["opacities"], sh)
-        tensors = {f"mapping.{name}": value for name, value in run.mapping.state_dict().items()}
-        tensors |= {"ranges": ranges, "cipher": torch.tensor(list(cipher), dtype=torch.uint8)}
-        return stego, HandedTensors(tensors, run.frame, rows=len(stego))
-
-    def open(self, handed: HandedTensors) -> HandedSecret:
-        mapping = OpacityMapping().requires_grad_(False)
-        names = [f"mapping.{name}" for name in mapping.state_dict()]
-        *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
-        mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
-        if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
-            raise ValueError("no such cipher")
-        cipher = bytes(numbers.tolist())
-
-        def show(stego: Gaussians) -> Gaussians:
-            if stego.sh_degree != len(ranges) - 1:
-                raise InputError(f"expected SH degree {len(ranges) - 1}, got {stego.sh_degree}")
-            sh = read_bits(stego.sh, ranges, cipher)
-            logits = mapping(stego.opacity_logits)
-            return Gaussians(stego.means, stego.quats, stego.log_scales, logits, sh)
-
-        return HandedSecret(handed, show)
+    return show
 
 
-METHOD = WaterGsMethod()
+METHOD = Peer(
+    options=WaterGsOptions,
+    summary="harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)",
+    capabilities=Capabilities(hands_over=True),
+    open=_open,
+    training=WaterGsTraining,
+)
 unpack = METHOD.unpack

@@ -34,7 +34,6 @@ from keyss.fitting.parameters import (
 )
 from keyss.fitting.plain import without_faint
 from keyss.methods.joint import Picture
-from keyss.methods.joint_options import JointOptions
 from keyss.methods.keyss.designs.base import Design, DesignTraining
 from keyss.methods.keyss.rows import (
     PAYLOAD_BYTES,
@@ -45,7 +44,6 @@ from keyss.methods.keyss.rows import (
     visibility,
 )
 from keyss.methods.points import combined_points
-from keyss.methods.poses import PlacedScene
 from keyss.methods.records.quantise import Codec
 from keyss.rendering.view import contributions
 
@@ -56,51 +54,14 @@ _EMPTY = -8.0  # opacity logit of a place without a Gaussian
 _VIEWS = 64  # that tell how much a Gaussian of a secret contributes
 
 
-@dataclass(frozen=True, kw_only=True)
-class CarriersDesign(Design):
-    """Rows that are a Gaussian of each scene."""
-
-    # Share of the steps after density control that render without the faintest quarter of each scene: what
-    # pruning then costs, against a share of faint Gaussians that plain models do not have.
-    pruned_steps: float = 0.3
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.pruned_steps <= 1:
-            raise UsageError(f"`pruned_steps`: expected 0 to 1, got {self.pruned_steps}")
-
-    def training(
-        self,
-        scenes: Sequence[PlacedScene],
-        embeddings: Sequence[Tensor],
-        options: JointOptions,
-        device: torch.device,
-    ) -> CarriersTraining:
-        return CarriersTraining(scenes, embeddings, options, device, self.pruned_steps)
-
-    def payload_bytes(self, sh_degree: int, secrets: int) -> int:
-        secret_tables(sh_degree, secrets)
-        return PAYLOAD_BYTES
-
-
-DESIGN = CarriersDesign()
-
-
 class CarriersTraining(DesignTraining):
     """One set of rows, and for each scene its own numbers, views and density control."""
 
-    def __init__(
-        self,
-        scenes: Sequence[PlacedScene],
-        embeddings: Sequence[Tensor],  # [64] of each secret's key
-        options: JointOptions,
-        device: torch.device,
-        pruned_steps: float,
-    ) -> None:
-        self.embeddings, self.pruned, self.pruned_steps = embeddings, False, pruned_steps
-        self.tables = secret_tables(options.fit.sh_degree, len(embeddings))
-        super().__init__(scenes, options, device, common_poses=0.0, network_rate=0.0)
+    design: CarriersDesign
+    pruned = False  # whether a step renders without the faintest Gaussians
 
     def start(self) -> Gaussians:
+        self.tables = secret_tables(self.options.fit.sh_degree, len(self.embeddings))
         return self._filled(0, self.options.fit.sh_degree)
 
     def _filled(self, scene: int, sh_degree: int) -> Gaussians:
@@ -125,7 +86,7 @@ class CarriersTraining(DesignTraining):
 
     def step(self) -> None:
         grown = self.iteration >= self.strategy.refine_stop_iter
-        self.pruned = grown and float(torch.rand((), generator=self.generator)) < self.pruned_steps
+        self.pruned = grown and float(torch.rand((), generator=self.generator)) < self.design.pruned_steps
         super().step()
         self.pruned = False
 
@@ -170,7 +131,7 @@ class CarriersTraining(DesignTraining):
             ]
             model, share = Gaussians.cat(parts), (index, len(self.embeddings))
             secrets.append(
-                RowSecret(embedding, tuple(codecs), placed.frame, *share, len(model), visibility(model))
+                RowSecret(embedding.cpu(), tuple(codecs), placed.frame, *share, len(model), visibility(model))
             )
             models.append(model)
         return encrypt_rows(cover, secrets, models, entropy), secrets
@@ -287,3 +248,25 @@ class DeadPlaces(CappedStrategy):
                     if key != "step":
                         moment[rows[fresh]] = 0
         return torch.cat([source[large], target])
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarriersDesign(Design):
+    """Rows that are a Gaussian of each scene."""
+
+    training = CarriersTraining
+
+    # Share of the steps after density control that render without the faintest quarter of each scene: what
+    # pruning then costs, against a share of faint Gaussians that plain models do not have.
+    pruned_steps: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pruned_steps <= 1:
+            raise UsageError(f"`pruned_steps`: expected 0 to 1, got {self.pruned_steps}")
+
+    def payload_bytes(self, sh_degree: int, secrets: int) -> int:
+        secret_tables(sh_degree, secrets)
+        return PAYLOAD_BYTES
+
+
+CARRIERS = CarriersDesign()

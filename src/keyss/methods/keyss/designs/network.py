@@ -25,95 +25,24 @@ from keyss.fitting.parameters import Optimizers, Parameters, to_gaussians
 from keyss.keys.derivation import random_embeddings, stream
 from keyss.methods.base import check_above_zero
 from keyss.methods.joint import Picture, Pose
-from keyss.methods.joint_options import JointOptions
 from keyss.methods.keyss.decoder import Decoder, DecoderShape, Mask
 from keyss.methods.keyss.designs.base import Design, DesignTraining
 from keyss.methods.keyss.secret import ANCHORS, HiddenSecret, choose_anchors
-from keyss.methods.poses import PlacedScene
 
 _VISIBLE = 0.05  # opacity from which a Gaussian counts for a scene
 _SLACK = 0.02  # scene extents by which a decoder may move a Gaussian
-
-
-@dataclass(frozen=True, kw_only=True)
-class NetworkDesign(Design):
-    """Raises UsageError for settings that do not work."""
-
-    # The decoder, see `DecoderShape`.
-    mask: Mask = ("op",)
-    conditioning: Literal["gate", "bias"] = "gate"
-    hidden: tuple[int, int] = (64, 64)
-    branch: int = 32
-    frequencies: int = 6
-    inputs: Literal["standardised", "normalised"] = "standardised"
-    residuals: Literal["signed", "one-sided"] = "signed"
-    decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
-    weight_decay: float = 1e-4  # of the decoders
-    incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
-    incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
-    # At the cap, Gaussians that ask for growth wait until others are pruned; "freeze": none are.
-    at_cap: Literal["wait", "freeze"] = "wait"
-    prune_by: Literal["all", "cover"] = "all"  # scenes in which an opaque Gaussian is spared
-    # Who gets free places: the largest gradients of all scenes, or the scenes with the fewest Gaussians.
-    growth: Literal["largest", "even"] = "even"
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "decoder_rate")
-        if self.incorrect_every < 1:
-            raise UsageError(f"`incorrect_every`: expected at least 1, got {self.incorrect_every}")
-
-    def shape(self, sh_degree: int) -> DecoderShape:
-        """Kind and sizes of the decoders."""
-        own = {name: getattr(self, name) for name in vars(DecoderShape()) if hasattr(self, name)}
-        return DecoderShape(**own | {"sh_degree": sh_degree})
-
-    def training(
-        self,
-        scenes: Sequence[PlacedScene],
-        embeddings: Sequence[Tensor],
-        options: JointOptions,
-        device: torch.device,
-    ) -> NetworkTraining:
-        return NetworkTraining(scenes, embeddings, options, device, self)
-
-    def payload_bytes(self, sh_degree: int, secrets: int) -> int:
-        decoder = Decoder(self.shape(sh_degree))
-        return len(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3)).payload().data)
-
-    def weights(self, sh_degree: int, secrets: int) -> float:
-        wrong = 1 / self.incorrect_every if self.conditioning == "bias" else 0.0
-        return (secrets + wrong) * self.shape(sh_degree).weights
 
 
 class NetworkTraining(DesignTraining):
     """Gaussians that show the cover, and for each secret a decoder that makes its Gaussians of them."""
 
     warm_up = 100
-
-    def __init__(
-        self,
-        scenes: Sequence[PlacedScene],
-        embeddings: Sequence[Tensor],  # [64] of each secret's key
-        options: JointOptions,
-        device: torch.device,
-        settings: NetworkDesign,
-    ) -> None:
-        self.settings = settings
-        self.shape = settings.shape(options.fit.sh_degree)
-        self.embeddings = [embedding.to(device) for embedding in embeddings]
-        super().__init__(
-            scenes,
-            options,
-            device,
-            common_poses=settings.common_poses,
-            network_rate=settings.decoder_rate,
-            weight_decay=settings.weight_decay,
-            freeze=settings.at_cap == "freeze",
-        )
+    design: NetworkDesign
 
     def prepare(self, start: Gaussians) -> None:
         # One for each secret: whoever opens one of them has no network that knows another.
-        self.decoders = [Decoder(self.shape) for _ in self.embeddings]
+        shape = self.design.shape(self.options.fit.sh_degree)
+        self.decoders = [Decoder(shape) for _ in self.embeddings]
         for decoder, embedding in zip(self.decoders, self.embeddings, strict=True):
             decoder.prepare(start, embedding)
         self.networks.extend(self.decoders)
@@ -131,7 +60,7 @@ class NetworkTraining(DesignTraining):
 
     def extras(self) -> Sequence[Tensor | None]:
         """Embeddings [64] of wrong keys; a gate needs none."""
-        settings = self.settings
+        settings = self.design
         if settings.conditioning == "gate" or self.iteration % settings.incorrect_every:
             return super().extras()
         return [random_embeddings(1, self.generator)[0].to(self.device) for _ in range(self.views_per_step)]
@@ -144,7 +73,7 @@ class NetworkTraining(DesignTraining):
 
     def _incorrect_loss(self, pose: Pose, embedding: Tensor) -> Tensor:
         """The cover is right already: only the decoders learn from wrong keys, in turns."""
-        settings, fit = self.settings, self.options.fit
+        settings, fit = self.design, self.options.fit
         cover, camera = self.gaussians(), self.poses.camera(*pose)
         decoder = self.decoders[self.iteration // settings.incorrect_every % len(self.decoders)]
         part = cover[possibly_seen(cover, camera, _SLACK * self.extent)]
@@ -154,16 +83,14 @@ class NetworkTraining(DesignTraining):
         return settings.incorrect_weight * settings.incorrect_every * len(self.decoders) * loss
 
     def density_control(self, freeze: bool) -> CappedStrategy:
-        even = self.settings.growth == "even" and len(self.growing) == len(self.scenes)
+        even = self.design.growth == "even" and len(self.growing) == len(self.scenes)
         if not even:
             return super().density_control(freeze)
         return EvenGrowth(self.options.fit, self.opacities, len(self.scenes))
 
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:
-        return (
-            super().opacity_for_pruning() if self.settings.prune_by == "cover" else self.opacities().amax(1)
-        )
+        return super().opacity_for_pruning() if self.design.prune_by == "cover" else self.opacities().amax(1)
 
     @torch.no_grad()
     def opacities(self) -> Tensor:
@@ -244,3 +171,77 @@ def possibly_seen(gaussians: Gaussians, camera: Camera, slack: float) -> Tensor:
         & (y.abs() - radius < 1.1 * half_height * depth)
     )
     return seen.nonzero()[:, 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkDesign(Design):
+    """Raises UsageError for settings that do not work."""
+
+    training = NetworkTraining
+
+    # The decoder, see `DecoderShape`.
+    mask: Mask = ("op",)
+    conditioning: Literal["gate", "bias"] = "gate"
+    hidden: tuple[int, int] = (64, 64)
+    branch: int = 32
+    frequencies: int = 6
+    inputs: Literal["standardised", "normalised"] = "standardised"
+    residuals: Literal["signed", "one-sided"] = "signed"
+    decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
+    weight_decay: float = 1e-4  # of the decoders
+    incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
+    incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
+    # At the cap, Gaussians that ask for growth wait until others are pruned; "freeze": none are.
+    at_cap: Literal["wait", "freeze"] = "wait"
+    prune_by: Literal["all", "cover"] = "all"  # scenes in which an opaque Gaussian is spared
+    # Who gets free places: the largest gradients of all scenes, or the scenes with the fewest Gaussians.
+    growth: Literal["largest", "even"] = "even"
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "decoder_rate")
+        if self.incorrect_every < 1:
+            raise UsageError(f"`incorrect_every`: expected at least 1, got {self.incorrect_every}")
+
+    @property
+    def joint(self) -> dict[str, Any]:
+        return {
+            "network_rate": self.decoder_rate,
+            "weight_decay": self.weight_decay,
+            "freeze": self.at_cap == "freeze",
+        }
+
+    def shape(self, sh_degree: int) -> DecoderShape:
+        """Kind and sizes of the decoders."""
+        own = {name: getattr(self, name) for name in vars(DecoderShape()) if hasattr(self, name)}
+        return DecoderShape(**own | {"sh_degree": sh_degree})
+
+    def payload_bytes(self, sh_degree: int, secrets: int) -> int:
+        decoder = Decoder(self.shape(sh_degree))
+        return len(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3)).payload().data)
+
+    def weights(self, sh_degree: int, secrets: int) -> float:
+        wrong = 1 / self.incorrect_every if self.conditioning == "bias" else 0.0
+        return (secrets + wrong) * self.shape(sh_degree).weights
+
+
+# The paper's architecture with inputs, rates, poses and conditioning that work at small scale.
+MLP = NetworkDesign(common_poses=0.1)
+
+# The paper's text (KeySS, sections 3.2 to 3.4 and appendix).
+PUBLISHED = NetworkDesign(
+    mask=("op", "ro", "sc", "xyz"),
+    conditioning="bias",
+    hidden=(64, 128),
+    branch=64,
+    frequencies=0,
+    inputs="normalised",
+    decoder_rate=5e-5,
+    common_poses=1.0,
+    incorrect_weight=0.01,
+    incorrect_every=1,
+    ssim_weight=0.5,
+    growth="largest",
+)
+
+# The authors' program, where it differs from the paper's text.
+RELEASED = replace(PUBLISHED, residuals="one-sided", ssim_weight=None, at_cap="freeze", prune_by="cover")
