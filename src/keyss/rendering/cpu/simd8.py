@@ -12,7 +12,9 @@ determines what the compiler may assume of floats, see `jit`.
 
 from __future__ import annotations
 
+import inspect
 import operator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -104,8 +106,7 @@ def _register_operator(python_operator, instruction):
         return typer
 
     def lower(context, builder, signature, values):
-        a, b = _as_vectors(builder, signature, values)
-        return getattr(builder, instruction)(a, b)
+        return getattr(builder, instruction)(*_as_vectors(builder, signature, values))
 
     for operands in ((Float32x8, Float32x8), (Float32x8, types.Float), (types.Float, Float32x8)):
         lower_builtin(python_operator, *operands)(lower)
@@ -209,85 +210,44 @@ def ramp(typingctx, start):
     return float32x8(types.float32), codegen
 
 
-@intrinsic
-def multiply_add(typingctx, a, b, c):
-    """a * b + c, one instruction where the CPU has it."""
+def _lanewise(build):
+    """An intrinsic that `build` makes of vectors; numbers among its arguments are in every lane."""
 
-    def codegen(context, builder, signature, arguments):
-        return _multiply_add(builder, *_as_vectors(builder, signature, arguments))
-
-    return float32x8(_operand(a), _operand(b), _operand(c)), codegen
-
-
-@intrinsic
-def divide(typingctx, a, b):
-    """a / b."""
-
-    def codegen(context, builder, signature, arguments):
-        return builder.fdiv(*_as_vectors(builder, signature, arguments))
-
-    return float32x8(_operand(a), _operand(b)), codegen
-
-
-def _selection(predicate):
-    @intrinsic
-    def select(typingctx, a, b, yes, no):
+    def function(typingctx, *operands):
         def codegen(context, builder, signature, arguments):
-            a, b, yes, no = _as_vectors(builder, signature, arguments)
-            return builder.select(builder.fcmp_ordered(predicate, a, b), yes, no)
+            return build(builder, *_as_vectors(builder, signature, arguments))
 
-        return float32x8(*(_operand(argument) for argument in (a, b, yes, no))), codegen
+        return float32x8(*map(_operand, operands)), codegen
 
-    return select
-
-
-select_ge = _selection(">=")  # (a, b, yes, no): per lane `yes` where a >= b, else `no`
-select_gt = _selection(">")
-select_le = _selection("<=")
+    function.__signature__ = inspect.signature(build)  # numba takes no variable number of arguments
+    return intrinsic(function)
 
 
-def _extremum(predicate):
-    @intrinsic
-    def extremum(typingctx, a, b):
-        def codegen(context, builder, signature, arguments):
-            a, b = _as_vectors(builder, signature, arguments)
-            return builder.select(builder.fcmp_ordered(predicate, a, b), a, b)
-
-        return float32x8(_operand(a), _operand(b)), codegen
-
-    return extremum
+def _selected(predicate, builder, a, b, yes, no):
+    return builder.select(builder.fcmp_ordered(predicate, a, b), yes, no)
 
 
-minimum = _extremum("<")
-maximum = _extremum(">")
+def _called(name, builder, a):
+    return builder.call(_llvm_function(builder, name, VECTOR, [VECTOR]), [a])
 
 
-def _unary(name):
-    @intrinsic
-    def function(typingctx, a):
-        def codegen(context, builder, signature, arguments):
-            return builder.call(_llvm_function(builder, name, VECTOR, [VECTOR]), arguments)
-
-        return float32x8(float32x8), codegen
-
-    return function
+def _with_sign(builder, a):
+    bits = builder.or_(builder.bitcast(a, INT_VECTOR), ir.Constant(INT_VECTOR, [-(1 << 31)] * 8))
+    return builder.bitcast(bits, VECTOR)
 
 
-square_root = _unary("llvm.sqrt.v8f32")
-floor8 = _unary("llvm.floor.v8f32")
-ceil8 = _unary("llvm.ceil.v8f32")
-absolute = _unary("llvm.fabs.v8f32")
-
-
-@intrinsic
-def negative_abs(typingctx, a):
-    """-|a|."""
-
-    def codegen(context, builder, signature, arguments):
-        bits = builder.bitcast(arguments[0], INT_VECTOR)
-        return builder.bitcast(builder.or_(bits, ir.Constant(INT_VECTOR, [-(1 << 31)] * 8)), VECTOR)
-
-    return float32x8(float32x8), codegen
+multiply_add = _lanewise(_multiply_add)  # a * b + c, one instruction where the CPU has it
+divide = _lanewise(lambda builder, a, b: builder.fdiv(a, b))
+select_ge = _lanewise(partial(_selected, ">="))  # (a, b, yes, no): `yes` where a >= b, else `no`
+select_gt = _lanewise(partial(_selected, ">"))
+select_le = _lanewise(partial(_selected, "<="))
+minimum = _lanewise(lambda builder, a, b: _selected("<", builder, a, b, a, b))
+maximum = _lanewise(lambda builder, a, b: _selected(">", builder, a, b, a, b))
+square_root = _lanewise(partial(_called, "llvm.sqrt.v8f32"))
+floor8 = _lanewise(partial(_called, "llvm.floor.v8f32"))
+ceil8 = _lanewise(partial(_called, "llvm.ceil.v8f32"))
+absolute = _lanewise(partial(_called, "llvm.fabs.v8f32"))
+negative_abs = _lanewise(_with_sign)
 
 
 @intrinsic
@@ -381,26 +341,20 @@ def _exponential(power):
     """e^x 2^power, exactly scaled: the power is added to the float's exponent."""
     lowest = -87.0 - power * np.log(2.0)
 
-    @intrinsic
-    def exponential(typingctx, x):
-        def codegen(context, builder, signature, arguments):
-            (x,) = arguments
-            scaled = builder.fmul(x, _constant(_LOG2_E))
-            round_to_nearest = _llvm_function(builder, "llvm.rint.v8f32", VECTOR, [VECTOR])
-            exponent = builder.call(round_to_nearest, [scaled])
-            fraction = builder.fsub(scaled, exponent)
-            result = _constant(_EXP2_COEFFICIENTS[-1])
-            for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
-                result = _multiply_add(builder, result, fraction, _constant(coefficient))
-            steps = builder.fptosi(exponent, INT_VECTOR)
-            steps = builder.add(steps, ir.Constant(INT_VECTOR, [power] * 8))
-            shift = builder.shl(steps, ir.Constant(INT_VECTOR, [23] * 8))
-            result = builder.bitcast(builder.add(builder.bitcast(result, INT_VECTOR), shift), VECTOR)
-            return builder.select(builder.fcmp_ordered(">", x, _constant(lowest)), result, _constant(0.0))
+    def build(builder, x):
+        scaled = builder.fmul(x, _constant(_LOG2_E))
+        exponent = _called("llvm.rint.v8f32", builder, scaled)
+        fraction = builder.fsub(scaled, exponent)
+        result = _constant(_EXP2_COEFFICIENTS[-1])
+        for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
+            result = _multiply_add(builder, result, fraction, _constant(coefficient))
+        steps = builder.fptosi(exponent, INT_VECTOR)
+        steps = builder.add(steps, ir.Constant(INT_VECTOR, [power] * 8))
+        shift = builder.shl(steps, ir.Constant(INT_VECTOR, [23] * 8))
+        result = builder.bitcast(builder.add(builder.bitcast(result, INT_VECTOR), shift), VECTOR)
+        return _selected(">", builder, x, _constant(lowest), result, _constant(0.0))
 
-        return float32x8(float32x8), codegen
-
-    return exponential
+    return _lanewise(build)
 
 
 exp = _exponential(0)  # e^x for x < 87, and 0 below -87; the relative error is about 1e-7 (1 + |x|)
