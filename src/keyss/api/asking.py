@@ -12,8 +12,7 @@ from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene
 from keyss.keys import normalized_key
 from keyss.methods import registry
-from keyss.methods.base import Method, MethodOptions, Source
-from keyss.methods.plan import Plan
+from keyss.methods.base import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.sources import PathLike, as_3dgs_model, path_of

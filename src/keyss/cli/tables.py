@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from keyss.audits import Audit
     from keyss.many import Forecast, ManyResult
     from keyss.measure.stegexpose import Steganalysis
-    from keyss.methods.plan import Plan
+    from keyss.methods.base import Plan
     from keyss.runs.metrics import FitMetrics, HideMetrics
 
 

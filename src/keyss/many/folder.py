@@ -16,8 +16,7 @@ from keyss.many.measures import check_extras
 from keyss.many.performing import plan_of
 from keyss.many.running import CELLS, MASTER_KEY, Outcome, claimed, run_cells, settle_master_key
 from keyss.methods import registry
-from keyss.methods.base import MethodOptions
-from keyss.methods.plan import Plan
+from keyss.methods.base import MethodOptions, Plan
 
 
 @dataclass(frozen=True)

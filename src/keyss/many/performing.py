@@ -24,9 +24,8 @@ from keyss.keys.master import MasterKey
 from keyss.many.cell import RUN, Cell, Result, failure_of, result_of
 from keyss.many.measures import MEASURES, Subject
 from keyss.methods import registry
-from keyss.methods.base import MethodOptions, role_of
+from keyss.methods.base import MethodOptions, Plan, role_of
 from keyss.methods.plain_models import plain_stage
-from keyss.methods.plan import Plan
 from keyss.progress import reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import METRICS, MODEL, stego_in

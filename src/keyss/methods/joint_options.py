@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from keyss.core.errors import UsageError
-from keyss.methods.base import MethodOptions, Training, check_above_zero
-from keyss.methods.plan import Plan
+from keyss.methods.base import MethodOptions, Plan, Training, check_above_zero
 
 Scenes = Literal["both", "cover", "secret"]  # "both": all scenes, also with several secrets
 

@@ -19,9 +19,8 @@ from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.ranks import here
-from keyss.methods.base import Method, MethodOptions, Source, role_of
+from keyss.methods.base import Method, MethodOptions, Plan, Source, Stage, role_of
 from keyss.methods.plain_models import Bound, plain_stage
-from keyss.methods.plan import Plan, Stage
 from keyss.progress import about
 
 _LONG = 1000  # steps

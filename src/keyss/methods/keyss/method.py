@@ -20,13 +20,12 @@ from keyss.core.errors import KeyssError, KeyssWarning, UsageError
 from keyss.core.scene import Scene
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
-from keyss.methods.base import Capabilities, Context, Source, Stego
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.joint import train_jointly
 from keyss.methods.keyss.clip_keys import MODEL, ClipKeys
 from keyss.methods.keyss.designs.base import DesignTraining
 from keyss.methods.keyss.options import KeyssOptions
 from keyss.methods.keyss.secret import unpack
-from keyss.methods.plan import Plan
 
 _APPENDED = "the secrets lie in appended Gaussians instead, and everybody can see that they are there"
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from keyss.core.gaussians import Gaussians
-from keyss.methods.base import Capabilities, Context, Source, Stego, Training
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, Training
 from keyss.methods.peers.method import Peer, PeerOptions
 from keyss.methods.peers.payload import HandedTensors, Show
-from keyss.methods.plan import Plan
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
 

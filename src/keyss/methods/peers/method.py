@@ -13,11 +13,10 @@ from torch import Tensor
 from keyss.channels import Content
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.methods.base import Capabilities, CommandLineOption, Context, Source, Stego, check_above_zero
+from keyss.methods.base import Capabilities, CommandLineOption, Context, Plan, Source, Stego, check_above_zero
 from keyss.methods.joint import JointTraining, train_jointly
 from keyss.methods.joint_options import JointOptions
 from keyss.methods.peers.payload import DAMAGED, HandedSecret, HandedTensors, Show
-from keyss.methods.plan import Plan
 from keyss.methods.poses import PlacedScene
 from keyss.methods.tensors import damage_refused
 

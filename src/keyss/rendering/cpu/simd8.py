@@ -219,7 +219,8 @@ def _lanewise(build):
 
         return float32x8(*map(_operand, operands)), codegen
 
-    function.__signature__ = inspect.signature(build)  # numba takes no variable number of arguments
+    # numba takes no variable number of arguments.
+    function.__signature__ = inspect.signature(build)  # type: ignore[attr-defined]
     return intrinsic(function)
 
 
