@@ -21,13 +21,11 @@ import statistics
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 from keyss.channels import SUFFIXES, CodesChannel, CodesReader, Payload
-from keyss.channels.codes.fields import format_of
+from keyss.channels.codes.fields import FORMATS
 from keyss.core import Gaussians, Scene
 from keyss.files import write_bytes
-from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
@@ -41,7 +39,6 @@ from keyss.rendering.orbit import scene_of_model
 import numpy as np
 import torch
 
-FORMATS: dict[str, ModuleType] = {"spz": spz, "sog": sog, "compressed-ply": compressed_ply}
 START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"
 HEAD = (
     "| cover | Gaussians | format | bits per Gaussian | cover against photos, untouched / carrying (dB) "
@@ -77,27 +74,27 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
     found = []
     for name, format_ in FORMATS.items():
         model = in_morton_order(cover[1])
-        untouched = format_.dequantise(format_.quantise(model))
+        untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
         room = CodesChannel(name).prepare(cover[1])
         left = room.capacity - room.overhead
         kept = pruned(own, left)
         encoded = fitted(kept, left)
         stego = room.embed([(KEY, Payload("carry", encoded))])
-        file = format_.serialise(stego.codes)
+        file = stego.codes.serialise()
         hiding = time.monotonic() - start
         start = time.monotonic()
         opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
         bits = 8 * room.size / len(model)
         most = room.size * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
-        in_format = format_.dequantise(format_.quantise(in_morton_order(kept)))
+        in_format = format_.quantise(in_morton_order(kept)).dequantise()
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
             *(against_photos(each, scenes[1]) for each in (in_format, opened)),
         ]
         found.append(
-            f"| {cover[0]} | {len(model):,} | {format_of(stego.codes).name} | {bits:.1f} "
+            f"| {cover[0]} | {len(model):,} | {stego.codes.name} | {bits:.1f} "
             f"| {numbers[0]:.2f} / {numbers[1]:.2f} | {psnr_between(untouched, stego):.1f} "
             f"| 1 : {1 / most:.1f} | {numbers[2]:.2f} / {numbers[3]:.2f} | {hiding:.1f}, {revealing:.1f} |"
         )

@@ -19,7 +19,7 @@ from dataclasses import replace
 
 from keyss.core import Gaussians, InputError
 from keyss.files import model_bytes, model_of_bytes
-from keyss.files.formats import spz
+from keyss.files.formats.spz import SpzCodes
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def examples(count: int = 60) -> dict[str, list[bytes]]:
 
     names = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat")
     found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in names}
-    found["a.spz"].append(spz.serialise(replace(spz.quantise(model(1)), version=4)))
+    found["a.spz"].append(replace(SpzCodes.quantise(model(1)), version=4).serialise())
     return found
 
 

@@ -51,8 +51,11 @@ from keyss.channels.codes.fields import _log2  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
-from keyss.files.formats import compressed_ply, sog, splat, spz  # noqa: E402
+from keyss.files.formats import splat  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
+from keyss.files.formats.compressed_ply import CompressedPlyCodes  # noqa: E402
+from keyss.files.formats.sog import SogCodes  # noqa: E402
+from keyss.files.formats.spz import SpzCodes  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
 from keyss.methods import (  # noqa: E402  # noqa: E402
     ATTRIBUTES,
@@ -167,12 +170,12 @@ def write_published() -> None:
     """One model in the formats that are published, and what Python reads of each."""
     model = model_of(300, 2, seed=7)
     files = {
-        "published.spz": spz.write_spz(model),
-        "published-2.spz": spz.serialise(random_spz(np.random.default_rng(1), 2, 40, 15)),
-        "published-4.spz": spz.serialise(replace(spz.quantise(model), version=4)),
-        "published.compressed.ply": compressed_ply.write_compressed_ply(model),
-        "published.sog": sog.write_sog(model),
-        "published.splat": splat.write_splat(model),
+        "published.spz": SpzCodes.write(model),
+        "published-2.spz": random_spz(np.random.default_rng(1), 2, 40, 15).serialise(),
+        "published-4.spz": replace(SpzCodes.quantise(model), version=4).serialise(),
+        "published.compressed.ply": CompressedPlyCodes.write(model),
+        "published.sog": SogCodes.write(model),
+        "published.splat": splat.write(model),
     }
     read = {}
     for name, data in files.items():
@@ -206,11 +209,11 @@ def write_extremes() -> None:
         each[40:] = each[:20]  # Gaussians alike in all that is not written
     codes = replace(codes, **same, mins=np.array([-40.0, 1, 5e-310]), maxs=np.array([60.0, 1, 0]))
     codes = replace(codes, scale_codebook=(16 * codes.scale_codebook).astype(np.float32))
-    (FOLDER / "extreme.sog").write_bytes(sog.serialise(codes))
+    (FOLDER / "extreme.sog").write_bytes(codes.serialise())
     chunks = random_compressed(random, 700, 0)
     chunks.bounds[0, 6:12] = [0, 1, -3e38, 0, -1, 3e38]
     chunks.bounds[1, 6:12] = [0, 0, -1e-3, 1e-44, 1e-6, 1e-3]
-    (FOLDER / "extreme.compressed.ply").write_bytes(compressed_ply.serialise(chunks))
+    (FOLDER / "extreme.compressed.ply").write_bytes(chunks.serialise())
 
 
 def write_counted() -> None:

@@ -46,4 +46,4 @@ def suffix_of(stego: Gaussians) -> str:
     """The suffix of a file that keeps everything a published model carries."""
     if not isinstance(stego, CodedGaussians):
         return ".ply"
-    return SUFFIXES[type(stego.codes).__module__.rpartition(".")[2].replace("_", "-")]
+    return SUFFIXES[stego.codes.name]

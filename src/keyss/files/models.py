@@ -1,13 +1,13 @@
 """Reading and writing 3DGS models in all formats.
 
-A new format is a module with a reader and a writer, and one entry in `FORMATS`.
+A new format is a module with `read` and `write`, or codes that have both, and one entry in `FORMATS`.
 """
 
 from __future__ import annotations
 
-import importlib
 import io
 import os
+import pkgutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,53 +46,52 @@ class ModelFormat:
     is_exact: bool = False  # True if all numbers are kept to the last bit
 
 
-def _format(module: str) -> Any:
-    """A module of `keyss.files.formats`, imported on first use since some import slow libraries."""
-    return importlib.import_module(f"keyss.files.formats.{module}")
+def _format(name: str) -> Any:
+    """What reads and writes a format, imported on first use since some import slow libraries."""
+    return pkgutil.resolve_name(f"keyss.files.formats.{name}")
 
 
-def _reader(module: str) -> Callable[[BinaryIO], Gaussians]:
-    """A reader that calls the module's `read_MODULE(data)`."""
+def _reader(name: str) -> Callable[[BinaryIO], Gaussians]:
+    """A reader that calls the format's `read(data)`."""
 
     def read(file: BinaryIO) -> Gaussians:
         data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise InputError(f"expected at most {MAX_BYTES:,} bytes, found more")
         with np.errstate(all="ignore"):  # values that are not finite are reported in the end
-            model: Gaussians = getattr(_format(module), f"read_{module}")(data)
+            model: Gaussians = _format(name).read(data)
         return model
 
     return read
 
 
-def _writer(module: str) -> Callable[[Gaussians, BinaryIO], None]:
-    """A writer that calls the module's `write_MODULE(model)`."""
+def _writer(name: str) -> Callable[[Gaussians, BinaryIO], None]:
+    """A writer that calls the format's `write(model)`."""
 
     def write(model: Gaussians, file: BinaryIO) -> None:
-        file.write(getattr(_format(module), f"write_{module}")(_format("common").writable(model)))
+        file.write(_format(name).write(model))
 
     return write
 
 
-def _write_decoded(model: Gaussians, file: BinaryIO) -> None:
-    file.write(_format("decoded").write_decoded(model))
-
-
 def _read_any_ply(file: BinaryIO) -> Gaussians:
-    return _reader("compressed_ply")(file) if has_packed_header(file) else read_ply(file)
+    return _reader(_PACKED)(file) if has_packed_header(file) else read_ply(file)
 
 
+_PACKED = "compressed_ply:CompressedPlyCodes"
 # A file name belongs to the first format with a fitting suffix.
 FORMATS = [
-    ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer("compressed_ply")),
+    ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer(_PACKED)),
     ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, is_exact=True),
-    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz"), _writer("spz")),
-    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog"), _writer("sog")),
+    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz:SpzCodes"), _writer("spz:SpzCodes")),
+    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog:SogCodes"), _writer("sog:SogCodes")),
     ModelFormat("glTF", (".glb",), (b"glTF",), _reader("glb"), _writer("glb")),
     ModelFormat(".splat", (".splat",), (), _reader("splat"), _writer("splat")),
 ]
 # Not a format of 3DGS models, hence not among those that messages list.
-_DECODED = ModelFormat("decoded", (DECODED_SUFFIX,), (), _reader("decoded"), _write_decoded, is_exact=True)
+_DECODED = ModelFormat(
+    "decoded", (DECODED_SUFFIX,), (), _reader("decoded"), _writer("decoded"), is_exact=True
+)
 _PLY = FORMATS[1]
 
 

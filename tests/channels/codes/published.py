@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -12,10 +11,12 @@ import torch
 from channels.low_bits.trained_like import trained_like
 from keyss.channels import CodesCover, CodesReader, Payload
 from keyss.core import Gaussians, WrongKeyError
-from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import in_morton_order
+from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.sog import SogCodes
+from keyss.files.formats.spz import SpzCodes
 
-FORMATS: dict[str, ModuleType] = {".spz": spz, ".sog": sog, ".compressed.ply": compressed_ply}
+FORMATS = {".spz": SpzCodes, ".sog": SogCodes, ".compressed.ply": CompressedPlyCodes}
 
 
 @cache
@@ -49,4 +50,4 @@ def opened(codes: Any, key: str = "0") -> bytes:
 
 def there_and_back(suffix: str, codes: Any) -> Any:
     """Codes as they come out of a file."""
-    return FORMATS[suffix].parse(FORMATS[suffix].serialise(codes))
+    return FORMATS[suffix].parse(codes.serialise())

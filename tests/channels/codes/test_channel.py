@@ -11,10 +11,12 @@ from hypothesis import given, settings, strategies as st
 
 from channels.codes.published import FORMATS, codes_of, model_of, opened, there_and_back, written
 from keyss.channels import CodesCover, CodesReader, Field, Payload, in_counted_order, pack_payload
-from keyss.channels.codes.fields import format_of
+from keyss.channels.codes.fields import carrying
 from keyss.core import InputError, UsageError, WrongKeyError
-from keyss.files.formats import sog, spz
+from keyss.files.formats import sog
 from keyss.files.formats.common import morton_order
+from keyss.files.formats.sog import SogCodes
+from keyss.files.formats.spz import SpzCodes
 from keyss.keys import encryption
 
 ENTROPY = bytes(range(32))
@@ -206,7 +208,7 @@ def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None
     """But for those that rounding alone makes, which stay, too."""
     cover = CodesCover.of(codes_of(suffix, 20_000))
     _, after = in_counted_order(written(cover, b"data"))
-    least, largest = format_of(cover.codes).rotations
+    least, largest = carrying(cover.codes).rotations
 
     def wrong(fields: list[Field]) -> Any:
         levels = np.stack([each.levels for each in fields if each.name == "rotations"], axis=1)
@@ -219,14 +221,14 @@ def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None
 
 
 def test_rotations_of_an_old_spz_stay() -> None:
-    codes = spz.quantise(model_of())
+    codes = SpzCodes.quantise(model_of())
     old = replace(
         codes,
         version=2,
         largest=np.full(len(codes), 3, np.uint8),
         rotations=np.random.default_rng(0).integers(1, 255, (len(codes), 3)).astype(np.uint16),
     )
-    file = spz.parse(spz.serialise(written(CodesCover.of(old), b"data")))
+    file = SpzCodes.parse(written(CodesCover.of(old), b"data").serialise())
     assert np.array_equal(file.rotations, old.rotations)
     assert opened(file) == b"data"
 
@@ -235,9 +237,9 @@ def test_sog_stays_in_the_order_of_its_positions() -> None:
     """As much as that of an untouched file, which was sorted before it was rounded."""
 
     def out_of_order(codes: sog.SogCodes) -> int:
-        return int((np.diff(morton_order(sog.dequantise(codes).means.numpy())) < 0).sum())
+        return int((np.diff(morton_order(codes.dequantise().means.numpy())) < 0).sum())
 
-    plain = sog.quantise(model_of(20_000))
+    plain = SogCodes.quantise(model_of(20_000))
     expected = out_of_order(plain)
     found = out_of_order(written(CodesCover.of(plain), bytes(5000)))
     assert expected > 0

@@ -19,9 +19,11 @@ from files.formats.examples import (
     random_spz,
 )
 from keyss.core import Gaussians, OutputError, Similarity
-from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.codebooks import codebook_of, nearest, palette_of
 from keyss.files.formats.common import from_smallest_three, morton_order, smallest_three, unit
+from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.sog import SogCodes
+from keyss.files.formats.spz import SpzCodes
 
 SEEDS, COUNTS, DEGREES = st.integers(0, 2**32 - 1), st.integers(1, 300), st.sampled_from([0, 3, 8, 15])
 
@@ -30,27 +32,27 @@ SEEDS, COUNTS, DEGREES = st.integers(0, 2**32 - 1), st.integers(1, 300), st.samp
 @given(SEEDS, st.sampled_from([2, 3, 4]), COUNTS, DEGREES)
 def test_spz_inverts(seed: int, version: int, count: int, k: int) -> None:
     codes = random_spz(np.random.default_rng(seed), version, count, k)
-    again = spz.parse(spz.serialise(codes))
+    again = SpzCodes.parse(codes.serialise())
     assert again == codes
-    assert is_finite(spz.dequantise(again))
+    assert is_finite(again.dequantise())
 
 
 @settings(max_examples=40, deadline=None)
 @given(SEEDS, COUNTS, DEGREES)
 def test_compressed_ply_inverts(seed: int, count: int, k: int) -> None:
     codes = random_compressed(np.random.default_rng(seed), count, k)
-    again = compressed_ply.parse(compressed_ply.serialise(codes))
+    again = CompressedPlyCodes.parse(codes.serialise())
     assert again == codes
-    assert is_finite(compressed_ply.dequantise(again))
+    assert is_finite(again.dequantise())
 
 
 @settings(max_examples=40, deadline=None)
 @given(SEEDS, COUNTS, DEGREES)
 def test_sog_inverts(seed: int, count: int, k: int) -> None:
     codes = random_sog(np.random.default_rng(seed), count, k)
-    again = sog.parse(sog.serialise(codes))
+    again = SogCodes.parse(codes.serialise())
     assert again == codes
-    assert is_finite(sog.dequantise(again))
+    assert is_finite(again.dequantise())
 
 
 def test_codes_differ_in_a_single_bit() -> None:
@@ -65,23 +67,23 @@ def test_codes_differ_in_a_single_bit() -> None:
 def test_extensions_of_an_spz_are_kept() -> None:
     for version in (3, 4):
         codes = replace(random_spz(np.random.default_rng(0), version, 9, 3), flags=2, extensions=b"\1\2\3")
-        assert spz.parse(spz.serialise(codes)) == codes
+        assert SpzCodes.parse(codes.serialise()) == codes
 
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_reading_and_writing_an_spz_keeps_its_codes(version: int) -> None:
     """`dequantise` returns the middle of the interval that `quantise` maps to a code."""
-    codes = replace(spz.quantise(model_of(500, 3)), version=version)
-    again = replace(spz.quantise(spz.dequantise(codes)), version=version)
+    codes = replace(SpzCodes.quantise(model_of(500, 3)), version=version)
+    again = replace(SpzCodes.quantise(codes.dequantise()), version=version)
     # Which of two parts of a rotation is the larger one may change after rounding, and so may the sign of 0.
     assert replace(again, largest=codes.largest, rotations=codes.rotations) == codes
     assert np.mean(again.rotations != codes.rotations) < 0.02
-    assert angle(spz.dequantise(again), spz.dequantise(codes)) < 0.2
+    assert angle(again.dequantise(), codes.dequantise()) < 0.2
 
 
 def test_reading_and_writing_a_compressed_ply_keeps_its_codes() -> None:
-    codes = compressed_ply.quantise(model_of(700, 2))
-    again = compressed_ply.quantise(compressed_ply.dequantise(codes))
+    codes = CompressedPlyCodes.quantise(model_of(700, 2))
+    again = CompressedPlyCodes.quantise(codes.dequantise())
     for name in ("positions", "scales", "colors", "alphas", "sh"):
         assert np.array_equal(getattr(again, name), getattr(codes, name)), name
 
@@ -113,7 +115,7 @@ def spz_harmonics_bound(degree: int) -> torch.Tensor:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_errors_of_spz_are_half_a_step(degree: int) -> None:
     model = model_of(400, degree)
-    found = spz.dequantise(spz.quantise(model))
+    found = SpzCodes.quantise(model).dequantise()
     assert worst(found.means, model.means) <= 0.5 / 4096 + 1e-6
     assert worst(found.log_scales, model.log_scales) <= 0.5 / 16 + 1e-6
     assert worst(found.opacities, model.opacities) <= 0.5 / 255 + 1e-6
@@ -126,7 +128,7 @@ def test_errors_of_spz_are_half_a_step(degree: int) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_errors_of_compressed_ply_are_half_a_step_of_its_chunk(degree: int) -> None:
     model = model_of(600, degree)
-    found = compressed_ply.dequantise(compressed_ply.quantise(model))
+    found = CompressedPlyCodes.quantise(model).dequantise()
     for start in range(0, 600, 256):
         part, near = model[start : start + 256], found[start : start + 256]
         for name, bits in (("means", (11, 10, 11)), ("log_scales", (11, 10, 11))):
@@ -145,8 +147,8 @@ def test_errors_of_compressed_ply_are_half_a_step_of_its_chunk(degree: int) -> N
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_errors_of_sog(degree: int) -> None:
     model = model_of(400, degree)
-    codes = sog.quantise(model)
-    found = sog.dequantise(codes)
+    codes = SogCodes.quantise(model)
+    found = codes.dequantise()
     logs = torch.log1p(model.means.double().abs())
     step = (torch.from_numpy(codes.maxs) - torch.from_numpy(codes.mins)) / 65535
     assert bool(((found.means - model.means).abs() <= 0.5 * step * logs.exp() * 1.01 + 1e-5).all())
@@ -161,7 +163,7 @@ def test_errors_of_sog(degree: int) -> None:
 def test_spz_rotates_harmonics_with_the_model() -> None:
     """y and z change signs in the file, and the harmonics as for a rotated model."""
     model = model_of(50, 3)
-    codes = spz.quantise(model)
+    codes = SpzCodes.quantise(model)
     turned = Similarity(rotation=torch.diag(torch.tensor([1.0, -1.0, -1.0]))).apply_gaussians(model)
     assert worst(torch.from_numpy(codes.positions) / 4096, turned.means) < 2e-4
     errors = (torch.from_numpy(codes.sh).double() - 128) / 128 - turned.sh[:, 1:].clamp(-1, 127 / 128)
@@ -172,22 +174,22 @@ def test_spz_rotates_harmonics_with_the_model() -> None:
 def test_spz_makes_room_for_large_models(reach: float) -> None:
     model = model_of(30, 0)
     model = replace(model, means=model.means / model.means.abs().max() * reach)
-    codes = spz.quantise(model)
-    assert worst(spz.dequantise(codes).means, model.means) <= 0.51 * 2.0**-codes.fractional_bits
+    codes = SpzCodes.quantise(model)
+    assert worst(codes.dequantise().means, model.means) <= 0.51 * 2.0**-codes.fractional_bits
     assert reach > 2048 or codes.fractional_bits == 12
 
 
 def test_spz_refuses_models_that_are_too_large() -> None:
     model = model_of(3, 0)
     with pytest.raises(OutputError, match="up to 8,388,607 world units"):
-        spz.quantise(replace(model, means=model.means * 1e9))
+        SpzCodes.quantise(replace(model, means=model.means * 1e9))
 
 
 def test_equal_gaussians_and_zero_quaternions() -> None:
     model = model_of(2, 3)[torch.ones(300, dtype=torch.long)]
     model = replace(model, quats=torch.zeros(300, 4))
-    for module in (spz, compressed_ply, sog):
-        found = module.dequantise(module.quantise(model))
+    for codes in (SpzCodes, CompressedPlyCodes, SogCodes):
+        found = codes.quantise(model).dequantise()
         assert_close(found, replace(model, quats=torch.tensor([[1.0, 0, 0, 0]]).expand(300, 4)), 0.07)
 
 

@@ -22,7 +22,7 @@ from PIL import Image
 from files.formats.examples import model_of
 from keyss.core import InputError
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
-from keyss.files.formats import spz
+from keyss.files.formats.spz import SpzCodes
 from mutations import attempt, damaged, examples
 
 MODEL = model_of(60, 1)
@@ -97,8 +97,8 @@ def test_a_gzip_bomb() -> None:
 
 def test_a_zstd_bomb() -> None:
     """Of a stream that is longer than the header announces, only the announced size is unpacked."""
-    codes = replace(spz.quantise(MODEL), version=4)
-    data = spz.serialise(codes)
+    codes = replace(SpzCodes.quantise(MODEL), version=4)
+    data = codes.serialise()
     bomb = zstandard.ZstdCompressor().compress(bytes(200 * MEGABYTE))
     old = struct.unpack_from("<Q", data, 32)[0]
     start = 32 + 6 * 16

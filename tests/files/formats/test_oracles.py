@@ -14,7 +14,9 @@ import torch
 from files.formats.examples import assert_close, model_of
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
-from keyss.files.formats import compressed_ply, glb, spz
+from keyss.files.formats import glb, spz
+from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.spz import SpzCodes
 
 Transform = Callable[..., Path]
 DEGREES = pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -83,8 +85,8 @@ def test_spz_has_the_codes_of_splat_transforms(
     """It uses the format's own library."""
     model = model_of(600, degree)
     write_model(tmp_path / "in.ply", model)
-    theirs = spz.parse(splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes())
-    assert replace(spz.quantise(model), version=4) == theirs
+    theirs = SpzCodes.parse(splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes())
+    assert replace(SpzCodes.quantise(model), version=4) == theirs
 
 
 @DEGREES
@@ -94,10 +96,10 @@ def test_compressed_ply_has_the_codes_of_splat_transforms(
     model = model_of(600, degree)
     write_model(tmp_path / "in.ply", model)
     theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
-    codes = compressed_ply.parse(theirs)
-    order = torch.cdist(compressed_ply.dequantise(codes).means, model.means).argmin(dim=1)
+    codes = CompressedPlyCodes.parse(theirs)
+    order = torch.cdist(codes.dequantise().means, model.means).argmin(dim=1)
     assert len(order.unique()) == 600
-    assert compressed_ply.quantise(model[order]) == codes
+    assert CompressedPlyCodes.quantise(model[order]) == codes
 
 
 def test_the_order_in_chunks_is_as_good_as_splat_transforms(
@@ -108,10 +110,10 @@ def test_the_order_in_chunks_is_as_good_as_splat_transforms(
     theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
 
     def extent(data: bytes) -> float:
-        bounds = compressed_ply.parse(data).bounds
+        bounds = CompressedPlyCodes.parse(data).bounds
         return float((bounds[:, 3:6] - bounds[:, :3]).mean())
 
-    assert extent(compressed_ply.write_compressed_ply(model)) < 1.02 * extent(theirs)
+    assert extent(CompressedPlyCodes.write(model)) < 1.02 * extent(theirs)
 
 
 @DEGREES
@@ -165,10 +167,10 @@ def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
 
 def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
     """It reads this version and does not write it."""
-    codes = spz.quantise(model_of(300, 1))
+    codes = SpzCodes.quantise(model_of(300, 1))
     codes = replace(codes, version=2, largest=np.full_like(codes.largest, 3), rotations=codes.rotations & 63)
     codes = replace(codes, rotations=codes.rotations + np.uint16(100))
-    (tmp_path / "a.spz").write_bytes(spz.serialise(codes))
+    (tmp_path / "a.spz").write_bytes(codes.serialise())
     assert_close(
         read_model(tmp_path / "a.spz"), of_gsply(gsply.read_spz(tmp_path / "a.spz"), turned=True), 1e-5
     )
@@ -185,7 +187,7 @@ def test_we_read_gsplys_compressed_ply(tmp_path: Path, degree: int) -> None:
 @DEGREES
 def test_glb_comes_back(degree: int) -> None:
     model = model_of(150, degree)
-    found = glb.read_glb(glb.write_glb(model))
+    found = glb.read(glb.write(model))
     assert_close(found, model, 1e-6)
     assert torch.equal(found.means, model.means)
     assert torch.equal(found.sh, model.sh)

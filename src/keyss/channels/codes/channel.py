@@ -18,7 +18,7 @@ import numpy as np
 
 from keyss.channels.base import Content, Payload, RoomEstimate, SaltedReader
 from keyss.channels.codes import syndromes
-from keyss.channels.codes.fields import FORMATS, Field, Flags, Levels, format_of
+from keyss.channels.codes.fields import FORMATS, Field, Flags, Levels, carrying
 from keyss.channels.codes.kept import changeable
 from keyss.channels.codes.layout import (
     SLOT_BYTES,
@@ -36,7 +36,7 @@ from keyss.channels.mixing import random_fractions, random_order, random_words
 from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack_payload
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
-from keyss.files.formats.common import CodedGaussians, Codes, in_morton_order, writable
+from keyss.files.formats.common import CodedGaussians, Codes
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
@@ -64,11 +64,7 @@ class CodesChannel:
 
     def prepare(self, cover: Gaussians) -> CodesCover:
         """The room in the codes of a model; a model read from a file of this format keeps its codes."""
-        format_ = FORMATS[self.format]
-        if isinstance(cover, CodedGaussians) and format_of(cover.codes) is format_:
-            return CodesCover.of(cover.codes)
-        model = writable(cover)
-        return CodesCover.of(format_.quantise(in_morton_order(model) if format_.sorts else model))
+        return CodesCover.of(FORMATS[self.format].of(cover))
 
     def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
         return RoomEstimate(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _OVERHEAD)
@@ -96,7 +92,7 @@ class CodesCover:
         if not cover.room.slots or cover.rate < ZONE_RATE:
             raise InputError(
                 f"a model of {cover.carriers:,} Gaussians has no room for secrets in the codes of "
-                f"{format_of(codes).name} files"
+                f"{codes.name} files"
             )
         return cover
 
@@ -126,7 +122,7 @@ class CodesCover:
 
     @property
     def cover(self) -> CodedGaussians:
-        return _model_of(self.codes)
+        return CodedGaussians.of(self.codes)
 
     @property
     def carriers(self) -> int:
@@ -145,7 +141,7 @@ class CodesCover:
             check_keys([key.verifier() for key in keys])
             embedded = self._embedded(list(zip(keys, packed, strict=True)), salt, own)
             if embedded is not None:
-                return _model_of(embedded)
+                return CodedGaussians.of(embedded)
         raise RuntimeError("no block order was found in which all blocks have room")
 
     def _embedded(
@@ -196,7 +192,7 @@ class CodesCover:
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)
         attributes = {name: np.stack(each, axis=1) for name, each in columns.items()}
-        written: Codes = format_of(self.codes).with_levels(self.codes, attributes)
+        written: Codes = carrying(self.codes).with_levels(self.codes, attributes)
         return written
 
 
@@ -211,7 +207,7 @@ class CodesReader(SaltedReader):
 
     @staticmethod
     def of(codes: Codes) -> CodesReader | None:
-        """None for codes without room. Raises InputError for other formats."""
+        """None for codes without room."""
         _, fields = in_counted_order(codes)
         room = _zones(fields)
         if not room.slots:
@@ -235,11 +231,6 @@ class CodesReader(SaltedReader):
             if header is None:
                 raise WrongKeyError() from None
             raise
-
-
-def _model_of(codes: Codes) -> CodedGaussians:
-    """The model that codes stand for, with them."""
-    return CodedGaussians.of(format_of(codes).dequantise(codes), codes)
 
 
 def _zones(fields: Sequence[Field]) -> Zones:

@@ -19,9 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.core.errors import InputError
-from keyss.core.gaussians import Gaussians
-from keyss.files.formats import compressed_ply, sog, spz
 from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
@@ -81,24 +78,18 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Format:
-    """How codes of one kind carry."""
+class Carrying:
+    """How codes of one format carry."""
 
-    name: str  # as users know it
     fields: Callable[[Any], list[Field]]
     with_levels: Callable[[Any, Mapping[str, Levels]], Any]  # codes with new levels of some fields
     # Least and largest level of a rotation's parts: -sqrt(1/2) and sqrt(1/2).
     rotations: tuple[int, int]
-    dequantise: Callable[[Any], Gaussians]
-    quantise: Callable[[Gaussians], Any]
-    sorts: bool = True  # True if its writer sorts models
 
 
-def format_of(codes: Codes) -> Format:
-    """The format of codes. Raises InputError for formats whose codes carry nothing."""
-    if type(codes) not in _FORMATS:
-        raise InputError(f"nothing can be carried in the codes of this format: expected {', '.join(FORMATS)}")
-    return _FORMATS[type(codes)]
+def carrying(codes: Codes) -> Carrying:
+    """How these codes carry."""
+    return _CARRYING[type(codes)]
 
 
 def sog_distances(codes: SogCodes, levels: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
@@ -154,21 +145,12 @@ def _replaced(codes: Any, levels: Mapping[str, Levels]) -> Any:
     )
 
 
-_FORMATS: dict[type[Codes], Format] = {
-    SpzCodes: Format(
-        "spz", _spz_fields, _spz_with_levels, (-511, 511), spz.dequantise, spz.quantise, sorts=False
-    ),
-    SogCodes: Format("sog", _sog_fields, _replaced, (0, 255), sog.dequantise, sog.quantise),
-    CompressedPlyCodes: Format(
-        "compressed-ply",
-        _compressed_ply_fields,
-        _replaced,
-        (0, 1023),
-        compressed_ply.dequantise,
-        compressed_ply.quantise,
-    ),
+_CARRYING: dict[type[Codes], Carrying] = {
+    SpzCodes: Carrying(_spz_fields, _spz_with_levels, (-511, 511)),
+    SogCodes: Carrying(_sog_fields, _replaced, (0, 255)),
+    CompressedPlyCodes: Carrying(_compressed_ply_fields, _replaced, (0, 1023)),
 }
-FORMATS = {each.name: each for each in _FORMATS.values()}
+FORMATS = {each.name: each for each in _CARRYING}
 
 
 def _middle(values: npt.NDArray[Any]) -> Doubles:

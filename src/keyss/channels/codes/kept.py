@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from keyss.channels.codes.fields import Doubles, Field, Flags, Levels, format_of, sog_distances
+from keyss.channels.codes.fields import Doubles, Field, Flags, Levels, carrying, sog_distances
 from keyss.channels.mixing import random_fractions
 from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
@@ -52,7 +52,7 @@ def _alone(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     change grows smoothly with the distance in sizes of the Gaussian. A Gaussian that has a written attribute
     in common with a neighbour never changes.
     """
-    model = format_of(codes).dequantise(codes)
+    model = codes.dequantise()
     means, log_scales = (each.double().numpy() for each in (model.means, model.log_scales))
     sizes = np.exp(np.sort(log_scales, axis=1)[:, 1])
     distance, near = cKDTree(means).query(means, k=min(_NEIGHBOURS + 1, len(means)))
@@ -69,7 +69,7 @@ def _room(codes: Codes, field: Field) -> Doubles:
     """[N] how many levels lie between the reach of each and the nearest limit; negative for none."""
     least, largest = field.levels.min(), field.levels.max()
     if field.name == "rotations":
-        least, largest = format_of(codes).rotations
+        least, largest = carrying(codes).rotations
     elif isinstance(codes, CompressedPlyCodes):
         least, largest = 0, (2047, 1023, 2047)[field.column]
     room: Doubles = np.minimum(field.levels - least, largest - field.levels) - 1.0
@@ -94,7 +94,7 @@ def _turnable(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     own = [each for each in fields if each.name == "rotations"]
     if not own:
         return np.ones(len(random), np.bool_)
-    least, largest = format_of(codes).rotations
+    least, largest = carrying(codes).rotations
     parts = np.abs(np.stack([each.levels for each in own], axis=1) - (least + largest) / 2)
     parts += np.stack([each.reach for each in own], axis=1)
     rest = np.sqrt(np.maximum(0.0, (largest - least) ** 2 / 2 - np.square(parts).sum(axis=1)))

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.codes.fields import Field, Flags, format_of, sog_distances
+from keyss.channels.codes.fields import Field, Flags, carrying, sog_distances
 from keyss.channels.mixing import row_hashes
 from keyss.files.formats.common import Codes, Floats, morton_order
-from keyss.files.formats.sog import SogCodes, positions_of
+from keyss.files.formats.sog import SogCodes
 
 Rows = npt.NDArray[np.intp]
 
@@ -28,10 +28,10 @@ def in_counted_order(codes: Codes) -> tuple[Any, list[Field]]:
     Gaussians of a .sog that are alike in all codes that are not written carry nothing.
     """
     if not isinstance(codes, SogCodes):
-        return codes, format_of(codes).fields(codes)
+        return codes, carrying(codes).fields(codes)
     rows, alike = _sog_order(codes)
     codes = _taken(codes, rows)
-    fields = format_of(codes).fields(codes)
+    fields = carrying(codes).fields(codes)
     return codes, [replace(each, bits=np.where(alike, 0, each.bits)) for each in fields]
 
 
@@ -45,7 +45,7 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
         return codes
     levels = codes.positions
     extreme = (levels == levels.min(axis=0)) | (levels == levels.max(axis=0))
-    means: Floats = positions_of(codes, levels + np.where(extreme, 0.0, within)).astype(np.float32)
+    means: Floats = codes.positions_at(levels + np.where(extreme, 0.0, within)).astype(np.float32)
     return _taken(codes, morton_order(means))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +25,51 @@ SMALL_COUNT = 1 << 18
 _MORTON_BITS = 21  # per axis
 
 
-class Codes:
-    """Base of a format's codes: dataclasses of numbers and arrays, which compare by value."""
+class Codes(ABC):
+    """The numbers of a file in a lossy format: base of dataclasses of arrays, which compare by value.
+
+    `parse` and `serialise` convert between bytes and codes, exactly; `quantise` and `dequantise` between
+    models and codes.
+    """
+
+    name: ClassVar[str]  # of the format, as users know it
+    sorts: ClassVar[bool] = True  # its writer sorts models
+
+    @classmethod
+    @abstractmethod
+    def parse(cls, data: bytes) -> Self:
+        """The codes of a file. Raises InputError if it is not complete."""
+
+    @abstractmethod
+    def serialise(self) -> bytes:
+        """A file of the codes."""
+
+    @classmethod
+    @abstractmethod
+    def quantise(cls, model: Gaussians) -> Self:
+        """The codes nearest to a model, in its order. Raises OutputError for what the format cannot hold."""
+
+    @abstractmethod
+    def dequantise(self) -> Gaussians:
+        """The model in the frame of a .ply. Raises InputError if it is not finite."""
+
+    @classmethod
+    def of(cls, model: Gaussians) -> Self:
+        """The codes of the model's file if it has this format, else as a writer sorts and quantises it."""
+        if isinstance(model, CodedGaussians) and isinstance(model.codes, cls):
+            return model.codes
+        model = writable(model)
+        return cls.quantise(in_morton_order(model) if cls.sorts else model)
+
+    @classmethod
+    def read(cls, data: bytes) -> CodedGaussians:
+        """The model in a file. Raises InputError."""
+        return CodedGaussians.of(cls.parse(data))
+
+    @classmethod
+    def write(cls, model: Gaussians) -> bytes:
+        """A model as a file. Raises OutputError."""
+        return cls.of(model).serialise()
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
@@ -47,15 +91,16 @@ class CodedGaussians(Gaussians):
     codes: Codes
 
     @staticmethod
-    def of(model: Gaussians, codes: Codes) -> CodedGaussians:
-        """`model`, decoded from `codes`."""
+    def of(codes: Codes, model: Gaussians | None = None) -> CodedGaussians:
+        """The model that `codes` stand for; `model` is the same, decoded before."""
+        model = codes.dequantise() if model is None else model
         found = CodedGaussians(*(getattr(model, each.name) for each in fields(model)))
         object.__setattr__(found, "codes", codes)
         return found
 
     def to(self, device: torch.device | str) -> Gaussians:
         moved = super().to(device)
-        return CodedGaussians.of(moved, self.codes) if hasattr(self, "codes") else moved  # after `replace`
+        return CodedGaussians.of(self.codes, moved) if hasattr(self, "codes") else moved  # after `replace`
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -88,15 +133,15 @@ def gaussians_of(
     means: npt.NDArray[Any],
     quats: npt.NDArray[Any],
     log_scales: npt.NDArray[Any],
-    opacity_logits: npt.NDArray[Any],
+    opacities: npt.NDArray[Any],
     colors: npt.NDArray[Any],
     rest: npt.NDArray[Any],
 ) -> Gaussians:
-    """A model from arrays: `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the other harmonics.
+    """A model from arrays: `opacities` in [0, 1]; `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the others.
 
     Raises InputError for values that are not finite in single precision.
     """
-    parts = (means, quats, log_scales, opacity_logits, np.concatenate([colors[:, None], rest], axis=1))
+    parts = (means, quats, log_scales, _logits(opacities), np.concatenate([colors[:, None], rest], axis=1))
     with np.errstate(over="ignore", invalid="ignore"):
         model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
     wrong = [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
@@ -123,28 +168,22 @@ def writable(model: Gaussians) -> Gaussians:
     return flat
 
 
-def arrays_of(model: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """The arguments of `gaussians_of`, from a model on any device."""
+def arrays_of(model: Gaussians) -> tuple[Floats, Doubles, Floats, Doubles, Floats, Floats]:
+    """The arguments of `gaussians_of` with unit quaternions, from a model on any device."""
     flat = model.detach().to("cpu")
-    sh = flat.sh.numpy()
-    parts = (flat.means, flat.quats, flat.log_scales, flat.opacity_logits)
-    means, quats, log_scales, opacity_logits = (each.numpy() for each in parts)
-    return means, quats, log_scales, opacity_logits, sh[:, 0], sh[:, 1:]
+    parts = (flat.means, flat.quats, flat.log_scales, flat.opacity_logits, flat.sh)
+    means, quats, log_scales, opacity_logits, sh = (each.numpy() for each in parts)
+    with np.errstate(over="ignore"):
+        opacities = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
+    return means, unit(quats), log_scales, opacities, sh[:, 0], sh[:, 1:]
 
 
-def logits(opacities: npt.NDArray[Any]) -> Doubles:
+def _logits(opacities: npt.NDArray[Any]) -> Doubles:
     """Opacity logits of opacities in [0, 1], clipped to +-OPACITY_LOGIT_BOUND."""
     values = np.asarray(opacities, dtype=np.float64)
     with np.errstate(divide="ignore"):
         found: Doubles = np.log(values) - np.log1p(-values)
     return found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
-
-
-def opacities(opacity_logits: Floats) -> Doubles:
-    """[N] opacities in [0, 1]."""
-    with np.errstate(over="ignore"):
-        found: Doubles = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
-    return found
 
 
 def rounded(values: npt.NDArray[Any]) -> Doubles:

@@ -2,7 +2,7 @@
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply/#compressed-ply. Positions, log
 scales and colours are quantised between the bounds of their chunk, hence the finer the closer the Gaussians
-of a chunk are: `write_compressed_ply` sorts them.
+of a chunk are: `write` sorts them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.formats.common import (
     Bytes,
-    CodedGaussians,
     Codes,
     Doubles,
     Floats,
@@ -28,12 +27,8 @@ from keyss.files.formats.common import (
     f_dc_of,
     from_smallest_three,
     gaussians_of,
-    in_morton_order,
-    logits,
-    opacities,
     smallest_three,
     to_bytes,
-    unit,
 )
 from keyss.files.ply_table import ply_header, read_tables
 
@@ -53,7 +48,9 @@ _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 @dataclass(frozen=True, eq=False)
 class CompressedPlyCodes(Codes):
-    """All numbers of a file; Gaussian i is in chunk i // 256. `dequantise` decodes them."""
+    """All numbers of a file; Gaussian i is in chunk i // 256."""
+
+    name = "compressed-ply"
 
     bounds: Floats  # [C, 18] smallest, then largest x y z; log scales; r g b (0 to 1: of f_dc * SH_C0 + 0.5)
     positions: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
@@ -67,106 +64,90 @@ class CompressedPlyCodes(Codes):
     def __len__(self) -> int:
         return len(self.positions)
 
+    @classmethod
+    def parse(cls, data: bytes) -> Self:
+        """See `Codes`. Old files have no bounds of colours, which are then 0 and 1."""
+        tables = read_tables(io.BytesIO(data))
+        vertex, chunk = tables["vertex"], tables.get("chunk")
+        n = len(vertex)
+        if chunk is None or not _has(vertex, _PACKED, "u4") or not _has(chunk, _BOUNDS[:12], "f4"):
+            raise InputError(
+                "not a compressed .ply: expected chunks of floats and vertices of packed integers"
+            )
+        if n == 0:
+            raise InputError("it holds no Gaussians")
+        if len(chunk) != -(-n // CHUNK):
+            raise InputError(f"expected {-(-n // CHUNK):,} chunks of {n:,} Gaussians, found {len(chunk):,}")
+        bounds = np.tile(np.repeat(np.array([0, 1], np.float32), 3), (len(chunk), 3))
+        for column, name in enumerate(_BOUNDS if _has(chunk, _BOUNDS, "f4") else _BOUNDS[:12]):
+            bounds[:, column] = chunk[name]
+        position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
+        return cls(
+            bounds=bounds,
+            positions=_fields(position, _VECTOR).astype(np.uint16),
+            largest=(rotation >> 30).astype(np.uint8),
+            rotations=_fields(rotation, (10, 10, 10)).astype(np.uint16),
+            scales=_fields(scale, _VECTOR).astype(np.uint16),
+            colors=_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
+            alphas=(color & 255).astype(np.uint8),
+            sh=_harmonics(tables.get("sh"), n),
+        )
 
-def parse(data: bytes) -> CompressedPlyCodes:
-    """The codes of a file; old files have no bounds of colours, which are then 0 and 1.
+    def serialise(self) -> bytes:
+        """See `Codes`."""
+        n, k = self.sh.shape[:2]
+        packed = np.empty((n, 4), dtype="<u4")
+        packed[:, 0] = _joined(self.positions, _VECTOR)
+        packed[:, 1] = self.largest.astype(np.uint32) << 30 | _joined(self.rotations, (10, 10, 10))
+        packed[:, 2] = _joined(self.scales, _VECTOR)
+        packed[:, 3] = _joined(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
+        elements = {
+            "chunk": (len(self.bounds), [f"float {name}" for name in _BOUNDS]),
+            "vertex": (n, [f"uint {name}" for name in _PACKED]),
+        }
+        if k:
+            elements["sh"] = (n, [f"uchar f_rest_{i}" for i in range(3 * k)])
+        harmonics = self.sh.transpose(0, 2, 1).tobytes()
+        return ply_header(elements) + self.bounds.astype("<f4").tobytes() + packed.tobytes() + harmonics
 
-    Raises InputError if it is not a complete compressed .ply.
-    """
-    tables = read_tables(io.BytesIO(data))
-    vertex, chunk = tables["vertex"], tables.get("chunk")
-    n = len(vertex)
-    if chunk is None or not _has(vertex, _PACKED, "u4") or not _has(chunk, _BOUNDS[:12], "f4"):
-        raise InputError("not a compressed .ply: expected chunks of floats and vertices of packed integers")
-    if n == 0:
-        raise InputError("it holds no Gaussians")
-    if len(chunk) != -(-n // CHUNK):
-        raise InputError(f"expected {-(-n // CHUNK):,} chunks of {n:,} Gaussians, found {len(chunk):,}")
-    bounds = np.tile(np.repeat(np.array([0, 1], np.float32), 3), (len(chunk), 3))
-    for column, name in enumerate(_BOUNDS if _has(chunk, _BOUNDS, "f4") else _BOUNDS[:12]):
-        bounds[:, column] = chunk[name]
-    position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
-    return CompressedPlyCodes(
-        bounds=bounds,
-        positions=_fields(position, _VECTOR).astype(np.uint16),
-        largest=(rotation >> 30).astype(np.uint8),
-        rotations=_fields(rotation, (10, 10, 10)).astype(np.uint16),
-        scales=_fields(scale, _VECTOR).astype(np.uint16),
-        colors=_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
-        alphas=(color & 255).astype(np.uint8),
-        sh=_harmonics(tables.get("sh"), n),
-    )
+    @classmethod
+    def quantise(cls, model: Gaussians) -> Self:
+        """See `Codes`."""
+        means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
+        colors = f_dc.astype(np.float64) * SH_C0 + 0.5
+        parts = [means.astype(np.float64), log_scales.astype(np.float64), colors]
+        bounds = np.concatenate([_bounds(each) for each in parts], axis=1)
+        bounds[:, 6:12] = bounds[:, 6:12].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
+        bounds = bounds.astype(np.float32)
+        ends = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
+        position, scale, color = (_share(ends[:, i], values) for i, values in enumerate(parts))
+        largest, others = smallest_three(quats)
+        steps = 2.0 ** np.array(_VECTOR) - 1
+        return cls(
+            bounds=bounds,
+            positions=np.floor(position * steps + 0.5).astype(np.uint16),
+            largest=largest,
+            rotations=to_bytes((others * np.sqrt(0.5) + 0.5) * 1023, 1023),
+            scales=np.floor(scale * steps + 0.5).astype(np.uint16),
+            colors=to_bytes(color * 255),
+            alphas=to_bytes(opacities * 255),
+            sh=to_bytes(np.trunc((rest.astype(np.float64) / 8 + 0.5) * 256)),
+        )
 
-
-def serialise(codes: CompressedPlyCodes) -> bytes:
-    """A file of the codes."""
-    n, k = codes.sh.shape[:2]
-    packed = np.empty((n, 4), dtype="<u4")
-    packed[:, 0] = _joined(codes.positions, _VECTOR)
-    packed[:, 1] = codes.largest.astype(np.uint32) << 30 | _joined(codes.rotations, (10, 10, 10))
-    packed[:, 2] = _joined(codes.scales, _VECTOR)
-    packed[:, 3] = _joined(codes.colors, (8, 8, 8)) << np.uint32(8) | codes.alphas
-    elements = {
-        "chunk": (len(codes.bounds), [f"float {name}" for name in _BOUNDS]),
-        "vertex": (n, [f"uint {name}" for name in _PACKED]),
-    }
-    if k:
-        elements["sh"] = (n, [f"uchar f_rest_{i}" for i in range(3 * k)])
-    harmonics = codes.sh.transpose(0, 2, 1).tobytes()
-    return ply_header(elements) + codes.bounds.astype("<f4").tobytes() + packed.tobytes() + harmonics
-
-
-def dequantise(codes: CompressedPlyCodes) -> Gaussians:
-    """Decode codes to a model. Raises InputError for bounds that are not finite."""
-    bounds = codes.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(codes)].reshape(-1, 3, 2, 3)
-    steps = 2.0 ** np.array(_VECTOR) - 1
-    rotations = (codes.rotations / 1023 - 0.5) * np.sqrt(2)
-    harmonics = np.where(codes.sh == 0, 0.0, np.where(codes.sh == 255, 256.0, codes.sh + 0.5))
-    return gaussians_of(
-        _between(bounds[:, 0], codes.positions / steps),
-        from_smallest_three(codes.largest, rotations),
-        _between(bounds[:, 1], codes.scales / steps),
-        logits(codes.alphas / 255),
-        f_dc_of(_between(bounds[:, 2], codes.colors / 255)),
-        harmonics / 32 - 4,
-    )
-
-
-def quantise(model: Gaussians) -> CompressedPlyCodes:
-    """The codes of a model, in its order."""
-    means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
-    colors = f_dc.astype(np.float64) * SH_C0 + 0.5
-    parts = [means.astype(np.float64), log_scales.astype(np.float64), colors]
-    bounds = np.concatenate([_bounds(each) for each in parts], axis=1)
-    bounds[:, 6:12] = bounds[:, 6:12].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
-    bounds = bounds.astype(np.float32)
-    ends = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
-    position, scale, color = (_share(ends[:, i], values) for i, values in enumerate(parts))
-    largest, others = smallest_three(unit(quats))
-    steps = 2.0 ** np.array(_VECTOR) - 1
-    return CompressedPlyCodes(
-        bounds=bounds,
-        positions=np.floor(position * steps + 0.5).astype(np.uint16),
-        largest=largest,
-        rotations=to_bytes(np.floor((others * np.sqrt(0.5) + 0.5) * 1023 + 0.5), 1023),
-        scales=np.floor(scale * steps + 0.5).astype(np.uint16),
-        colors=to_bytes(np.floor(color * 255 + 0.5)),
-        alphas=to_bytes(np.floor(opacities(opacity_logits) * 255 + 0.5)),
-        sh=to_bytes(np.trunc((rest.astype(np.float64) / 8 + 0.5) * 256)),
-    )
-
-
-def read_compressed_ply(data: bytes) -> CodedGaussians:
-    """The model in a file. Raises InputError."""
-    codes = parse(data)
-    return CodedGaussians.of(dequantise(codes), codes)
-
-
-def write_compressed_ply(model: Gaussians) -> bytes:
-    """A model as a file, sorted so that the Gaussians of a chunk are close together."""
-    if isinstance(model, CodedGaussians) and isinstance(model.codes, CompressedPlyCodes):
-        return serialise(model.codes)
-    return serialise(quantise(in_morton_order(model)))
+    def dequantise(self) -> Gaussians:
+        """See `Codes`."""
+        bounds = self.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(self)].reshape(-1, 3, 2, 3)
+        steps = 2.0 ** np.array(_VECTOR) - 1
+        rotations = (self.rotations / 1023 - 0.5) * np.sqrt(2)
+        harmonics = np.where(self.sh == 0, 0.0, np.where(self.sh == 255, 256.0, self.sh + 0.5))
+        return gaussians_of(
+            _between(bounds[:, 0], self.positions / steps),
+            from_smallest_three(self.largest, rotations),
+            _between(bounds[:, 1], self.scales / steps),
+            self.alphas / 255,
+            f_dc_of(_between(bounds[:, 2], self.colors / 255)),
+            harmonics / 32 - 4,
+        )
 
 
 def _has(table: npt.NDArray[np.void], names: list[str], code: str) -> bool:

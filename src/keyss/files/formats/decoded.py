@@ -24,7 +24,7 @@ FORMAT = "keyss-decoded/1"
 _NAMES = tuple(each.name for each in fields(Gaussians))
 
 
-def write_decoded(model: DecodedGaussians) -> bytes:
+def write(model: DecodedGaussians) -> bytes:
     """The bytes of a file. Raises OutputError for a model that is empty or not finite."""
     tensors = {name: getattr(model, name) for name in _NAMES} | {"background": model.network.background}
     if model.features is not None:
@@ -39,8 +39,8 @@ def write_decoded(model: DecodedGaussians) -> bytes:
     return safetensors.torch.save(kept, {"format": FORMAT})
 
 
-def read_decoded(data: bytes) -> Gaussians:
-    """The model of `write_decoded`. Raises InputError."""
+def read(data: bytes) -> Gaussians:
+    """The model of `write`. Raises InputError."""
     try:
         return _of_tensors(safetensors.torch.load(data))
     except (safetensors.SafetensorError, ValueError, KeyError, IndexError, RuntimeError) as error:

@@ -30,12 +30,11 @@ from keyss.files.formats.common import (
     colour_bytes,
     gaussians_of,
     log_scales_of,
-    logits,
-    opacities,
     reason,
     scales_of,
     to_bytes,
     unit,
+    writable,
 )
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -105,7 +104,7 @@ class _Document(msgspec.Struct, omit_defaults=True):
     meshes: list[_Mesh] = []
 
 
-def read_glb(data: bytes) -> Gaussians:
+def read(data: bytes) -> Gaussians:
     """All Gaussians of a file's scene, as one model in the frame of a .ply.
 
     Raises InputError for a file without Gaussians or with compressed ones.
@@ -128,15 +127,14 @@ def read_glb(data: bytes) -> Gaussians:
     return Gaussians.cat([part.with_sh_degree(degree) for part in parts])
 
 
-def write_glb(model: Gaussians) -> bytes:
+def write(model: Gaussians) -> bytes:
     """A model as a file, with colours for programs that only know points."""
-    means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
-    alphas = opacities(opacity_logits)
+    means, quats, log_scales, alphas, f_dc, rest = arrays_of(writable(model))
     colors = np.concatenate([colour_bytes(f_dc), to_bytes(alphas * 255)[:, None]], axis=1)
     attributes = {
         "POSITION": means,
         "COLOR_0": colors,
-        f"{EXTENSION}:ROTATION": np.roll(unit(quats), -1, axis=1),
+        f"{EXTENSION}:ROTATION": np.roll(quats, -1, axis=1),
         f"{EXTENSION}:SCALE": scales_of(log_scales),
         f"{EXTENSION}:OPACITY": alphas,
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": f_dc,
@@ -267,7 +265,7 @@ def _gaussians(document: _Document, primitive: _Primitive, binary: bytes) -> Gau
         raise InputError("damaged glTF: opacities outside of 0 to 1")
     rest = np.stack(sh[1:], axis=1) if degree else np.empty((len(means), 0, 3))
     wxyz = unit(np.roll(quats, 1, axis=1))
-    return gaussians_of(means, wxyz, log_scales_of(scales), logits(alphas), sh[0], rest)
+    return gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest)
 
 
 def _values(document: _Document, index: int, width: int, binary: bytes) -> Doubles:

@@ -1,14 +1,13 @@
 """SOG, PlayCanvas's format that stores attributes as images: reads and writes version 2.
 
-https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/. `parse` and `serialise` turn
-files into codes and back; `sog_bundle` handles the archive and its images.
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -20,7 +19,6 @@ from keyss.files.formats import sog_bundle as bundle
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
     Bytes,
-    CodedGaussians,
     Codes,
     Doubles,
     Floats,
@@ -30,12 +28,8 @@ from keyss.files.formats.common import (
     check_sh_degree,
     from_smallest_three,
     gaussians_of,
-    in_morton_order,
-    logits,
-    opacities,
     smallest_three,
     to_bytes,
-    unit,
 )
 
 _MAX_POSITION = 65535  # the largest code of a position
@@ -46,7 +40,9 @@ _MAX_LABELS = 65536
 
 @dataclass(frozen=True, eq=False)
 class SogCodes(Codes):
-    """All numbers of a file; `dequantise` decodes them."""
+    """All numbers of a file."""
+
+    name = "sog"
 
     mins: Doubles  # [3] smallest positions, as sign(x) ln(|x| + 1)
     maxs: Doubles  # [3] largest positions, likewise
@@ -65,160 +61,140 @@ class SogCodes(Codes):
     def __len__(self) -> int:
         return len(self.positions)
 
+    @classmethod
+    def parse(cls, data: bytes) -> Self:
+        """See `Codes`: of version 2."""
+        file = bundle.opened(data)
+        meta = bundle.read_meta(file("meta.json"))
+        n = meta.count
+        check_count(n, len(data))
 
-def parse(data: bytes) -> SogCodes:
-    """The codes of a .sog. Raises InputError if it is not a complete SOG of version 2."""
-    file = bundle.opened(data)
-    meta = bundle.read_meta(file("meta.json"))
-    n = meta.count
-    check_count(n, len(data))
+        def image(names: list[str], index: int = 0) -> Bytes:
+            """[N, 4] the first N pixels, RGBA."""
+            return bundle.pixels(file(names[index]), n)
 
-    def image(names: list[str], index: int = 0) -> Bytes:
-        """[N, 4] the first N pixels, RGBA."""
-        return bundle.pixels(file(names[index]), n)
+        low, high = image(meta.means.files), image(meta.means.files, 1)
+        quats, colors = image(meta.quats.files), image(meta.sh0.files)
+        if (quats[:, 3] < _LARGEST).any():
+            raise InputError("damaged SOG: expected 252 to 255 in the fourth channel of its quaternions")
+        sh_codebook, palette, labels = _no_harmonics(n)
+        if meta.shN is not None and meta.shN.bands:
+            k = check_sh_degree(meta.shN.bands)
+            sh_codebook = _codebook(meta.shN.codebook)
+            pair = image(meta.shN.files, 1)
+            labels = _joined(pair[:, 0], pair[:, 1])
+            if not int(labels.max()) < meta.shN.count <= _MAX_LABELS:
+                raise InputError("damaged SOG: labels beyond the end of its palette")
+            size = -(-meta.shN.count // _ROW) * _ROW
+            rows = bundle.pixels(file(meta.shN.files[0]), size * k, width=_ROW * k)
+            palette = rows[: meta.shN.count * k, :3].reshape(-1, k, 3).copy()
+        return cls(
+            mins=np.array(meta.means.mins, np.float64),
+            maxs=np.array(meta.means.maxs, np.float64),
+            positions=_joined(low[:, :3], high[:, :3]),
+            largest=quats[:, 3] - np.uint8(_LARGEST),
+            rotations=quats[:, :3].copy(),
+            scale_codebook=_codebook(meta.scales.codebook),
+            scales=image(meta.scales.files)[:, :3].copy(),
+            color_codebook=_codebook(meta.sh0.codebook),
+            colors=colors[:, :3].copy(),
+            alphas=colors[:, 3].copy(),
+            sh_codebook=sh_codebook,
+            palette=palette,
+            labels=labels,
+        )
 
-    low, high = image(meta.means.files), image(meta.means.files, 1)
-    quats, colors = image(meta.quats.files), image(meta.sh0.files)
-    if (quats[:, 3] < _LARGEST).any():
-        raise InputError("damaged SOG: expected 252 to 255 in the fourth channel of its quaternions")
-    sh_codebook, palette, labels = (
-        np.empty(0, np.float32),
-        np.empty((1, 0, 3), np.uint8),
-        np.zeros(n, np.uint16),
-    )
-    if meta.shN is not None and meta.shN.bands:
-        k = check_sh_degree(meta.shN.bands)
-        sh_codebook = _codebook(meta.shN.codebook)
-        pair = image(meta.shN.files, 1)
-        labels = _joined(pair[:, 0], pair[:, 1])
-        if not int(labels.max()) < meta.shN.count <= _MAX_LABELS:
-            raise InputError("damaged SOG: labels beyond the end of its palette")
-        size = -(-meta.shN.count // _ROW) * _ROW
-        rows = bundle.pixels(file(meta.shN.files[0]), size * k, width=_ROW * k)
-        palette = rows[: meta.shN.count * k, :3].reshape(-1, k, 3).copy()
-    return SogCodes(
-        mins=np.array(meta.means.mins, np.float64),
-        maxs=np.array(meta.means.maxs, np.float64),
-        positions=_joined(low[:, :3], high[:, :3]),
-        largest=quats[:, 3] - np.uint8(_LARGEST),
-        rotations=quats[:, :3].copy(),
-        scale_codebook=_codebook(meta.scales.codebook),
-        scales=image(meta.scales.files)[:, :3].copy(),
-        color_codebook=_codebook(meta.sh0.codebook),
-        colors=colors[:, :3].copy(),
-        alphas=colors[:, 3].copy(),
-        sh_codebook=sh_codebook,
-        palette=palette,
-        labels=labels,
-    )
+    def serialise(self) -> bytes:
+        """See `Codes`."""
+        n, (p, k) = len(self), self.palette.shape[:2]
+        images = {
+            "means_l.webp": _rgba(self.positions & 255),
+            "means_u.webp": _rgba(self.positions >> 8),
+            "quats.webp": _rgba(self.rotations, self.largest + np.uint8(_LARGEST)),
+            "scales.webp": _rgba(self.scales),
+            "sh0.webp": _rgba(self.colors, self.alphas),
+        }
+        width = math.ceil(math.sqrt(n) / 4) * 4
+        files = {
+            name: bundle.webp(pixels, width, math.ceil(n / width / 4) * 4) for name, pixels in images.items()
+        }
+        harmonics = None
+        if k:
+            labels = np.stack([self.labels & 255, self.labels >> 8, np.zeros_like(self.labels)], axis=1)
+            files["shN_labels.webp"] = bundle.webp(_rgba(labels), width, math.ceil(n / width / 4) * 4)
+            palette = _rgba(self.palette.reshape(-1, 3))
+            files["shN_centroids.webp"] = bundle.webp(palette, _ROW * k, -(-p // _ROW))
+            degree = {3: 1, 8: 2, 15: 3}[k]
+            names = ["shN_centroids.webp", "shN_labels.webp"]
+            harmonics = bundle.Harmonics(p, degree, self.sh_codebook.tolist(), names)
+        meta = bundle.Meta(
+            version=2,
+            count=n,
+            means=bundle.Means(self.mins.tolist(), self.maxs.tolist(), ["means_l.webp", "means_u.webp"]),
+            scales=bundle.Book(self.scale_codebook.tolist(), ["scales.webp"]),
+            quats=bundle.Images(["quats.webp"]),
+            sh0=bundle.Book(self.color_codebook.tolist(), ["sh0.webp"]),
+            shN=harmonics,
+        )
+        return bundle.packed({**files, "meta.json": msgspec.json.encode(meta)})
 
+    @classmethod
+    def quantise(cls, model: Gaussians) -> Self:
+        """See `Codes`: with a palette of N / 2 to N vectors, at most 65,536."""
+        means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
+        n, k = rest.shape[:2]
+        logs = np.copysign(np.log1p(np.abs(means.astype(np.float64))), means)
+        mins, maxs = logs.min(axis=0), logs.max(axis=0)
+        positions = (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _MAX_POSITION
+        largest, others = smallest_three(quats)
+        scale_codebook, color_codebook = codebook_of(log_scales), codebook_of(f_dc)
+        sh_codebook, palette, labels = _no_harmonics(n)
+        if k:
+            size = min(_MAX_LABELS, 2 ** int(math.log2(n)))
+            vectors, labels = palette_of(rest.reshape(n, 3 * k), size)
+            sh_codebook = codebook_of(vectors)
+            palette = nearest(sh_codebook, vectors).reshape(-1, k, 3)
+        return cls(
+            mins=mins,
+            maxs=maxs,
+            positions=to_bytes(positions, _MAX_POSITION),
+            largest=largest,
+            rotations=to_bytes((others * np.sqrt(2) + 1) / 2 * 255),
+            scale_codebook=scale_codebook,
+            scales=nearest(scale_codebook, log_scales),
+            color_codebook=color_codebook,
+            colors=nearest(color_codebook, f_dc),
+            alphas=to_bytes(opacities * 255),
+            sh_codebook=sh_codebook,
+            palette=palette,
+            labels=labels,
+        )
 
-def serialise(codes: SogCodes) -> bytes:
-    """A .sog of the codes."""
-    n, (p, k) = len(codes), codes.palette.shape[:2]
-    images = {
-        "means_l.webp": _rgba(codes.positions & 255),
-        "means_u.webp": _rgba(codes.positions >> 8),
-        "quats.webp": _rgba(codes.rotations, codes.largest + np.uint8(_LARGEST)),
-        "scales.webp": _rgba(codes.scales),
-        "sh0.webp": _rgba(codes.colors, codes.alphas),
-    }
-    width = math.ceil(math.sqrt(n) / 4) * 4
-    files = {
-        name: bundle.webp(pixels, width, math.ceil(n / width / 4) * 4) for name, pixels in images.items()
-    }
-    harmonics = None
-    if k:
-        labels = np.stack([codes.labels & 255, codes.labels >> 8, np.zeros_like(codes.labels)], axis=1)
-        files["shN_labels.webp"] = bundle.webp(_rgba(labels), width, math.ceil(n / width / 4) * 4)
-        palette = _rgba(codes.palette.reshape(-1, 3))
-        files["shN_centroids.webp"] = bundle.webp(palette, _ROW * k, -(-p // _ROW))
-        degree = {3: 1, 8: 2, 15: 3}[k]
-        names = ["shN_centroids.webp", "shN_labels.webp"]
-        harmonics = bundle.Harmonics(p, degree, codes.sh_codebook.tolist(), names)
-    meta = bundle.Meta(
-        version=2,
-        count=n,
-        means=bundle.Means(codes.mins.tolist(), codes.maxs.tolist(), ["means_l.webp", "means_u.webp"]),
-        scales=bundle.Book(codes.scale_codebook.tolist(), ["scales.webp"]),
-        quats=bundle.Images(["quats.webp"]),
-        sh0=bundle.Book(codes.color_codebook.tolist(), ["sh0.webp"]),
-        shN=harmonics,
-    )
-    return bundle.packed({**files, "meta.json": msgspec.json.encode(meta)})
+    def dequantise(self) -> Gaussians:
+        """See `Codes`."""
+        rotations = (self.rotations / 255 * 2 - 1) * np.sqrt(0.5)
+        palette = self.sh_codebook[self.palette] if self.palette.size else np.empty((1, 0, 3), np.float32)
+        return gaussians_of(
+            self.positions_at(self.positions),
+            from_smallest_three(self.largest, rotations),
+            self.scale_codebook[self.scales],
+            self.alphas / 255,
+            self.color_codebook[self.colors],
+            palette[self.labels],
+        )
 
-
-def dequantise(codes: SogCodes) -> Gaussians:
-    """Decode codes to a model. Raises InputError if it is not finite."""
-    means = positions_of(codes, codes.positions)
-    rotations = (codes.rotations / 255 * 2 - 1) * np.sqrt(0.5)
-    palette = codes.sh_codebook[codes.palette] if codes.palette.size else np.empty((1, 0, 3), np.float32)
-    return gaussians_of(
-        means,
-        from_smallest_three(codes.largest, rotations),
-        codes.scale_codebook[codes.scales],
-        logits(codes.alphas / 255),
-        codes.color_codebook[codes.colors],
-        palette[codes.labels],
-    )
-
-
-def positions_of(codes: SogCodes, levels: npt.NDArray[Any]) -> Doubles:
-    """[N, 3] world positions for the codes `levels`, 0 to 65535, which may be fractional."""
-    extent = np.where(codes.maxs == codes.mins, 1.0, codes.maxs - codes.mins)
-    logs = codes.mins + extent * (levels / _MAX_POSITION)
-    with np.errstate(over="ignore"):
-        found: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
-    return found
-
-
-def quantise(model: Gaussians) -> SogCodes:
-    """The codes of a model, in its order; the palette has N / 2 to N vectors, at most 65,536."""
-    means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
-    n, k = rest.shape[:2]
-    logs = np.copysign(np.log1p(np.abs(means.astype(np.float64))), means)
-    mins, maxs = logs.min(axis=0), logs.max(axis=0)
-    positions = (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _MAX_POSITION
-    largest, others = smallest_three(unit(quats))
-    scale_codebook, color_codebook = codebook_of(log_scales), codebook_of(f_dc)
-    sh_codebook, palette, labels = (
-        np.empty(0, np.float32),
-        np.empty((1, 0, 3), np.uint8),
-        np.zeros(n, np.uint16),
-    )
-    if k:
-        size = min(_MAX_LABELS, 2 ** int(math.log2(n)))
-        vectors, labels = palette_of(rest.reshape(n, 3 * k), size)
-        sh_codebook = codebook_of(vectors)
-        palette = nearest(sh_codebook, vectors).reshape(-1, k, 3)
-    return SogCodes(
-        mins=mins,
-        maxs=maxs,
-        positions=to_bytes(positions, _MAX_POSITION),
-        largest=largest,
-        rotations=to_bytes((others * np.sqrt(2) + 1) / 2 * 255),
-        scale_codebook=scale_codebook,
-        scales=nearest(scale_codebook, log_scales),
-        color_codebook=color_codebook,
-        colors=nearest(color_codebook, f_dc),
-        alphas=to_bytes(opacities(opacity_logits) * 255),
-        sh_codebook=sh_codebook,
-        palette=palette,
-        labels=labels,
-    )
+    def positions_at(self, levels: npt.NDArray[Any]) -> Doubles:
+        """[N, 3] world positions for the codes `levels`, 0 to 65535, which may be fractional."""
+        extent = np.where(self.maxs == self.mins, 1.0, self.maxs - self.mins)
+        logs = self.mins + extent * (levels / _MAX_POSITION)
+        with np.errstate(over="ignore"):
+            found: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
+        return found
 
 
-def read_sog(data: bytes) -> CodedGaussians:
-    """The model in a .sog. Raises InputError."""
-    codes = parse(data)
-    return CodedGaussians.of(dequantise(codes), codes)
-
-
-def write_sog(model: Gaussians) -> bytes:
-    """A model as a .sog, sorted so that its images compress well."""
-    if isinstance(model, CodedGaussians) and isinstance(model.codes, SogCodes):
-        return serialise(model.codes)
-    return serialise(quantise(in_morton_order(model)))
+def _no_harmonics(count: int) -> tuple[Floats, Bytes, Shorts]:
+    """Codebook, palette and labels of degree 0."""
+    return np.empty(0, np.float32), np.empty((1, 0, 3), np.uint8), np.zeros(count, np.uint16)
 
 
 def _codebook(values: list[float]) -> Floats:

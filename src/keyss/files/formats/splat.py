@@ -16,11 +16,10 @@ from keyss.files.formats.common import (
     f_dc_of,
     gaussians_of,
     log_scales_of,
-    logits,
-    opacities,
     scales_of,
     to_bytes,
     unit,
+    writable,
 )
 
 _ROW = np.dtype(
@@ -28,7 +27,7 @@ _ROW = np.dtype(
 )
 
 
-def read_splat(data: bytes) -> Gaussians:
+def read(data: bytes) -> Gaussians:
     """The model in a file, of SH degree 0. Raises InputError."""
     if not data or len(data) % _ROW.itemsize:
         raise InputError(
@@ -39,19 +38,19 @@ def read_splat(data: bytes) -> Gaussians:
         rows["mean"],
         unit(rows["quat"].astype(np.float64) / 128 - 1),
         log_scales_of(rows["scale"]),
-        logits(rows["alpha"] / 255),
+        rows["alpha"] / 255,
         f_dc_of(rows["rgb"] / 255),
         np.empty((len(rows), 0, 3), np.float32),
     )
 
 
-def write_splat(model: Gaussians) -> bytes:
+def write(model: Gaussians) -> bytes:
     """A model as a file, the most visible Gaussians first, as viewers show a file while it loads."""
-    means, quats, log_scales, opacity_logits, f_dc, _ = arrays_of(model)
+    means, quats, log_scales, opacities, f_dc, _ = arrays_of(writable(model))
     size = np.exp(log_scales.astype(np.float64).sum(axis=1))
-    order = np.argsort(-opacities(opacity_logits) * size, kind="stable")
+    order = np.argsort(-opacities * size, kind="stable")
     rows = np.empty(len(model), _ROW)
     rows["mean"], rows["scale"] = means, scales_of(log_scales)
-    rows["rgb"], rows["alpha"] = colour_bytes(f_dc), to_bytes(opacities(opacity_logits) * 255)
-    rows["quat"] = to_bytes(unit(quats) * 128 + 128)
+    rows["rgb"], rows["alpha"] = colour_bytes(f_dc), to_bytes(opacities * 255)
+    rows["quat"] = to_bytes(quats * 128 + 128)
     return rows[order].tobytes()

@@ -1,13 +1,13 @@
 """SPZ, Niantic's compressed format: reads versions 2, 3 and 4, writes models in version 3.
 
-https://github.com/nianticlabs/spz. `parse` and `serialise` turn bytes into codes and back;
-`spz_container` packs them. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward (RDF):
-`quantise` and `dequantise` rotate models by 180 degrees about x, like Niantic's library.
+https://github.com/nianticlabs/spz. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward
+(RDF): `quantise` and `dequantise` rotate models by 180 degrees about x, like Niantic's library.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,19 +16,15 @@ from keyss.core.errors import OutputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     Bytes,
-    CodedGaussians,
     Codes,
     Floats,
     Shorts,
     arrays_of,
     from_smallest_three,
     gaussians_of,
-    logits,
-    opacities,
     rounded,
     smallest_three,
     to_bytes,
-    unit,
 )
 from keyss.files.formats.spz_container import Header, pack, unpack
 
@@ -47,7 +43,10 @@ _QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
 
 @dataclass(frozen=True, eq=False)
 class SpzCodes(Codes):
-    """All integers of a file; `dequantise` decodes them."""
+    """All integers of a file."""
+
+    name = "spz"
+    sorts = False
 
     version: int  # 2, 3 or 4
     fractional_bits: int  # 0 to 24: positions are multiples of 2^-fractional_bits world units
@@ -65,102 +64,91 @@ class SpzCodes(Codes):
     def __len__(self) -> int:
         return len(self.positions)
 
+    @classmethod
+    def parse(cls, data: bytes) -> Self:
+        """See `Codes`: of version 2, 3 or 4."""
+        header, sections = unpack(data)
+        n = header.count
+        triples = sections[0].reshape(n, 3, 3).astype(np.int32)
+        positions = triples[..., 0] | triples[..., 1] << 8 | triples[..., 2] << 16
+        positions -= (positions & 0x800000) << 1
+        if header.version == 2:
+            largest, rotations = np.full(n, 3, np.uint8), sections[4].reshape(n, 3).astype(np.uint16)
+        else:
+            packed = sections[4].reshape(n, 4).view("<u4")[:, 0]
+            largest = (packed >> 30).astype(np.uint8)
+            rotations = np.stack([packed >> 20 & 1023, packed >> 10 & 1023, packed & 1023], 1).astype(
+                np.uint16
+            )
+        return cls(
+            version=header.version,
+            fractional_bits=header.fractional_bits,
+            flags=header.flags,
+            positions=positions,
+            alphas=sections[1],
+            colors=sections[2].reshape(n, 3),
+            scales=sections[3].reshape(n, 3),
+            largest=largest,
+            rotations=rotations,
+            sh=sections[5].reshape(n, -1, 3),
+            extensions=header.extensions,
+        )
 
-def parse(data: bytes) -> SpzCodes:
-    """The codes of a file. Raises InputError if it is not a complete SPZ of version 2, 3 or 4."""
-    header, sections = unpack(data)
-    n = header.count
-    triples = sections[0].reshape(n, 3, 3).astype(np.int32)
-    positions = triples[..., 0] | triples[..., 1] << 8 | triples[..., 2] << 16
-    positions -= (positions & 0x800000) << 1
-    if header.version == 2:
-        largest, rotations = np.full(n, 3, np.uint8), sections[4].reshape(n, 3).astype(np.uint16)
-    else:
-        packed = sections[4].reshape(n, 4).view("<u4")[:, 0]
-        largest = (packed >> 30).astype(np.uint8)
-        rotations = np.stack([packed >> 20 & 1023, packed >> 10 & 1023, packed & 1023], 1).astype(np.uint16)
-    return SpzCodes(
-        version=header.version,
-        fractional_bits=header.fractional_bits,
-        flags=header.flags,
-        positions=positions,
-        alphas=sections[1],
-        colors=sections[2].reshape(n, 3),
-        scales=sections[3].reshape(n, 3),
-        largest=largest,
-        rotations=rotations,
-        sh=sections[5].reshape(n, -1, 3),
-        extensions=header.extensions,
-    )
+    def serialise(self) -> bytes:
+        """See `Codes`: of the codes' own version."""
+        n = len(self)
+        fixed = self.positions.astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
+        if self.version == 2:
+            rotations = self.rotations.astype(np.uint8).tobytes()
+        else:
+            parts = self.rotations.astype(np.uint32)
+            packed = (
+                self.largest.astype(np.uint32) << 30 | parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
+            )
+            rotations = packed.astype("<u4").tobytes()
+        sections = [fixed.tobytes(), self.alphas.tobytes(), self.colors.tobytes(), self.scales.tobytes()]
+        degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.sh.shape[1]]
+        header = Header(self.version, n, degree, self.fractional_bits, self.flags, self.extensions)
+        return pack(header, [*sections, rotations, self.sh.tobytes()])
 
+    @classmethod
+    def quantise(cls, model: Gaussians) -> Self:
+        """See `Codes`: in version 3. Raises OutputError for positions beyond 8 million."""
+        means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
+        bits = _fractional_bits(means)
+        largest, xyz = smallest_three(np.roll(quats * _QUAT_SIGNS, -1, axis=1))
+        magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
+        return cls(
+            version=VERSION,
+            fractional_bits=bits,
+            flags=0,
+            positions=rounded(np.ldexp(means.astype(np.float64), bits) * _MEAN_SIGNS).astype(np.int32),
+            alphas=to_bytes(opacities * 255),
+            colors=to_bytes(f_dc.astype(np.float64) * (_COLOR_SCALE * 255) + 127.5),
+            scales=to_bytes((log_scales.astype(np.float64) + 10) * 16),
+            largest=largest,
+            rotations=magnitudes.astype(np.uint16) | np.where(xyz < 0, 512, 0).astype(np.uint16),
+            sh=_quantised_harmonics(rest),
+        )
 
-def serialise(codes: SpzCodes) -> bytes:
-    """A file of the codes, of their version."""
-    n = len(codes)
-    fixed = codes.positions.astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
-    if codes.version == 2:
-        rotations = codes.rotations.astype(np.uint8).tobytes()
-    else:
-        parts = codes.rotations.astype(np.uint32)
-        packed = codes.largest.astype(np.uint32) << 30 | parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
-        rotations = packed.astype("<u4").tobytes()
-    sections = [fixed.tobytes(), codes.alphas.tobytes(), codes.colors.tobytes(), codes.scales.tobytes()]
-    degree = {0: 0, 3: 1, 8: 2, 15: 3}[codes.sh.shape[1]]
-    header = Header(codes.version, n, degree, codes.fractional_bits, codes.flags, codes.extensions)
-    return pack(header, [*sections, rotations, codes.sh.tobytes()])
-
-
-def dequantise(codes: SpzCodes) -> Gaussians:
-    """Decode codes to a model in the frame of a .ply."""
-    means = np.ldexp(codes.positions.astype(np.float64), -codes.fractional_bits) * _MEAN_SIGNS
-    if codes.version == 2:
-        xyz = codes.rotations / 127.5 - 1
-    else:
-        xyz = np.where(codes.rotations & 512, -1.0, 1.0) * (codes.rotations & _MAGNITUDE)
-        xyz *= np.sqrt(0.5) / _MAGNITUDE
-    quats = np.roll(from_smallest_three(codes.largest, xyz), 1, axis=1) * _QUAT_SIGNS
-    rest = (codes.sh.astype(np.float32) - 128) / 128 * _SH_SIGNS[: codes.sh.shape[1], None]
-    return gaussians_of(
-        means,
-        quats,
-        codes.scales / 16 - 10,
-        logits(codes.alphas / 255),
-        (codes.colors / 255 - 0.5) / _COLOR_SCALE,
-        rest,
-    )
-
-
-def quantise(model: Gaussians) -> SpzCodes:
-    """The codes nearest to a model, in its order. Raises OutputError for positions beyond 8 million."""
-    means, quats, log_scales, opacity_logits, f_dc, rest = arrays_of(model)
-    bits = _fractional_bits(means)
-    largest, xyz = smallest_three(np.roll(unit(quats) * _QUAT_SIGNS, -1, axis=1))
-    magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
-    return SpzCodes(
-        version=VERSION,
-        fractional_bits=bits,
-        flags=0,
-        positions=rounded(np.ldexp(means.astype(np.float64), bits) * _MEAN_SIGNS).astype(np.int32),
-        alphas=to_bytes(opacities(opacity_logits) * 255),
-        colors=to_bytes(f_dc.astype(np.float64) * (_COLOR_SCALE * 255) + 127.5),
-        scales=to_bytes((log_scales.astype(np.float64) + 10) * 16),
-        largest=largest,
-        rotations=magnitudes.astype(np.uint16) | np.where(xyz < 0, 512, 0).astype(np.uint16),
-        sh=_quantised_harmonics(rest),
-    )
-
-
-def read_spz(data: bytes) -> CodedGaussians:
-    """The model in a file. Raises InputError."""
-    codes = parse(data)
-    return CodedGaussians.of(dequantise(codes), codes)
-
-
-def write_spz(model: Gaussians) -> bytes:
-    """A model as a file of version 3. Raises OutputError as `quantise` does."""
-    if isinstance(model, CodedGaussians) and isinstance(model.codes, SpzCodes):
-        return serialise(model.codes)
-    return serialise(quantise(model))
+    def dequantise(self) -> Gaussians:
+        """See `Codes`."""
+        means = np.ldexp(self.positions.astype(np.float64), -self.fractional_bits) * _MEAN_SIGNS
+        if self.version == 2:
+            xyz = self.rotations / 127.5 - 1
+        else:
+            xyz = np.where(self.rotations & 512, -1.0, 1.0) * (self.rotations & _MAGNITUDE)
+            xyz *= np.sqrt(0.5) / _MAGNITUDE
+        quats = np.roll(from_smallest_three(self.largest, xyz), 1, axis=1) * _QUAT_SIGNS
+        rest = (self.sh.astype(np.float32) - 128) / 128 * _SH_SIGNS[: self.sh.shape[1], None]
+        return gaussians_of(
+            means,
+            quats,
+            self.scales / 16 - 10,
+            self.alphas / 255,
+            (self.colors / 255 - 0.5) / _COLOR_SCALE,
+            rest,
+        )
 
 
 def _fractional_bits(means: Floats) -> int:
