@@ -1,12 +1,11 @@
 """Ctrl-C while the command line is loading, before `keyss.cli.process` handles signals: no traceback."""
 
+import _signal  # type: ignore[import-not-found]  # `signal` takes 10 ms to import
 import os
-import signal
 import sys
-from types import FrameType
 
 
-def _end(signum: int, frame: FrameType | None) -> None:
+def _end(signum: int, frame: object) -> None:
     os.write(2, b"keyss: interrupted\n")
     os._exit(128 + signum)
 
@@ -14,5 +13,5 @@ def _end(signum: int, frame: FrameType | None) -> None:
 # Only in a process of our own: elsewhere signals belong to the program that imports keyss.
 if (
     os.path.basename(sys.argv[0] if sys.argv else "") == "keyss" or sys.orig_argv[1:3] == ["-m", "keyss"]
-) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, _end)
+) and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+    _signal.signal(_signal.SIGINT, _end)
