@@ -115,6 +115,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "one image": (4, "2 posed images", lambda f: ["fit", write_colmap(f / "s", count=1), "-o", f / "out"]),
     "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
     "no secret": (4, "nowhere", lambda f: _hide(f, secret=f / "nowhere")),
+    "too few Gaussians": (2, "--channel appended has room", lambda f: [*_hide(f), "--channel", "colours"]),
     "no cover model": (4, "nowhere.ply", lambda f: _hide(f, cover_model=f / "nowhere.ply")),
     "output exists": (5, "--overwrite", lambda f: _hide(f, out=f / "hidden")),
     "output is a file": (5, "not a folder", lambda f: ["fit", f / "a", "-o", f / "key.txt"]),

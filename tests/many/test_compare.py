@@ -12,7 +12,7 @@ from keyss import compare
 from keyss.cli import main
 from keyss.core import InputError, OutputError, UsageError
 from keyss.fitting import PRESETS
-from keyss.many import Comparison, Forecast, comparing, performing, running
+from keyss.many import Forecast, comparing, performing, running
 from keyss.methods import Bound, registry
 from test_api import write_nerfstudio
 from tiny_scenes import tiny_scene
@@ -36,17 +36,20 @@ def test_a_table_a_picture_and_a_second_start(
     out = tmp_path / "compared"
     names = "3dgs,3dgs-sh,watergs,carry"
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
-    assert main([*command, "--methods", names, "--dry-run"]) == 0
+    monkeypatch.setattr(comparing, "EVERY", tuple(names.split(",")))
+    assert main([*command, "--methods", names]) == 2
+    assert "carry: not possible" in capsys.readouterr().err  # so small a cover has no room
+    assert main([*command, "--dry-run"]) == 0
     assert not out.exists()
     assert "8 cells, 7 to do" in capsys.readouterr().out  # four plain models and three methods
     assert main([*command, "--methods", "3dgs,3dgs-sh"]) == 0
     before = {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}
     assert len(before) == 4 + 2
     capsys.readouterr()
-    assert main([*command, "--methods", names]) == 0
+    assert main(command) == 0
     assert before.items() <= {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}.items()
     said = capsys.readouterr().out
-    assert "carry: not possible" in said  # so small a cover has no room
+    assert "carry: not possible" in said
     found = json.loads((out / "comparison.json").read_text())
     rows = {row["name"]: row for row in found["methods"]}
     assert list(rows) == names.split(",")
@@ -67,7 +70,7 @@ def test_a_table_a_picture_and_a_second_start(
     for figure in ("classifier", "stealth", "stegexpose"):
         assert numbers["3dgs"][f"secrecy.{figure}"] == numbers["3dgs"][f"secrecy.{figure}_plain"]
     assert numbers["watergs"]["files.readers"] == numbers["watergs"]["files.readers that load"] > 0
-    assert main([*command, "--methods", names, "--dry-run"]) == 0
+    assert main([*command, "--dry-run"]) == 0
     said = capsys.readouterr().out
     assert "0 to do" in said
     assert "carry: " in said
@@ -100,18 +103,25 @@ def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: 
 
 @pytest.mark.parametrize("verb", ["hide", "fit"])
 def test_where_no_method_works_the_reasons_are_said_and_there_is_no_picture(
-    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+    folders: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    verb: str,
 ) -> None:
-    def full(*arguments: object, **more: object) -> None:
+    real, out = getattr(performing, verb), tmp_path / "out"
+
+    def full(*arguments: object, **more: object) -> object:
+        if more.get("dry_run"):
+            return real(*arguments, **more)
         raise InputError("the disk is full")
 
     monkeypatch.setattr(performing, verb, full)
-    sizes = {"iterations": 20, "max_gaussians": 100, "seed": 1}
-    found = compare(*folders, methods=["3dgs"], out=tmp_path / "out", **sizes)  # type: ignore[arg-type]
-    assert isinstance(found, Comparison)
-    assert [each.error for each in found.methods] == ["the disk is full"]
-    assert "the disk is full" in (tmp_path / "out" / "comparison.md").read_text()
-    assert not (tmp_path / "out" / "comparison.png").exists()
+    command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
+    assert main([*command, "--methods", "3dgs"]) == 4
+    assert capsys.readouterr().err.splitlines()[-1] == "keyss: error: not possible: 3dgs"
+    assert "3dgs: not possible: the disk is full" in (out / "comparison.md").read_text()
+    assert not (out / "comparison.png").exists()
 
 
 def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp_path: Path) -> None:

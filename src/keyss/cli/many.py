@@ -44,22 +44,25 @@ def compare(
     """Hide a scene by each method with the same budget, and tabulate the results.
 
     The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the bound:
-    plain 3DGS with that budget. Run the same command again to resume.
+    plain 3DGS with that budget. A method asked for by name must be possible with it; of all methods, those
+    that are not are listed. Run the same command again to resume.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
     import keyss
     from keyss.cli.tables import print_files, print_forecast, print_table
+    from keyss.core.errors import InputError
     from keyss.many import Forecast
     from keyss.many.comparison import comparison_notes, comparison_tables
     from keyss.progress import reporter
 
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     budget = {name: QUICK[name] if value is None and quick else value for name, value in given.items()}
+    named = [] if methods.strip() == "all" else [name.strip() for name in methods.split(",")]
     comparison = keyss.compare(
         cover,
         secret,
-        methods=() if methods.strip() == "all" else [name.strip() for name in methods.split(",")],
+        methods=named,
         seed=seed,
         device=device,
         out=out,
@@ -79,6 +82,8 @@ def compare(
     }
     print(*comparison_notes(comparison), sep="\n")
     print_files(out, described)
+    if named and (failed := [row.name for row in comparison.methods if row.error]):
+        raise InputError(f"not possible: {', '.join(failed)}")
 
 
 def reproduce(

@@ -65,7 +65,8 @@ def compare(
 
     `out` (a folder) gets the cells, and `comparison.json`, `.md` and `.png` (a row for each method: cover,
     secret, and the secret's error). Cells that are done are skipped. `dry_run`: only return their plans.
-    A method that fails has a row with the error. Raises KeyssError and its children; Interrupted.
+    A method that fails has a row with the error. Raises UsageError, before anything is trained, for one of
+    `methods` that is not possible with these settings; KeyssError and its children; Interrupted.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
@@ -74,8 +75,14 @@ def compare(
     scenes = [os.path.realpath(cover), os.path.realpath(secret)]
     folder = CellFolder(Path(out), common={"views": ViewOptions(width), "device": device})
     places = _places(folder, scenes, chosen, fit)
-    if dry_run:
-        return folder.forecast()
+    if dry_run or methods:
+        forecast = folder.forecast()
+        refused = {each.id: each.refused for each in forecast.cells}
+        for name in methods:
+            if (reason := refused[places[name].name]) is not None:
+                raise UsageError(f"{name}: not possible: {reason}")
+        if dry_run:
+            return forecast
     outcomes = folder.run(f"comparison of {len(places)} methods", reporter=reporter or default_reporter())
     told = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
     told |= {"max_gaussians": fit.max_gaussians, "width": width, "seed": seed}

@@ -44,6 +44,7 @@ _ASSOCIATED = b"keyss/v1/codes/data"
 _ATTEMPTS = 100  # orders of blocks to try; fewer than one in ten fails
 _USUAL_RATE = 800  # of a key that opens nothing
 _BITS_PER_GAUSSIAN = 18  # of room, about
+_LAST_BITS = {"spz": 29, "sog": 32, "compressed-ply": 26}  # of the levels of a Gaussian, about
 _OVERHEAD = 128  # bytes of a payload beside its data, at most
 
 
@@ -67,7 +68,8 @@ class CodesChannel:
         return CodesCover.of(FORMATS[self.format].of(cover))
 
     def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
-        return RoomEstimate(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _OVERHEAD)
+        slots = Zones(gaussians * _LAST_BITS[self.format]).slots
+        return RoomEstimate(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8 if slots else 0, _OVERHEAD)
 
     def reader(self, stego: Gaussians) -> CodesReader | None:
         """The reader of codes of any format."""

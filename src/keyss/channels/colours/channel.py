@@ -46,7 +46,8 @@ from keyss.rendering.difference import psnr_between
 
 _TOO_FEW = "this model has too few Gaussians to hide anything that survives other formats"
 _LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
-_BITS_PER_GAUSSIAN = 1  # of room, about
+_BITS_PER_GAUSSIAN = 1  # of room, about, beside headers
+_HEADERS = 100  # bytes, about
 _OVERHEAD = METHOD_BYTES + 1  # bytes of a payload beside its data, at most
 
 
@@ -70,7 +71,8 @@ class Colours:
         return ColoursCover(Capacity(cover, Numbers.of(cover), self.strength))
 
     def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
-        return RoomEstimate(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _OVERHEAD)
+        capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
+        return RoomEstimate(gaussians, max(0, capacity), _OVERHEAD)
 
     def reader(self, stego: Gaussians) -> ColoursReader:
         return ColoursReader(Numbers.of(stego))

@@ -57,6 +57,17 @@ class SecretSize:
         return self.count * _BITS_PER_GAUSSIAN // 8 if self.model is None else least_bytes(self.model)
 
 
+def _check_not_tiny(
+    counts: Sequence[int], secrets: Sequence[SecretSize], cover: int, place: str, more_room: str
+) -> None:
+    """Raise UsageError if so few Gaussians of a secret fit into a cover of `cover` that they are none."""
+    if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
+        raise UsageError(
+            f"a cover of {cover:,} Gaussians is too small to hide {len(secrets)} "
+            f"{'secrets' if len(secrets) > 1 else 'secret'} in its {place}; {more_room}"
+        )
+
+
 @dataclass(frozen=True)
 class RecordRoom:
     """The room for records in low bits: of a prepared cover, or about that of one not fitted yet."""
@@ -119,12 +130,8 @@ class RecordRoom:
             largest = max(request.least_bytes for request in requests)
             share = self.room.unnoticed_records(largest, len(secrets)) if len(secrets) > 1 else 0
             counts = [min(count, share) for count in counts] if share else divided(counts, capacity)
-        if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
-            raise UsageError(
-                f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
-                f"{'secrets' if len(secrets) > 1 else 'secret'} in its low bits, {self.room.carriers:,} of "
-                f"them random; {_ANY}"
-            )
+        place = f"low bits, {self.room.carriers:,} of them random"
+        _check_not_tiny(counts, secrets, self.gaussians, place, _ANY)
         return list(zip(counts, degrees, strict=True))
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
@@ -167,10 +174,13 @@ class WholeRoom:
     def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
         """See `RecordRoom.sizes`; an estimate for secrets that do not fit."""
         rooms = shares(self.room, [secret.payload_bytes for secret in secrets])
-        return [
-            (min(secret.count, max(1, secret.count * room // secret.payload_bytes)), secret.sh_degree)
+        counts = [
+            min(secret.count, secret.count * room // secret.payload_bytes)
             for secret, room in zip(secrets, rooms, strict=True)
         ]
+        more_room = '`channel="appended"` has room for all' if self.channel.survives else _ANY
+        _check_not_tiny(counts, secrets, self.gaussians, self.channel.place, more_room)
+        return [(count, secret.sh_degree) for count, secret in zip(counts, secrets, strict=True)]
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
         """See `RecordRoom.prune`; the SH degree is the one that renders most like the model."""
